@@ -1,4 +1,4 @@
-"""A board for tests that is as fast as its reader: TCP waits for it, so no frame is lost on the busiest machine."""
+"""Simulated board for tests. It sends over TCP and waits for its reader, so no frame is lost on a busy machine."""
 
 import signal
 import socket

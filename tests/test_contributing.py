@@ -1,4 +1,4 @@
-"""The recipes of CONTRIBUTING.md work: each is followed in a copy of the project, to its last line."""
+"""The recipes of CONTRIBUTING.md work. Each recipe is followed completely in a copy of the project."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Files that are read whole, lines that are read one by one, parts of runs: bounded, whatever they hold."""
+"""Reading of files, of lines and of the parts of interrupted runs. The memory is bounded for any content."""
 
 import io
 import os
@@ -28,7 +28,7 @@ def test_what_is_no_file_is_not_read(tmp_path):
 
 
 def test_nothing_of_an_interrupted_write_stays(tmp_path, monkeypatch):
-    """Ctrl-C just after the bytes went out."""
+    """Ctrl-C interrupts the function immediately after the bytes are written."""
     file, write = AtomicWriter(tmp_path / "file"), os.write
     monkeypatch.setattr("os.write", lambda *words: write(*words) and signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):

@@ -1,4 +1,4 @@
-"""Values on their way to JSON: what it has no notation for becomes null."""
+"""Conversion of values to JSON. Values without a notation in JSON become null."""
 
 import json
 

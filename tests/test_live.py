@@ -1,4 +1,4 @@
-"""The live path on what the simulator's amplifier makes of charges: two stages that know nothing of each other."""
+"""The signal chain applied to the readings of the simulated amplifier, which shares no code with the chain."""
 
 from dataclasses import replace
 
@@ -45,7 +45,10 @@ def undo(measurement, charge_pC, seed, *, hum=True):
 
 @pytest.mark.parametrize("tau", [10.0, 1.0])
 def test_two_held_presses(tau):
-    """400 pC for 8 s, 300 pC for 10 s on `bench` without thermal drift: under 5 pC of error at the end; then zero."""
+    """Two presses of 400 pC for 8 s and 300 pC for 10 s have errors below 5 pC at their ends, and zero afterwards.
+
+    The amplifier is `bench` without thermal drift.
+    """
     part = replace(load_amplifier("bench"), tau=tau, temperature_rms=0.0)
     charge = held((6.0, 8.0, 400.0), (20.0, 10.0, 300.0), seconds=36.0)
     for seed in range(4):
@@ -60,7 +63,7 @@ def test_two_held_presses(tau):
 
 
 def test_three_minutes_of_rest_give_no_touch():
-    """The whole of `bench`, film temperature wandering included."""
+    """The amplifier is `bench`, whose film temperature changes."""
     part = load_amplifier("bench").start(3, RATE_HZ, np.random.default_rng(0))
     _, contact = undo(part, np.zeros((36_000, 3)), 0)
     assert not contact.any()
@@ -102,7 +105,7 @@ def steady_presses(level, seed, table, tau_error=0.0, press_s=1.2):
     ],
 )
 def test_charges_of_steady_presses(level, table, tau_error, most_pC):
-    """Hum, leak, bias and slow warming of the film add less than the noise of one frame."""
+    """The errors by hum, leak, bias current and slow warming of the film are smaller than the noise of one frame."""
     errors = []
     for seed in range(4):
         error, reasons = steady_presses(level, seed, table, tau_error)

@@ -1,4 +1,4 @@
-"""Reading npz files that somebody else may have made, against what NumPy and zipfile write."""
+"""Reading of npz files from untrusted sources, compared with files that NumPy and zipfile write."""
 
 import io
 import struct
@@ -84,7 +84,7 @@ def test_large_lzma_dictionary_is_refused():
 
 
 def with_header(text):
-    """An npy file with any header."""
+    """Return an npy file with a given header."""
     header = text.encode().ljust(117) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(16)
 

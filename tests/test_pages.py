@@ -1,4 +1,4 @@
-"""What README.md and the pages show is true: every example runs and prints what it says, links lead somewhere."""
+"""The examples of README.md and of the pages run and print what their comments say, and all links have targets."""
 
 import re
 
@@ -38,7 +38,7 @@ misfit_charges = 1000
 """
 
 EXAMPLE_PAGES = [page for page in PAGES if not page.startswith(("serve/", "CONTRIBUTING", "CHANGELOG"))]
-"""Those of serve use ports (tests/serve), and CONTRIBUTING.md has recipes (tests/test_contributing.py)."""
+"""Pages whose examples run here. tests/serve runs those of serve, and tests/test_contributing.py the recipes."""
 
 RESEARCH_TUTORIAL = "simulate/docs/tutorial.md"
 """Tutorial that goes from a press to records of a virtual sensor."""
@@ -76,7 +76,7 @@ def desks(tmp_path_factory):
 
 @pytest.fixture
 def desk(page_example, desks, presses):
-    """The folder of a page; a dataset `presses` is in it where the page reads one that it has not made."""
+    """The folder of a page. It contains a dataset `presses` if the page reads a dataset that it does not create."""
     folder = desks[page_example.page]
     reads = re.search(r'(?:fit|report) presses\b|read_dataset\(Path\("presses"\)\)', page_example.text)
     makes = re.search(r'-o presses\b|Path\("presses"\), load_sensor', page_example.text)
@@ -86,7 +86,7 @@ def desk(page_example, desks, presses):
 
 
 def test_an_example_does_what_it_says(page_example, desk, installed, run_example, run_commands, train_in_this_process):
-    """In the order of the page, in the install that it names; Python prints what the comments say."""
+    """The examples run in the order of the page, with the extras that it names, and print what their comments say."""
     text, environment = page_example.text, installed(*page_example.extras)
     for shown, smaller in SMALLER.items():
         text = text.replace(shown, smaller)

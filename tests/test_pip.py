@@ -101,7 +101,7 @@ def test_nothing_heavy_came_along(base, tmp_path):
 
 
 def test_the_size_of_the_base_install_is_as_stated(base):
-    """Without the compiled modules, which are a tenth of the stated size."""
+    """The size does not include compiled Python modules, which are a tenth of the stated size."""
     page = (ROOT / "serve/docs/getting_started.md").read_text("utf-8")
     stated_MB = float(re.search(r"^\| none \|.*\| (\d+) MB \|$", page, re.MULTILINE)[1])
     size_MB = sum(path.stat().st_size for path in base.parent.rglob("*") if path.is_file()) / 2**20
@@ -114,7 +114,7 @@ def test_predict_works_from_any_folder(base, tmp_path):
 
 @pytest.mark.parametrize(("page", "number"), [("README.md", 0), ("serve/README.md", 0), ("serve/README.md", 1)])
 def test_examples_of_the_base_install_work_from_any_folder(base, tmp_path, page, number):
-    """They print what their comments say with nothing but the base install."""
+    """The examples print what their comments say in an installation without extras."""
     example = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)[number]
     done = run(base, "python", "-c", example, cwd=tmp_path)
     assert done.stdout.splitlines() == re.findall(r"^print\(.*\)  # (.+)$", example, re.MULTILINE), done.stderr

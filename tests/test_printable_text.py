@@ -44,7 +44,7 @@ def test_ordinary_names_are_not_changed(text):
 
 @given(st.text())
 def test_nothing_that_a_terminal_obeys_or_hides_is_left(text):
-    """Against the categories of Unicode; the escapes are those of JSON, so a reader of JSON gets the text again."""
+    """The characters are compared with the categories of Unicode. A JSON parser converts the escapes to the text."""
     for result in (printable(text), printable_lines(text).replace("\n", ""), cut(text), shown(text)):
         assert HARMFUL_CATEGORIES.isdisjoint(map(unicodedata.category, result))
     assert json.loads(printable(json.dumps(text, ensure_ascii=False))) == text

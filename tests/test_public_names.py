@@ -11,7 +11,7 @@ PACKAGES = ["isocharge.simulate", "isocharge.train", "isocharge.serve"]
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_dir_lists_the_public_names_before_their_first_use(package):
-    """In a new process, because a name that was used once is an ordinary attribute from then on."""
+    """The test runs in a new process, because a name becomes an ordinary attribute when it is used once."""
     code = f"import sys, {package} as package\nprint(dir(package) == package.__all__, 'torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "True False\n"
@@ -25,7 +25,7 @@ def test_every_public_name_can_be_imported(package):
 
 
 def test_every_name_of_the_module_with_torch_is_public():
-    """A name is lazy if it is listed there, and public if it is in `__all__`."""
+    """The names of the module are imported lazily. A name is public if it is in `__all__` of the package."""
     lazy_names = [name for name in vars(import_module("isocharge.train.needs_torch")) if not name.startswith("_")]
     assert lazy_names
     assert set(lazy_names) <= set(import_module("isocharge.train").__all__)

@@ -1,4 +1,4 @@
-"""Typed structs from TOML and JSON: what is wrong is said with its place, what was expected and what was given."""
+"""Typed structs from TOML and JSON. Errors state the position, the expected value and the given value."""
 
 import math
 import re

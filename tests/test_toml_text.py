@@ -1,4 +1,4 @@
-"""Tables to TOML: what the standard library reads back is what was written."""
+"""Conversion of tables to TOML. The standard library reads the same tables from the text."""
 
 import tomllib
 

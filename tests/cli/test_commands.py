@@ -1,4 +1,4 @@
-"""The command line as a user meets it: help, exit codes, data on stdout, words on stderr, nothing half-written."""
+"""Commands: help, exit codes, data on stdout, messages on stderr, and no incomplete output files."""
 
 import io
 import json
@@ -36,14 +36,14 @@ def sensor_file(folder):
 
 
 def point(command, *words):
-    """The JSON of a point, and what was said."""
+    """Return the JSON of `simulate point`, and its stderr."""
     code, out, err = command("simulate", "point", *words, "--json")
     assert code == 0
     return json.loads(out), err
 
 
 def test_a_point(command):
-    """A table for people, all numbers in JSON; the charges first."""
+    """The command prints a table that begins with the charges, and JSON with all numbers."""
     answer, _ = point(command, SENSOR, "--probe", "circle:1.0", "--at", "0,0", "--force", "1")
     assert answer["deflection_mm"] == pytest.approx(2.812061, rel=1e-4)  # collocation, tests/data/film_cases.json
     assert answer["charge_pC"]["A"] == pytest.approx(848, rel=1e-3)
@@ -71,7 +71,7 @@ SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1"]
 
 
 def test_a_sweep_as_a_table_for_other_programs(command, refused, tmp_path, monkeypatch):
-    """Read by pyarrow, against the dataset beside it."""
+    """The file is read by pyarrow and compared with the dataset."""
     assert command(*SMALL, "--samples", "5", "--workers", "1", "-o", tmp_path / "a.parquet")[0] == 0
     samples, columns = read_dataset(tmp_path / "a").samples, read_table(tmp_path / "a.parquet").to_pydict()
     assert columns["x_mm"] == samples.x_mm.tolist()
@@ -90,7 +90,7 @@ def test_a_sweep_as_a_table_for_other_programs(command, refused, tmp_path, monke
 
 
 def test_a_stopped_sweep_says_how_to_go_on_and_leaves_no_process(tmp_path):
-    """Stopped at the first of many shards."""
+    """The command is stopped at the first of many shards."""
     process = subprocess.Popen(
         [sys.executable, "-m", "isocharge.cli", *SMALL, "--samples", "1000000", "--workers", "2", "-o", "presses"],
         cwd=tmp_path,
@@ -110,7 +110,7 @@ def test_a_stopped_sweep_says_how_to_go_on_and_leaves_no_process(tmp_path):
 
 
 def ends(is_so) -> bool:
-    """Whether something is so no more, within two minutes."""
+    """Return whether a condition becomes false within two minutes."""
     for _ in range(6000):
         if not is_so():
             return True
@@ -174,7 +174,10 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys)
 
 
 def test_a_thick_film(command, tmp_path):
-    """1 mm: 3.72 pC on A, 0.139 mm deep (tests/data/film_cases.json); other theories are solved and cautioned of."""
+    """A film of 1 mm has 3.72 pC on A and a deflection of 0.139 mm (tests/data/film_cases.json).
+
+    Other theories are computed if the user chooses them, and the command prints a warning.
+    """
     path = sensor_file(tmp_path)
     path.write_text(path.read_text().replace("thickness_um = 25.0", "thickness_um = 1000.0"))
     answer, _ = point(command, path, "--at", "3,-2")
@@ -196,7 +199,7 @@ def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
 
 @pytest.mark.slow
 def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
-    """Three uniaxial electrodes fold within 8 mm, and the user is told."""
+    """The map of three electrodes on a uniaxial film folds within 8 mm. The command prints a warning."""
     monkeypatch.setattr("isocharge.cli.shared.forward_maps.N_SIMULATED_PRESSES", 4000)
     (tmp_path / "quick.toml").write_text(
         "[network]\nhidden = [24, 24]\nmisfit_hidden = [24, 24]\n"
@@ -350,7 +353,7 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(refused, tmp_path, monke
 
 
 def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
-    """Without the long sweep, training and maps: it follows the released model, and finds the errors of its card."""
+    """The sweep, the training and the maps are replaced. The errors are those on the card of the released model."""
     figures, released, out = [], find_model(SENSOR), tmp_path / "first-light"
     for name, stub in {
         "SAMPLES": 40,
@@ -387,7 +390,7 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
 
 
 def test_demo_plays_the_working_area_of_the_released_model_of_the_sensor():
-    """A sensor without a released model is played up to the default radius."""
+    """For a sensor without a released model, the presses lie within the default radius."""
     assert played_radius_mm("three-25um-biaxial") == pytest.approx(8.0)
     assert played_radius_mm("four-25um-biaxial-15mm") == pytest.approx(15.0)
     assert played_radius_mm("no-such-sensor") == 8.0

@@ -1,4 +1,4 @@
-"""Help: each option says what it is, with unit and default; each example is one that the command accepts."""
+"""Help: each option has a description with its unit and its default, and each command accepts its example."""
 
 import os
 import re
@@ -15,7 +15,7 @@ ROOT = typer.main.get_command(app)
 
 
 def commands(group=ROOT, path=()):
-    """Every command by its words, imported as when it is called."""
+    """Return all commands by their words. They are imported in the same way as when they are called."""
     for name in group.list_commands(None):
         _, command, _ = group.resolve_command(None, [name])
         if hasattr(command, "list_commands"):
@@ -29,7 +29,7 @@ COMMANDS = dict(commands())
 
 @pytest.mark.parametrize("path", COMMANDS)
 def test_the_help_begins_with_one_sentence_and_has_an_example_that_parses(path):
-    """What the example names need not exist."""
+    """The files that the example names need not exist."""
     command, text = COMMANDS[path], COMMANDS[path].help
     purpose = text.split("\n\n")[0]
     assert purpose.endswith(".")

@@ -1,4 +1,4 @@
-"""Every command that reads a file of presses refuses the same faults with the same words."""
+"""All commands that read a file of presses give the same error messages for the same faults."""
 
 import pyarrow
 import pytest

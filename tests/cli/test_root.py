@@ -1,4 +1,4 @@
-"""What every command line has: a version, and completion by the shell."""
+"""Options of `isocharge` itself: its version, and completion by the shell."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""`isocharge simulate design` as a user meets it."""
+"""Output and error messages of `isocharge simulate design`."""
 
 import json
 from dataclasses import replace
@@ -20,7 +20,7 @@ FILES = ["design.json", "design.png", "layout.dxf", "layout.svg", "sensor.toml"]
 
 @pytest.fixture
 def _rough(monkeypatch):
-    """A rough search without a look for folds: the command's own takes half a minute."""
+    """The search is coarse and does not search for folds, because the complete search takes half a minute."""
     monkeypatch.setattr(case_module, "FINE_GRID_STEPS", 12)
     monkeypatch.setattr(case_module, "MAX_SEARCH_PRESSES", 50)
     monkeypatch.setattr(search_module, "STARTS", 2)

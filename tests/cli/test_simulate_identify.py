@@ -1,4 +1,4 @@
-"""`isocharge simulate identify` as a user meets it."""
+"""Output and error messages of `isocharge simulate identify`."""
 
 import json
 

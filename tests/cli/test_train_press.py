@@ -30,7 +30,7 @@ RATE_HZ = 200.0
 
 
 class FakeSession:
-    """Proposes places one after the other, and knows enough after three presses."""
+    """Plan that proposes positions one after the other, and ends after three presses."""
 
     summary = ("so much is known",)
 
@@ -64,7 +64,7 @@ class FakeSession:
 
 
 class Script:
-    """Events in their order; those that are not asked for are an error."""
+    """Source of events in a given order. A request for a further event is an error."""
 
     def __init__(self, *events):
         self.events, self.armed = list(events), 0
@@ -169,7 +169,7 @@ def problem():
 
 @pytest.fixture(scope="module")
 def film(problem):
-    """A film that a seed draws."""
+    """Return the film of a seed."""
     return problem.charges.forward_map(problem.prior.draw(np.random.default_rng(3), 1)[0])
 
 
@@ -179,7 +179,7 @@ def places(problem):
 
 
 def board_rows(film, places, seed=0) -> Iterator[tuple[float, ...]]:
-    """Charges, pC, of a machine that presses at places for 1.2 s each, as an amplifier measures them."""
+    """Return the charges that an amplifier measures while a machine presses each position for 1.2 s, pC."""
     t = np.arange(round(1.2 * RATE_HZ)) / RATE_HZ
     rise = np.clip(np.minimum(t, 1.2 - t) / 0.1, 0.0, 1.0)[:, None] ** (2 / 3)
     pause = np.zeros((round(0.8 * RATE_HZ), 4))
@@ -192,7 +192,7 @@ def board_rows(film, places, seed=0) -> Iterator[tuple[float, ...]]:
 
 
 def board(film, places, seed=0) -> Iterator[bytes]:
-    """Frames of the same machine."""
+    """Return the frames of a board while the machine presses."""
     for number, row in enumerate(board_rows(film, places, seed)):
         yield encode_frame(Frame(number, round(1e6 * number / RATE_HZ), row))
 

@@ -1,4 +1,4 @@
-"""Rungs 5 and 6 of the ladder: how fast the error falls, for the energy, the deflection and the charge."""
+"""Convergence of the deflection and of the charges with the order and the size of the elements."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,7 +35,7 @@ PLACES = np.array([(5.0, 3.0), (0.0, 0.0), (-20.0, 10.0), (0.0, 40.0)])
 
 @pytest.fixture(scope="module", params=list(zip(PROBES, THEORIES.values(), strict=True)), ids=THEORIES.keys())
 def solves(film, request) -> list[Equilibrium]:
-    """One press off the centre at growing order, the last one as the reference."""
+    """Equilibria of one press for elements of increasing order. The last equilibrium is the reference."""
     probe, (thickness, theory) = request.param
     film = replace(film, thickness=thickness)
 
@@ -46,12 +46,21 @@ def solves(film, request) -> list[Equilibrium]:
     return [solve(order) for order in (*ORDERS, 7)]
 
 
-def check(solves: list[Equilibrium], read: Callable[[Equilibrium], np.ndarray], digits: float, last: float) -> None:
-    """What is read wins digits with every order, and has an error below `last` at the highest."""
-    *values, reference = map(read, solves)
+def check(
+    solves: list[Equilibrium], output: Callable[[Equilibrium], np.ndarray], digits_per_order: float, final_error: float
+) -> None:
+    """Check the exponential convergence of an output.
+
+    Args:
+        solves: Equilibria for increasing orders, the last one for the reference.
+        output: Function of an equilibrium.
+        digits_per_order: Smallest number of decimal digits that each order adds.
+        final_error: Largest relative error for the highest order of `ORDERS`.
+    """
+    *values, reference = map(output, solves)
     errors = [np.abs(value - reference).max() / np.abs(reference).max() for value in values]
-    assert -np.polyfit(ORDERS, np.log10(errors), 1)[0] > digits
-    assert errors[-1] < last
+    assert -np.polyfit(ORDERS, np.log10(errors), 1)[0] > digits_per_order
+    assert errors[-1] < final_error
 
 
 def test_deflection_converges_exponentially_with_the_order(solves):
@@ -64,10 +73,14 @@ def test_charge_converges_exponentially_with_the_order(solves, name, readout):
     check(solves, partial(touch_charge, sensor), 0.3, 1e-4)
 
 
-# Every element in half, and half again; the block round the footprint keeps its depth, so not for ever
+# Convergence with the size of the elements
 
 
 def refined(film: Film, probe: Probe, theory: Theory, order: int, times: int) -> Equilibrium:
+    """Solve a press on a mesh whose elements are divided by a factor in both directions.
+
+    The depth of the ring of elements next to the footprint does not change, so the factor must remain small.
+    """
     resolution = Resolution(order, 8 * times, 3 * times)
     return press(film, probe, (6.0, 3.0), 1.0, SolveSettings(theory=theory, resolution=resolution, layer=0.1))
 
@@ -81,7 +94,10 @@ ROUND = Circle(1.0)
     [(SMALL, 2, "membrane"), (ROUND, 3, "membrane"), (ROUND, 2, "membrane + bending")],
 )
 def test_charge_converges_with_the_order_of_the_elements(film, probe, order, name):
-    """Halving every element divides the error of the charge, a functional of the gradient, by at least 2^order."""
+    """Elements of half the size divide the error of the charge by at least 2^order.
+
+    This is the rate for a linear functional of the gradient.
+    """
     theory = THEORIES[name][1]
     film = replace(film, thickness=0.3) if theory.bending else film
     sensor = replace(load_sensor("four-25um-uniaxial"), film=film)

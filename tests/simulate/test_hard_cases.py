@@ -1,4 +1,4 @@
-"""Presses from all over what the simulator is made for: each converges, or says precisely why there is no answer."""
+"""Random presses from the whole range of the simulator. Each converges, or the error states why it has no solution."""
 
 import re
 from dataclasses import replace
@@ -16,11 +16,15 @@ REASONS = (
     r"force .* stretches a film of .* beyond small strains",
     r"no equilibrium at .* N, position .*: .*; the film is compressed to -.* MPa on the way: it wrinkles",
 )
-"""What a refusal may say: the rim, the strains, wrinkles; anything else is a failure of ours."""
+"""Messages of permitted errors: a press near the rim, large strains, and wrinkles."""
 
 
 def check(seed: int) -> str:
-    """What became of a draw: "converged" or the reason; fails on anything that is neither."""
+    """Solve the press of a seed and check its result.
+
+    Returns:
+        "converged", or the name of a permitted error.
+    """
     film, probe, at, force = draw(7, seed)
     try:
         solved = press(film, probe, at, force)

@@ -1,4 +1,4 @@
-"""Films that are not isotropic, not evenly taut or not round: against scikit-fem and on paper; what refuses them."""
+"""Films with uneven modulus, uneven tension or an oval clamp, compared with scikit-fem and with a closed form."""
 
 from dataclasses import replace
 
@@ -26,12 +26,14 @@ FORCE = 0.5
 ALL = Film(45.0, 0.025, 3000.0, 0.34, 1.0, (0.33, 0.2), young_ratio=1.2, axis=0.4, oval=0.02, oval_axis=-0.7)
 SLACK = Film(45.0, 0.025, 3000.0, 0.34, -0.3, shear=1000.0)
 
-
 BY_SCIKIT_FEM = {
     "all at once": (ALL, [574.79165, 354.29372, 356.80841, 491.15167]),
     "slack, soft in shear": (SLACK, [693.39308, 494.80579, 477.66952, 623.05922]),
 }
-"""Film and charges of the press, pC: scikit-fem 12, P3, `film_skfem.py` of commit 640aecf with 30 triangles around."""
+"""Film, and charges of the press by scikit-fem 12, pC.
+
+They were computed with P3 elements and 30 triangles around the probe by `film_skfem.py` of commit 640aecf.
+"""
 
 
 @pytest.mark.parametrize(("film", "expected"), BY_SCIKIT_FEM.values(), ids=BY_SCIKIT_FEM.keys())
@@ -40,26 +42,29 @@ def test_charges_of_imperfect_films_agree_with_scikit_fem(film, expected):
     np.testing.assert_allclose(charge, expected, rtol=8e-4)
 
 
-def test_an_oval_film_that_is_tauter_along_it_sinks_as_a_round_one_stretched():
-    """With T1 / T2 as the squares of the half axes, Green's function of the disk holds in scaled coordinates."""
+def test_deflection_of_an_oval_film_with_uneven_tension_agrees_with_greens_function():
+    """If T1 / T2 is the ratio of the squared half axes, Green's function of the disk holds in scaled coordinates.
+
+    The tension along the axes is (1 +- e)^2 times a constant, and the half axes are 1 +- e times the radius.
+    """
     e = 0.02
-    taut = 2.0
-    turn = 0.4
-    half = 2.0 * e * taut
-    mean = (1.0 + e**2) * taut
-    deviator = (half * np.cos(2.0 * turn), half * np.sin(2.0 * turn))
-    film = replace(SENSOR.film, pretension=mean, deviator=deviator, oval=e, oval_axis=turn)
+    tension = 2.0
+    axis = 0.4
+    half_difference = 2.0 * e * tension
+    mean = (1.0 + e**2) * tension
+    deviator = (half_difference * np.cos(2.0 * axis), half_difference * np.sin(2.0 * axis))
+    film = replace(SENSOR.film, pretension=mean, deviator=deviator, oval=e, oval_axis=axis)
     solved = press(film, Circle(0.1), (9.0, -5.0), 1e-6, SolveSettings(theory=Theory(True, False, True)))
 
     def scaled(points):
-        along = np.asarray(points) @ [1.0, 1j] * np.exp(-1j * turn) / film.radius
-        return along.real / (1.0 + e) + 1j * along.imag / (1.0 - e)
+        in_oval_axes = np.asarray(points) @ [1.0, 1j] * np.exp(-1j * axis) / film.radius
+        return in_oval_axes.real / (1.0 + e) + 1j * in_oval_axes.imag / (1.0 - e)
 
     points = np.array([[-10.0, 3.0], [15.0, 12.0], [0.0, 20.0], [-30.0, -10.0]])
     z = scaled(points)
     source = scaled((9.0, -5.0))
     green = np.log(np.abs((1.0 - z * np.conj(source)) / (z - source)))
-    expected = 1e-6 / (2.0 * np.pi * film.thickness * taut * (1.0 - e**2)) * green
+    expected = 1e-6 / (2.0 * np.pi * film.thickness * tension * (1.0 - e**2)) * green
     np.testing.assert_allclose(deflection(solved, points), expected, rtol=3.0 * e**2)
 
 
@@ -72,7 +77,7 @@ def test_sensor_file_stores_all_imperfections():
     assert sensor_to_dict(sensor_from_dict(table)) == table
 
 
-def test_crosstalk_adds_a_share_of_the_others():
+def test_crosstalk_adds_a_share_of_the_charges_of_the_other_electrodes():
     solved = press(SENSOR.film, PROBE, AT, FORCE)
     own = touch_charge(SENSOR, solved)
     wired = replace(SENSOR, calibration=replace(SENSOR.calibration, crosstalk=0.01))

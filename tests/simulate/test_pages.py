@@ -1,4 +1,4 @@
-"""What the pages of simulate and the docstring of the package show is true: files and names."""
+"""The files and names on the pages of simulate and in the docstring of its package exist."""
 
 import re
 import tomllib
@@ -17,7 +17,7 @@ TABLES = re.findall(r"```toml\n(.*?)```", FILES, re.DOTALL)
 
 
 def test_example_of_the_package():
-    """The docstring's five lines give three charges of some hundred pC."""
+    """The five lines of code in the docstring print three charges of several hundred pC."""
     lines = dedent(isocharge.simulate.__doc__.split("press.\n\n", 1)[1])
     scope = {}
     exec(compile(lines, "isocharge.simulate", "exec"), scope)

@@ -1,4 +1,4 @@
-"""Rung 7: turning the load turns the charges, mirrors mirror, and units do not matter."""
+"""Symmetries of the charges: rotated presses, mirrored presses, and other units of length and modulus."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ PROBES = {"circle": Circle(1.0), "rectangle": RECTANGLE, "triangle": TRIANGLE}
 FILMS = {"25 um": {}, "taut 110 um": {"thickness": 0.11, "pretension": 1.0}}
 
 EXACT = {"rtol": 2e-6}
-"""Where both presses have the same mesh, up to a turn; Newton's method stops at 1e-7."""
+"""Tolerance if both presses have the same mesh up to a rotation. Newton's method stops at a residual of 1e-7."""
 
 
 @pytest.fixture(params=PROBES.values(), ids=PROBES.keys())
@@ -40,13 +40,14 @@ def charges(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float 
     return touch_charge(sensor, press(sensor.film, probe, at, force))
 
 
-def turned(at: tuple[float, float], degrees: float) -> tuple[float, float]:
+def rotated(at: tuple[float, float], degrees: float) -> tuple[float, float]:
+    """Return a position that is rotated about the centre of the film."""
     z = complex(*at) * np.exp(1j * np.deg2rad(degrees))
     return z.real, z.imag
 
 
 def mirrored(probe: Probe) -> Probe:
-    """Left for right."""
+    """Return the mirror image of a probe in the y axis."""
     if isinstance(probe, Circle):
         return probe
     z = -np.conj(probe.outline)[::-1]
@@ -57,33 +58,40 @@ AT = (6.0, 2.5)
 
 
 def test_quarter_turn_of_an_uniaxial_film_swaps_the_coefficients(probe):
-    """What s11 was is s22 now: turning the press and exchanging d31 and d32 passes the charges on."""
+    """A rotation of the press by 90 degrees exchanges s11 and s22.
+
+    If d31 and d32 are exchanged as well, each electrode has the charge that its neighbour had before.
+    """
     sensor = sensor_of("four-25um-uniaxial")
     exchanged = replace(sensor, piezo=replace(sensor.piezo, d31=sensor.piezo.d32, d32=sensor.piezo.d31))
-    second = charges(exchanged, probe.rotated(0.5 * np.pi), turned(AT, 90.0))
+    second = charges(exchanged, probe.rotated(0.5 * np.pi), rotated(AT, 90.0))
     np.testing.assert_allclose(second, np.roll(charges(sensor, probe, AT), 1), **EXACT)
 
 
 def test_rotation_of_press_and_layout_keeps_the_charges(probe):
-    """Any angle, with polygonal electrodes that turn along; biaxial, so that the film's axes do not show."""
+    """The electrodes are polygons that are rotated like the press. The charges of a biaxial film have no axes."""
     sensor = sensor_of("four-25um-biaxial")
     angle = -2.5
-    still = tuple(replace(e, square=False) for e in sensor.electrodes)
+    polygons = tuple(replace(electrode, square=False) for electrode in sensor.electrodes)
     c, s = np.cos(angle), np.sin(angle)
-    along = tuple(replace(e, corners=tuple((c * x - s * y, s * x + c * y) for x, y in e.corners)) for e in still)
-    first = charges(replace(sensor, electrodes=still), probe, AT)
-    second = charges(replace(sensor, electrodes=along), probe.rotated(angle), turned(AT, np.rad2deg(angle)))
+    rotated_polygons = tuple(
+        replace(electrode, corners=tuple((c * x - s * y, s * x + c * y) for x, y in electrode.corners))
+        for electrode in polygons
+    )
+    rotated_press = (probe.rotated(angle), rotated(AT, np.rad2deg(angle)))
+    first = charges(replace(sensor, electrodes=polygons), probe, AT)
+    second = charges(replace(sensor, electrodes=rotated_polygons), *rotated_press)
     np.testing.assert_allclose(second, first, **EXACT)
 
 
 @pytest.mark.first_cases(3)
 @pytest.mark.parametrize("film", FILMS)
 def test_mirrored_press_has_mirrored_charges(probe, film):
-    """About the y axis."""
+    """The press is mirrored in the y axis, in which electrodes B and C are mirror images."""
     sensor = sensor_of("three-25um-uniaxial", film)
-    order = [0, 2, 1]
+    mirrored_electrodes = [0, 2, 1]
     second = charges(sensor, mirrored(probe), (-AT[0], AT[1]))
-    np.testing.assert_allclose(second, charges(sensor, probe, AT)[order], rtol=2e-5)
+    np.testing.assert_allclose(second, charges(sensor, probe, AT)[mirrored_electrodes], rtol=2e-5)
 
 
 SCALES = {
@@ -94,7 +102,7 @@ SCALES = {
 
 @pytest.mark.parametrize(("length", "modulus"), SCALES.values(), ids=SCALES.keys())
 def test_scaled_press_with_equal_dimensionless_groups_has_scaled_charges(probe, length, modulus):
-    """All lengths and the modulus scaled, pretension and force with them, F ~ E h a."""
+    """All lengths are multiplied by one factor, the modulus and the pretension by another, and the force fits them."""
     sensor = sensor_of("four-25um-uniaxial", "taut 110 um")
     film = sensor.film
     other = Film(

@@ -1,4 +1,4 @@
-"""Charge curves against direct presses and numpy's polynomials; the scheme against the paper's numbers."""
+"""Charge curves compared with direct solves and with polynomials of NumPy, and lines compared with the paper."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def film() -> ForwardMap:
 
 
 def test_mapping_lines_follow_the_scheme_of_the_paper():
-    """Fig. 6: 35, 45, ..., 85 and 90 degrees, every 4 mm."""
+    """The lines of Fig. 6 have angles of 35, 45, ..., 85 and 90 degrees, and presses every 4 mm."""
     mapping = Mapping.lines(SENSOR, "A", (35 * DEG, 90 * DEG))
     np.testing.assert_allclose(mapping.angle / DEG, [35, 45, 55, 65, 75, 85, 90])
     np.testing.assert_allclose(mapping.distance, [4.0, 8.0, 12.0, 16.0, 20.0])

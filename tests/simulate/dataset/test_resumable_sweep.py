@@ -22,11 +22,11 @@ SWEEP = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7)
 
 
 class Stopped(BaseException):
-    """As a signal would."""
+    """Interruption of a sweep, which is not an `Exception`, like the interruption by Ctrl-C."""
 
 
 class Counting(Executor):
-    """Works here and counts."""
+    """Executor that runs all jobs in this process and counts them."""
 
     def __init__(self) -> None:
         self.jobs = 0
@@ -49,13 +49,13 @@ def files(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> tuple[dict[str, bytes], int]:
-    """The files of an uninterrupted run, and how many jobs it took."""
+    """The files of an uninterrupted run, and its number of jobs."""
     executor = Counting()
     return files(sweep_to(tmp_path_factory.mktemp("whole") / "presses", executor=executor)), executor.jobs
 
 
 def sweep_until(target: Path, phase: str, count: int, **options) -> None:
-    """A run that is stopped when so much of a phase, "solving" or "pressing", is done."""
+    """Run a sweep and interrupt it when its progress in a phase ("solving" or "pressing") reaches a number."""
 
     def listener(title: str, done: int, *_) -> None:
         if title.startswith(phase) and done >= count:
@@ -67,7 +67,7 @@ def sweep_until(target: Path, phase: str, count: int, **options) -> None:
 
 @pytest.fixture
 def stopped(tmp_path) -> Path:
-    """The target of a run that was stopped with all solves and two shards of ten done."""
+    """The target of a sweep that was interrupted after all solves and two shards of ten presses."""
     sweep_until(tmp_path / "presses", "pressing", 20)
     return tmp_path / "presses"
 
@@ -84,7 +84,7 @@ def test_stopped_run_is_resumed_with_the_same_bytes(tmp_path, whole, phase, coun
         sweep_to(target, executor=second)
     expected, jobs = whole
     assert (files(target), [path.name for path in tmp_path.iterdir()]) == (expected, ["presses"])
-    assert first.jobs + second.jobs == jobs  # nothing twice
+    assert first.jobs + second.jobs == jobs  # no job is done twice
     assert reports[0] == (count if phase == "pressing" else 0)
 
 
@@ -108,7 +108,7 @@ def test_draft_of_different_settings_is_not_changed(stopped, whole, changes, mes
 
 @pytest.mark.parametrize(("content", "fresh"), [(None, True), ("{", False)])
 def test_existing_folder_is_not_changed(tmp_path, content, fresh):
-    """Somebody's own folder, or a draft that cannot be recognised as one."""
+    """The folder belongs to the user, or its `run.json` is damaged."""
     folder = tmp_path / "presses.part"
     folder.mkdir()
     (folder / "mine.txt").write_text("mine")
@@ -136,7 +136,10 @@ def test_damaged_part_is_reported_and_computed_again(stopped, whole, damage, nam
 
 
 def test_part_without_checksum_is_computed_again(stopped, whole):
-    """As after a kill between the two; nor does a file that was half written get into the dataset."""
+    """A process that is killed may leave a part without a checksum, or a temporary file.
+
+    These parts are computed again, and the temporary file does not become a part of the dataset.
+    """
     (draft_of(stopped) / "data" / ".0123abcd.draft").write_bytes(b"half")
     for name in ("solve-00-0001.npy", "shard-00001.npz"):
         (draft_of(stopped) / "parts" / f"{name}.sha256").unlink()
@@ -156,7 +159,7 @@ def test_second_run_on_the_same_draft_is_refused(tmp_path):
 
 
 def test_run_killed_after_renaming_the_dataset_removes_the_draft_when_resumed(stopped):
-    """The dataset is whole, its draft not yet removed: nothing is redone, and the rest goes."""
+    """The dataset is complete, but its draft was not yet removed. It is removed, and nothing is computed again."""
     draft_of(stopped).joinpath("data").rename(stopped)
     with pytest.raises(OutputExists, match="presses is already there"):
         sweep_to(stopped)

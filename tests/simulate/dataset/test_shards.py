@@ -35,7 +35,7 @@ ABOUT = {"probes": ["circle:1.0"], "ranges": {"radius_mm": 8.0}, "seed": 3, "sol
 
 @pytest.fixture
 def dataset(tmp_path) -> Path:
-    """Two shards, 5 and 3 samples."""
+    """A dataset with two shards, which contain 5 and 3 samples."""
     return write_dataset(tmp_path / "presses", SENSOR, [samples(5, 0), samples(3, 1)], ABOUT)
 
 
@@ -47,7 +47,7 @@ def edit(folder: Path, change) -> None:
 
 
 def replace_shard(folder: Path, **columns) -> None:
-    """Another content for the first shard, with a checksum that fits."""
+    """Replace the columns of the first shard, and write the correct checksum into the manifest."""
     path = folder / "shard-00000.npz"
     with np.load(path) as old:
         arrays = {name: old[name] for name in old} | columns
@@ -110,7 +110,7 @@ def test_read_dataset_of_another_sensor_raises_dataset_error(dataset):
 
 
 def packed(data: bytes) -> bytes:
-    """An npz file whose columns are these bytes."""
+    """Return an npz file whose columns consist of the given bytes."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
         for name in COLUMNS:
@@ -124,7 +124,7 @@ def npy(shape: str, dtype: str = "<f8", data: bytes = b"") -> bytes:
 
 
 def write_shard(folder: Path, data: bytes) -> None:
-    """Other bytes for the first shard, with a checksum that fits."""
+    """Replace the bytes of the first shard, and write the correct checksum into the manifest."""
     (folder / "shard-00000.npz").write_bytes(data)
     edit(folder, lambda manifest: manifest["shards"][0].update(sha256=hashlib.sha256(data).hexdigest()))
 
@@ -214,7 +214,7 @@ DAMAGE = {
 
 @pytest.mark.parametrize("what", DAMAGE)
 def test_damaged_dataset_raises_dataset_error(dataset, what):
-    """A manifest cannot point elsewhere, and nothing in a shard is run."""
+    """A manifest cannot name files outside the dataset, and code in a shard is not executed."""
     spoil, message = DAMAGE[what]
     spoil(dataset)
     with pytest.raises(DatasetError, match=message):
@@ -238,7 +238,7 @@ def test_invalid_samples_are_not_written(tmp_path, changes, message):
 
 
 def test_full_disk_leaves_no_partial_dataset(tmp_path, monkeypatch):
-    """The disk becomes full at each of the files in turn."""
+    """The disk is full when one of the files is written, for each file in turn."""
     for failing in range(1, 5):
         calls = []
 

@@ -1,4 +1,4 @@
-"""A sweep: what it writes, that it can be repeated, and what it refuses."""
+"""Contents and reproducibility of swept datasets, and error messages."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ from isocharge.simulate.dataset.sweep import SHARD_SIZE, TASK_SIZE, write_sweep
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
 QUICK = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
-"""A coarse membrane: half a second for a small family."""
+"""Membrane theory on a coarse mesh. A small family is solved in half a second."""
 
 
 def small(samples: int = 60, **changes) -> Sweep:
@@ -38,7 +38,7 @@ def small(samples: int = 60, **changes) -> Sweep:
 
 @dataclass(frozen=True)
 class Spy:
-    """In place of a forward map: its charges are what it was asked for."""
+    """Substitute for a forward map, whose three charges are the x, y and orientation of its arguments."""
 
     probe: Circle | Polygon
     sensor: Sensor = SENSOR
@@ -89,7 +89,7 @@ def test_manifest_of_a_sweep(small_dataset, three_map):
 
 
 def test_run_sweep_writes_the_same_bytes_as_write_sweep_and_reports_progress(tmp_path):
-    """Whether or not a draft is kept on the way."""
+    """`run_sweep` stores its parts in a draft, and `write_sweep` does not. The datasets are equal."""
     reports: dict[str, list] = {}
     with listening(lambda title, done, total, _: reports.setdefault(title, []).append((done, total))):
         drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (Circle(1.0),), small(), QUICK)
@@ -102,23 +102,24 @@ def test_run_sweep_writes_the_same_bytes_as_write_sweep_and_reports_progress(tmp
 
 
 def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path):
-    """The angle that the probe was given with and the press's own; the map is asked for the latter only."""
+    """The dataset contains the sum of both angles. The forward map receives the rotation of the press only."""
     probes = [parse_probe(text) for text in ("rectangle:4.0x2.0@30", "triangle:4.0@-30", "circle:1.0@50")]
     for orientation in ("fixed", "random"):
         sweep = Sweep(samples=999, orientation=orientation)
         read = read_dataset(write_sweep(tmp_path / orientation, [Spy(probe) for probe in probes], sweep)).samples
         assert read.probe.tolist() == ["rectangle:4.0x2.0", "triangle:4.0", "circle:1.0"] * 333
-        own = read.charge_pC[:, 2]
-        whole = read.orientation_deg
-        np.testing.assert_allclose((whole - own - np.tile([30.0, -30.0, 0.0], 333) + 180.0) % 360.0, 180.0, atol=1e-6)
-        assert (whole >= 0.0).all()
-        assert (whole < 360.0).all()
-    assert set(whole[read.probe == "triangle:4.0"].round(3).tolist()) != {330.0}
+        rotation = read.charge_pC[:, 2]
+        total = read.orientation_deg
+        difference = total - rotation - np.tile([30.0, -30.0, 0.0], 333)
+        np.testing.assert_allclose((difference + 180.0) % 360.0, 180.0, atol=1e-6)
+        assert (total >= 0.0).all()
+        assert (total < 360.0).all()
+    assert set(total[read.probe == "triangle:4.0"].round(3).tolist()) != {330.0}
     assert read_dataset(tmp_path / "fixed").samples.orientation_deg[:3].tolist() == [30.0, 330.0, 0.0]
 
 
 def test_shards_and_tasks_keep_the_order_of_the_presses(tmp_path):
-    """More than a shard, more than a task in one, and each press with its own charges."""
+    """The sweep has two shards, and the first shard has several tasks. Each press has its own charges."""
     sweep = Sweep(samples=SHARD_SIZE + 10, orientation="random")
     maps = [Spy(Polygon.rectangle(side, 2.0)) for side in (3.0, 4.0, 5.0)]
     read = read_dataset(write_sweep(tmp_path / "large", maps, sweep))
@@ -130,7 +131,7 @@ def test_shards_and_tasks_keep_the_order_of_the_presses(tmp_path):
     np.testing.assert_allclose(read.samples.charge_pC[:, 2], np.rad2deg(presses.rotation))
 
 
-# Refused, and failed
+# Errors
 
 
 def test_unwritable_folder_raises_output_error(tmp_path):

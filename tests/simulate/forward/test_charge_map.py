@@ -18,7 +18,7 @@ def linear(contact: np.ndarray) -> np.ndarray:
 
 
 CHECKED = ("forward map", "spline", "film family")
-"""Maps that refuse contacts outside their domain; others state it and leave the rest to the function."""
+"""Maps that refuse contacts outside their domain. Other maps evaluate their function there."""
 
 
 @pytest.fixture
@@ -43,10 +43,10 @@ def contacts(domain: Domain, count: int = 60, share: float = 0.97) -> np.ndarray
 
 @pytest.mark.parametrize("charge_map", [*CHECKED, "within", "function"], indirect=True)
 def test_maps_implement_the_charge_map_protocol(charge_map):
-    """Derivatives are those of the charges, over another step.
+    """The derivatives agree with finite differences of the charges with another step.
 
-    On the mesh that `press` chooses they agree within 2e-4 of the largest; at order 4 the kinks between the elements of
-    a membrane would leave 5e-3.
+    On the mesh that `press` chooses, the difference is below 2e-4 of the largest derivative. With elements of order 4,
+    it would be 5e-3, because the slope of a membrane has kinks between the elements.
     """
     contact = contacts(charge_map.domain, share=0.7)
     charge = charge_map.charges(contact)

@@ -72,10 +72,10 @@ def test_stress_charges_for_all_forces_equal_the_charges_of_the_map(near_map):
 
 
 def test_spline_includes_the_charge_of_contact_pressure(near_map):
-    """d33 adds charges that go with the force itself, not with the amplitude's square.
+    """The charges of d33 are proportional to the force, while those of the stress depend on the squared amplitude.
 
-    Their slope has a kink where the footprint's edge meets an electrode's corner: of them knots that are 0.5 mm apart
-    leave 1.1 %, and 0.25 mm apart 0.2 %.
+    The slope of these charges has a kink where the edge of the footprint meets a corner of an electrode. The error of
+    the spline is therefore 1.1 % with knots every 0.5 mm, and 0.2 % with knots every 0.25 mm.
     """
     sensor = near_map.sensor
     contact = spread(100)

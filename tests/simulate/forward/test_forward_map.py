@@ -41,9 +41,9 @@ def oriented_map(near_electrodes, request) -> ForwardMap:
 
 
 def errors(forward_map: ForwardMap, contact: np.ndarray, rotation: np.ndarray | float = 0.0) -> np.ndarray:
-    """Relative errors of all charges, small ones counted against a tenth of their press's largest.
+    """Return the errors of the charges of a map, compared with direct solves on the same mesh with the same theory.
 
-    The same presses are solved one by one, on the map's mesh and with its theory.
+    An error is relative to the charge, or to a tenth of the largest charge of the press if this is larger.
     """
     sensor, settings, probe = forward_map.sensor, forward_map.settings, forward_map.probe
     expected = np.array(

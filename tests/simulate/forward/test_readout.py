@@ -77,7 +77,7 @@ def solved(film) -> Equilibrium:
 
 
 def test_polygon_integrates_polynomials_exactly():
-    """Triangle (0, 0), (6, 0), (0, 3) mm: the mean of x^2 is b^2 / 6, of x y is b h / 12."""
+    """For the triangle (0, 0), (b, 0), (0, h), the mean of x^2 is b^2 / 6, and the mean of x y is b h / 12."""
     triangle = Electrode("A", np.array([[0.0, 0.0], [6.0, 0.0], [0.0, 3.0]]))
     sensor = replace(load_sensor("four-25um-uniaxial"), electrodes=[triangle])
     charge = charge_of(sensor, lambda x, y: (x**2, x * y, 0 * x))
@@ -95,11 +95,11 @@ def test_charge_is_linear_in_gains_and_coefficients(solved):
     np.testing.assert_allclose(touch_charge(sensor, solved), 20.0 * first + 2.0 * second, rtol=1e-12)
 
 
-# Traces, dents, front and back
+# Traces, concave electrodes, and metal on the back
 
 
 def midpoints(low, high, step=0.02):
-    """Centres of small cells of a rectangle, shape (n, 2), and their area, mm^2."""
+    """Return the centres of small cells of a rectangle, shape (n, 2), and the area of a cell, mm^2."""
     counts = np.round(np.subtract(high, low) / step).astype(int)
     x, y = (a + (b - a) * (np.arange(n) + 0.5) / n for a, b, n in zip(low, high, counts, strict=True))
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), np.prod(np.subtract(high, low)) / counts.prod()
@@ -195,10 +195,10 @@ def with_d33(d33: float = -30.0, **changes) -> Sensor:
     ],
 )
 def test_contact_charge_is_proportional_to_the_covered_area(probe, at, covered):
-    """Positive for PVDF's negative d33; nothing on the others.
+    """The charge is Q = -d33 F / (2 footprint) * overlap. It is positive for the negative d33 of PVDF.
 
-    Balance through a film whose other face is free, s33(z) = -p (1/2 + z / h), has the mean -p / 2. So
-    Q = -d33 F / (2 footprint) * overlap.
+    The stress s33(z) = -p (1/2 + z / h) balances the pressure p on one face of the film, and the other face is free.
+    Its mean is -p / 2.
     """
     charge = contact_charge(with_d33(), probe, at, 0.7)
     np.testing.assert_allclose(charge, [0.5 * 30.0 * 0.7 / probe.area * covered, 0.0, 0.0, 0.0], rtol=1e-9, atol=1e-12)
@@ -216,7 +216,10 @@ def test_contact_charge_follows_gain_and_place_of_the_electrodes():
 
 
 def test_thermal_charge():
-    """-30 uC/(m^2 K) on 9 mm^2: -27 pC per 0.1 K, the same on every electrode; less on a smaller."""
+    """A coefficient of -30 uC/(m^2 K) gives -27 pC on 9 mm^2 for a temperature step of 0.1 K.
+
+    The triangle has an area of 8 mm^2, and its gain is 0.5.
+    """
     sensor = load_sensor("three-25um-biaxial")
     electrodes = (sensor.electrodes[0], TRIANGLE)
     sensor = replace(sensor, piezo=replace(sensor.piezo, pyro=-30.0), electrodes=electrodes)
@@ -226,9 +229,10 @@ def test_thermal_charge():
 
 
 def test_signs_of_tension_pressure_and_warming_follow_the_thickness():
-    """A film of fixed dipoles, P the charge of one face over its area: dQ / Q = -dh / h, whatever changes h.
+    """The coefficients of a film of fixed dipoles follow from the change of its thickness, dQ / Q = -dh / h.
 
-    Tension s in both directions thins by 2 nu s / E, pressure p on a free film by p / (2 E), warming thickens by a dT.
+    The polarization is the charge of one face per area. A tension s in both directions reduces the thickness by the
+    factor 2 nu s / E, and a pressure p on one face by p / (2 E). Warming increases the thickness.
     """
     polarization = 0.18e6  # pC/mm^2
     young = 3000.0  # MPa

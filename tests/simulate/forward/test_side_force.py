@@ -1,4 +1,4 @@
-"""Side forces of the probe and friction: against direct solves, a closed form, reciprocity and the film's symmetry."""
+"""Side forces and friction, compared with direct solves, a closed form, a reciprocity and the symmetry of the film."""
 
 from dataclasses import replace
 
@@ -36,11 +36,11 @@ def test_side_force_jacobian_equals_differences_of_direct_solves(side_force_map,
     np.testing.assert_allclose(jacobian.T, expected, atol=2e-3 * np.abs(expected).max())
 
 
-def test_a_side_force_on_a_taut_film_gives_the_charges_of_a_clamped_disk_in_its_plane():
-    """Muskhelishvili's potentials of a force P at the centre of a clamped disk: phi' = -C (1 / z + 2 z / (kappa a^2)).
+def test_a_side_force_on_a_film_with_pretension_gives_the_charges_of_a_clamped_disk_in_its_plane():
+    """The stress is that of Muskhelishvili's potential for a force in the plane at the centre of a clamped disk.
 
-    Then s11 + s22 = 4 Re phi', a harmonic function, whose mean over a square with the centre z is its value at z up to
-    the fourth derivative.
+    The potential is phi' = -C (1 / z + 2 z / (kappa a^2)), and s11 + s22 = 4 Re phi'. This is a harmonic function. Its
+    mean over a square is its value at the centre of the square, up to terms of the fourth derivative.
     """
     sensor = taut("four-25um-biaxial", 1.0)
     film = sensor.film
@@ -58,7 +58,11 @@ def test_a_side_force_on_a_taut_film_gives_the_charges_of_a_clamped_disk_in_its_
 
 
 def test_holding_force_and_slip_are_reciprocal_to_the_deflection():
-    """Betti: the deflection under the probe per side force is the displacement along the film per force."""
+    """By Betti's theorem, the derivatives of two displacements under the probe are equal.
+
+    They are the derivative of the deflection with respect to the side force, and that of the displacement in the plane
+    with respect to the force.
+    """
     film = taut("four-25um-biaxial", 0.8).film
     at = (6.0, 0.0)
 
@@ -100,8 +104,8 @@ def test_friction_charges_look_like_a_press_farther_outwards(side_force_map):
     assert 0.2 < shift[:2] @ np.array([3.0, -2.0]) / np.hypot(3.0, 2.0) < 0.3
 
 
-def test_side_forces_of_a_square_probe_turn_with_the_film():
-    """A press and its side force that are turned by 90 degrees give the same charges on the turned electrodes."""
+def test_a_rotated_side_force_of_a_square_probe_gives_rotated_charges():
+    """If a press and its side force are rotated by 90 degrees, each electrode has the charge of its neighbour."""
     sensor = taut("four-25um-biaxial", 0.5)
     square = Polygon.rectangle(2.0, 2.0)
     first = charge_of(sensor, press(sensor.film, square, (4.0, 1.0), 0.3, FULL, side_force=(0.05, -0.02)))

@@ -1,4 +1,4 @@
-"""Change of the charges by the pretension and by the temperature of the film, against direct solves."""
+"""Change of the charges by the pretension and by the temperature of the film, compared with direct solves."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The coarse forward map of the whole film against direct solves on a finer mesh."""
+"""The coarse forward map of the whole film, compared with direct solves on a finer mesh."""
 
 from dataclasses import replace
 

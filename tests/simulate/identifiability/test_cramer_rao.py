@@ -1,4 +1,4 @@
-"""Cramer-Rao limits against closed forms and the scatter of an efficient estimator."""
+"""Cramer-Rao limits compared with closed forms and with results of an independent search."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ AT = np.array([[8.0, 0.0], [0.0, 8.0], [-8.0, 0.0], [0.0, -8.0]])
 
 
 def far_field(contact):
-    """Charges that fall with the distance from four electrodes and go with F^(2/3); pC."""
+    """Return charges that decrease with the distance from four electrodes and are proportional to F^(2/3), pC."""
     distance = np.linalg.norm(contact[:, None, :2] - AT, axis=2)
     return 1e3 * contact[:, 2:] ** (2.0 / 3.0) / (1.0 + (distance / 10.0) ** 2)
 
@@ -26,7 +26,10 @@ CONTACT = np.array([[1.0, -2.0, 0.3], [4.0, 3.0, 1.5]])
 
 
 def test_information_of_a_reading_agrees_with_numerical_integration():
-    """Fisher's information is the mean square of the likelihood's slope; with a large gain sigma informs, too."""
+    """The Fisher information is the mean square of the derivative of the log likelihood.
+
+    If the noise depends strongly on the charge, the size of the noise also provides information.
+    """
     model = NoiseModel("wild", 1.0, 0.4)
     charge = 3.0
 
@@ -53,7 +56,7 @@ def test_linear_charges_give_the_covariance_of_least_squares():
 
 
 def test_nuisances_are_equivalent_to_correlated_noise():
-    """Unknowns with a prior, marginalised, are correlated noise: covariance diag(1/i) + N N' (Woodbury)."""
+    """Unknowns with a prior act like correlated noise with the covariance diag(1/i) + N N' (Woodbury's identity)."""
     rng = np.random.default_rng(3)
     charge = rng.uniform(100.0, 1000.0, (20, 5))
     jacobian = rng.normal(size=(20, 5, 3)) * [100.0, 100.0, 1000.0]
@@ -66,7 +69,7 @@ def test_nuisances_are_equivalent_to_correlated_noise():
 
 
 def test_limit_of_an_unobservable_parameter_is_large():
-    """Charges that do not depend on y."""
+    """The charges do not depend on y."""
     blind = replace(MAP, function=lambda contact: far_field(contact * [1.0, 0.0, 1.0]))
     limits = limits_at(blind, CONTACT, REFERENCE)
     assert np.isfinite(limits.position).all()
@@ -85,7 +88,10 @@ def test_limit_of_an_unobservable_parameter_is_large():
     ],
 )
 def test_limits_of_layouts_agree_with_an_independent_search(three_map, places, worst, rms):
-    """Within 8 mm at 1 N, from an independent search over layouts; the worst depends on the grid by 4 %."""
+    """The expected errors within 8 mm at 1 N are from an independent search over layouts.
+
+    The largest error differs by up to 4 % between grids.
+    """
     electrodes = tuple(Electrode.of_square(name, place, 3.0) for name, place in zip("ABCD", places, strict=False))
     charges = ChargeSpline.of(replace(three_map, sensor=replace(three_map.sensor, electrodes=electrodes)), spacing=0.3)
     at = square_grid(8.0, 0.3)

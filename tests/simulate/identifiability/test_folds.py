@@ -113,7 +113,7 @@ def test_find_folds_finds_nothing_without_a_fold_line():
 
 
 def test_find_folds_finds_a_fold_smaller_than_the_rings():
-    """The slope of the first charge is negative within 0.1 mm of a point amid places that are 0.2 mm apart."""
+    """The slope of the first charge is negative only within 0.1 mm of a point. The grid has a spacing of 0.2 mm."""
     at = 1.5 * np.array([np.cos(np.pi * 0.225), np.sin(np.pi * 0.225)])
     width = 0.1
 
@@ -132,7 +132,7 @@ def test_find_folds_finds_a_fold_smaller_than_the_rings():
 
 
 def test_working_area_ends_at_a_large_error_between_the_rings():
-    """Within 0.03 mm of a point between the rings' places the first charge hardly changes: 20 times the error."""
+    """Within 0.03 mm of a point between the rings, the slope of the first charge is 5 % of its value elsewhere."""
     at = 3.025 * np.array([np.cos(np.pi / 180.0), np.sin(np.pi / 180.0)])
     width = 0.03
 
@@ -147,7 +147,7 @@ def test_working_area_ends_at_a_large_error_between_the_rings():
 
 
 def test_error_does_not_exceed_its_limit_on_finer_rings_within_the_working_area(film):
-    """Beside an electrode within the area the error rises between one ring and the next."""
+    """Beside an electrode within the area, the error may be larger between two rings than on both rings."""
     charges = ChargeSpline.of(squares(film, *INNER), 9.0, 0.3)
     working = working_area(charges, REFERENCE, search_pairs=False, error=0.3)
     assert limits_at(charges, Rings.spread(working.radius).contacts(0.05), REFERENCE).position.max() <= 0.3
@@ -163,7 +163,10 @@ def test_derivative_of_four_charges_is_singular_at_a_point():
 
 
 def test_find_folds_finds_nothing_in_a_sharply_bent_map():
-    """A sheet bent round a cylinder of 0.2 mm: 0.4 mm apart it has turned over, and every place has its own charges."""
+    """The map is a sheet that is bent around a cylinder with a radius of 0.2 mm.
+
+    Its orientation is reversed at a distance of 0.4 mm, but the map has no fold, and all charges are different.
+    """
     bend = 0.2
     model = shaped_charges(lambda x, _: bend * np.cos(x / bend), lambda x, _: bend * np.sin(x / bend), lambda _, y: y)
     near, far = (scaled_derivatives(model, np.array([[x, 0.0, 1.0]]), REFERENCE) for x in (-0.2, 0.2))
@@ -173,26 +176,29 @@ def test_find_folds_finds_nothing_in_a_sharply_bent_map():
 
 
 def test_find_folds_finds_nothing_beside_an_electrode(film):
-    """Rings 0.3 mm apart seem to turn over beside it, 1.7 mm from the centre; ten times finer ones do not."""
+    """Beside the electrode, the orientation seems reversed between rings with a spacing of 0.3 mm.
+
+    It is not reversed between rings with a tenth of this spacing, so there is no fold.
+    """
     force = 0.05
     charges = ChargeSpline.of(squares(film, *INNER), 4.0)
-    for count, seems in ((13, True), (130, False)):
+    for count, seems_reversed in ((13, True), (130, False)):
         rings = Rings.spread(4.0, count, 60)
         scaled = rings.per_ring(scaled_derivatives(charges, rings.contacts(force), REFERENCE))
-        assert has_reversed_orientation(scaled[:-1], scaled[1:]).any() == seems
+        assert has_reversed_orientation(scaled[:-1], scaled[1:]).any() == seems_reversed
     assert len(find_folds(charges, Rings.spread(4.0, 13, 60), force, REFERENCE).points) == 0
 
 
 def test_nearest_fold_agrees_with_signs_of_the_determinant_on_a_fine_grid(charges):
-    """Brute force, with derivatives by differences: signs of det J."""
+    """The determinant of J is computed by finite differences on a grid. Folds separate regions of different sign."""
     model = charges("three-25um-uniaxial")
     steps = 0.1 * np.arange(-50, 51)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
     contact = np.stack([x, y, np.full(x.size, 0.316)], axis=1)
     sign = np.sign(np.linalg.det(differences(model.charges, contact, (0.01, 0.01, 1e-3))))
-    turned = sign != sign[x.size // 2]
+    is_beyond_fold = sign != sign[x.size // 2]
     folds = find_folds(model, Rings.spread(11.5), 0.316, REFERENCE).points
-    assert np.hypot(*folds[0]) == pytest.approx(np.hypot(x, y)[turned].min(), abs=0.1)
+    assert np.hypot(*folds[0]) == pytest.approx(np.hypot(x, y)[is_beyond_fold].min(), abs=0.1)
 
 
 @pytest.mark.parametrize("forces", [FORCES, (0.5, 0.5)], ids=["a range", "one force"])

@@ -48,7 +48,7 @@ def test_identification_to_dict_can_be_written_as_json(identification):
 
 
 def test_determined_share_agrees_with_random_positions(film, identification):
-    """Of 2,000 places drawn at random, those where the limits at all three forces are within the allowed error."""
+    """The share is compared with that of 2,000 random positions whose limits at all three forces are small enough."""
     strict = replace(identification.area, error=0.1)
     rng = np.random.default_rng(0)
     found = replace(identification, area=strict)
@@ -86,7 +86,7 @@ def test_summary_states_the_determined_share_if_the_map_folds(identification):
 
 
 def test_working_area_with_an_electrode_at_the_centre_is_small(film):
-    """The area is smaller than the distance of the rings of the whole film."""
+    """The area is smaller than the spacing of the rings on the whole film."""
     places = ((0.0, 0.0), (8.66, 5.0), (-8.66, 5.0))
     electrodes = tuple(Electrode.of_square(name, at, 3.0) for name, at in zip("ABC", places, strict=True))
     numbers = Identification.of(replace(film, sensor=replace(SENSOR, electrodes=electrodes)), REFERENCE).to_dict()

@@ -19,11 +19,11 @@ CIRCLE = 10.0 * np.exp(2j * np.pi * np.arange(4) / 4)
 
 
 def inverse_distance_map(electrodes, radius):
-    """Charges in proportion to the force over the distance between electrode and press.
+    """Return a map whose charges are the force divided by the distance between electrode and press, times a constant.
 
-    Inversion in a circle about the origin divides the distances from every point of the circle by the same factor. If
-    all electrodes lie on the circle of 10 mm, a press at r and one at 100 / r with the force 10 F / r therefore have
-    exactly the same charges.
+    Inversion in a circle about the origin divides the distances from all points of the circle by the same factor. If
+    all electrodes lie on the circle of 10 mm, a press at the distance r with the force F has therefore exactly the same
+    charges as a press at 100 / r with the force 10 F / r.
     """
 
     def charges(contact):
@@ -56,7 +56,7 @@ def test_an_electrode_at_another_radius_removes_the_mirror_region():
 
 
 def test_a_press_at_20_mm_on_the_film_has_the_charges_of_one_at_5_mm():
-    """The mirror image of the circle of 10 mm, R^2 / r; the film itself gives 5.2 mm and 0.24 N."""
+    """The mirror image in the circle of 10 mm is at R^2 / r = 5 mm. On the film, it is at 5.2 mm, with 0.24 N."""
     sensor = load_sensor("four-25um-biaxial")
     inside = kept(ForwardMap.build, sensor, Circle(1.0), 9.0, FORCES)
     coarse = replace(kept(whole_film_map, sensor, Circle(1.0), FORCES), sensor=sensor)

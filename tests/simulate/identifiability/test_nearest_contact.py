@@ -1,4 +1,4 @@
-"""The choice of candidates for the nearest contact, against a full sort."""
+"""The choice of candidates for the nearest contact, compared with a complete sort."""
 
 import numpy as np
 import pytest

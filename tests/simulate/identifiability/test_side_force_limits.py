@@ -1,4 +1,4 @@
-"""Limits of contacts with an unknown side force, against the Fisher information of direct solves."""
+"""Limits of contacts with an unknown side force, compared with the Fisher information of direct solves."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def side_force_map_with_six_electrodes(side_force_map) -> SideForceMap:
 
 @pytest.mark.slow
 def test_side_force_limit_equals_that_of_direct_solves(forward_map, side_force_map_with_six_electrodes):
-    """The Jacobian of (x, y, ln F, Fx / F, Fy / F) by differences of direct solves, at one position of the rings."""
+    """The derivatives with respect to (x, y, ln F, Fx / F, Fy / F) are finite differences of direct solves."""
     sensor = forward_map.sensor
     force = 0.5
 

@@ -75,7 +75,10 @@ def test_temperature_drift_is_smooth_and_equal_on_all_electrodes():
 
 
 def test_temperature_step_gives_its_pyroelectric_charge():
-    """0.5 K within 5 ms, which 25 um of PVDF follow with rho c h / (2 U) = 2.67 s; a press would be positive."""
+    """The temperature rises by 0.5 K within 5 ms. A film of 25 um follows with the time constant 2.67 s.
+
+    The time constant is rho c h / (2 U). The charge of the temperature is negative, while that of a press is positive.
+    """
     part = Amplifier(noise=CLEAN, step=0.5, step_at=2.0, step_time=0.005)
     readings, _ = measure(part, np.zeros((5000, 3)))
     time = np.arange(5000) / RATE - 2.0

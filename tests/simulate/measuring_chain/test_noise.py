@@ -1,4 +1,4 @@
-"""The noise model against the statistics of what it draws."""
+"""The noise model compared with the statistics of the noise that it draws."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from isocharge.simulate.measuring_chain.noise_file import AMPLIFIER_LEVELS
 
 @pytest.mark.parametrize(("charge", "sigma"), [(0.0, 1.0), (500.0, np.sqrt(2.0)), (3000.0, 6.0827625)])
 def test_sigma_of_the_reference_level(charge, sigma):
-    """(1 pC)^2 + (0.002 Q)^2; the sign of the charge does not matter."""
+    """The variance is (1 pC)^2 + (0.002 Q)^2. It does not depend on the sign of the charge."""
     model = noise_model("reference")
     charges = np.array([charge, -charge])
     np.testing.assert_allclose(model.sigma(charges), sigma, rtol=1e-7)
@@ -27,7 +27,7 @@ def test_added_noise_is_gaussian_with_sigma(charge):
 
 
 def test_noise_is_independent_between_channels_and_readings():
-    """No correlation between electrodes, nor from one reading to the next."""
+    """The noise of different electrodes and of successive readings is not correlated."""
     noise = noise_model("reference").add(np.zeros((20_000, 3)), np.random.default_rng(1))
     joined = np.concatenate([noise[1:], noise[:-1]], axis=1)
     assert np.abs(np.corrcoef(joined.T) - np.eye(6)).max() < 4.0 / np.sqrt(20_000)
@@ -40,7 +40,7 @@ def test_noise_level_clean_adds_nothing():
 
 @pytest.mark.parametrize("level", AMPLIFIER_LEVELS)
 def test_noise_and_amplifier_levels_have_the_same_noise(level):
-    """Training and limits take charges one by one, the virtual sensor in time: from one level the same noise."""
+    """Single readings for training and limits have the same noise as the time series of the virtual sensor."""
     assert noise_model(level) == load_amplifier(level).noise
 
 

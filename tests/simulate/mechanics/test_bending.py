@@ -28,7 +28,10 @@ def test_tilt_has_bending_energy_at_the_clamped_rim_only(fine):
 
 @pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.notation.partition(":")[0])
 def test_lowest_frequency_of_a_clamped_plate(mesh_of, probe):
-    """lap lap W = k^4 W with J0(k) I1(k) + I0(k) J1(k) = 0, k = 3.1962 (Rayleigh 1894, art. 221)."""
+    """The lowest mode of a clamped plate satisfies lap lap W = k^4 W with k = 3.1962 (Rayleigh 1894, art. 221).
+
+    This k is the first root of J0(k) I1(k) + I0(k) J1(k) = 0.
+    """
     k = brentq(lambda k: jv(0, k) * iv(1, k) + iv(0, k) * jv(1, k), 3.0, 3.4)
     mesh = mesh_of(probe, (0.3, 0.0), Resolution(4, 8, 4))
     geometry = mesh.geometry

@@ -1,6 +1,7 @@
-"""The first rung of the ladder: energy, force and tangent agree, with stretching, bending and both, on every template.
+"""Energy, force and tangent agree, with stretching, bending and both, on every template.
 
-The energy is a polynomial of degree four in the nodal values, so five-point differences are exact but for round-off.
+The energy is a polynomial of degree four in the nodal values. Finite differences with five points are therefore exact
+except for round-off.
 """
 
 import numpy as np
@@ -26,7 +27,10 @@ def elastic(request, mesh) -> ElasticFilm:
 
 
 def condensed(mesh, matrix: np.ndarray) -> np.ndarray:
-    """The whole matrix over (U1, U2, W) alone: the Schur complement of the carried Laplacian; (3 n_node, 3 n_node)."""
+    """Return the dense matrix for (U1, U2, W), shape (3 n_node, 3 n_node).
+
+    The fourth unknown, the Laplacian of W, is eliminated by a Schur complement.
+    """
     n_node = mesh.template.n_node
     size = 3 * mesh.template.n_node
     whole = assembled(mesh.template, matrix).reshape(n_node, -1, n_node, matrix.shape[2])

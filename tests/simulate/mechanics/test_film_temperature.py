@@ -1,4 +1,4 @@
-"""Pretension at other temperatures of film and ring, against the closed forms of plane stress."""
+"""Pretension at other temperatures of film and ring, compared with closed forms of plane stress."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def test_tension_of_a_drawn_film_on_aluminium_changes_mostly_across_the_drawn_di
 
 
 def test_tension_turns_with_the_axis_of_an_orthotropic_film():
-    """Compliance in the axes of the film: strain = S stress, with nu12 / E1 = poisson / sqrt(E1 E2)."""
+    """Return the compliance S in the axes of the film (strain = S stress), where nu12 / E1 = poisson / sqrt(E1 E2)."""
     film = film_with(expansion=(-5e-6, 100e-6), young_ratio=2.0, axis=np.deg2rad(30.0))
     first = YOUNG * np.sqrt(2.0)
     second = YOUNG / np.sqrt(2.0)

@@ -94,7 +94,7 @@ def test_chosen_theory_is_accurate_or_the_full_theory(thickness, pretension, for
 )
 @settings(derandomize=True)
 def test_amplitude_solves_the_cubic_equation(thickness, pretension, force, poisson):
-    """A^3 + (1.6 pretension / E + 16 pi b) A = F / (E h a): so height is one, and the load is what the cubic says."""
+    """The scale A satisfies A^3 + (1.6 pretension / E + 16 pi b) A = F / (E h a)."""
     film = Film(45.0, thickness, 3000.0, poisson, pretension)
     a = np.sqrt(amplitude_squared(film, force))
     b = (thickness / 45.0) ** 2 / (12.0 * (1.0 - poisson**2))
@@ -116,9 +116,10 @@ def test_theory_for_a_sensor_suffices_for_all_forces_and_the_surface(film):
 
 
 def draw(rng: np.random.Generator) -> tuple[Film, Circle | Polygon, tuple[float, float], float]:
-    """A press for one of the simpler theories: thin, thick or taut; the probe off the electrodes or on them."""
+    """Draw a press on a thin or thick film with or without pretension."""
 
     def between(low: float, high: float) -> float:
+        """Draw a number whose logarithm is uniform."""
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
     thickness = between(0.005, 2.0)
@@ -131,9 +132,10 @@ def draw(rng: np.random.Generator) -> tuple[Film, Circle | Polygon, tuple[float,
 
 
 def test_modelling_error_is_an_upper_bound_of_the_difference_of_theories():
-    """Of the worst charge, over the press's largest, for drawn presses that get a simpler theory, on the same mesh.
+    """The charges of a simpler theory differ from those of the complete theory by at most the modelling error.
 
-    A hundredth of the accuracy is for the digits of Newton's method.
+    The difference is relative to the largest charge of the press, and both theories use the same mesh. A hundredth of
+    the accuracy is added because Newton's method stops at a small residual.
     """
     rng = np.random.default_rng(5)
     accuracy = 1e-2

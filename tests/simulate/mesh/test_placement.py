@@ -66,14 +66,17 @@ def exact_points(placement: Placement, mesh: Template, xi: np.ndarray, eta: np.n
 
 
 def found_again(placement: Placement, mesh: Template, film: np.ndarray) -> np.ndarray:
-    """Film points of the elements and local coordinates that `locate` gives; these lie in [-1, 1]."""
+    """Return the points of the local coordinates that `locate` finds. These coordinates must lie in [-1, 1]."""
     element, xi, eta = (found[0] for found in locate_points(placement.batch(), mesh, film[None]))
     assert np.abs(np.concatenate([xi, eta])).max() <= 1.0 + 1e-7
     return exact_points(placement, mesh, xi, eta)[element, np.arange(film.size)]
 
 
 def accuracy(film: np.ndarray, placement: Placement) -> np.ndarray:
-    """1e-9 of the size of the elements nearby: those of a small probe are small, those at a near rim too."""
+    """Return the tolerance for each point, which is 1e-9 of the size of the elements near the point.
+
+    Elements are small near a small probe, and between a probe and a near rim.
+    """
     (distance,) = np.abs(film[None] - placement.corners.mean())
     room = 1.0 - np.abs(placement.corners).max()
     return 1e-9 * np.minimum(1.0, np.maximum(distance, 1e-3 * room) + np.ptp(np.abs(placement.corners)) + 1e-3)

@@ -25,7 +25,10 @@ def convex(draw) -> np.ndarray:
 
 
 def halves(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A polygon cut along the line from its first corner to a middle one (triangles are cut to an edge's middle)."""
+    """Cut a polygon along the line from its first corner to a corner on the other side.
+
+    A triangle is cut along the line from its first corner to the middle of the opposite side.
+    """
     if z.size == 3:
         middle = 0.5 * (z[1] + z[2])
         return np.array([z[0], z[1], middle]), np.array([z[0], middle, z[2]])

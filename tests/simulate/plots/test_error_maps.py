@@ -1,4 +1,4 @@
-"""Pictures of least errors, on made-up ones."""
+"""Pictures of smallest possible errors, drawn for given errors."""
 
 from types import SimpleNamespace
 
@@ -37,7 +37,7 @@ def test_error_maps_picture_marks_the_position_of_the_largest_error(nuisances, b
 
 
 def test_identification_picture_shows_the_error_against_distance():
-    """Errors that grow with the distance and fall with the force; the worst of a ring is twice the median."""
+    """The errors are proportional to distance / force. On each ring, the largest error is twice the median."""
     rings = Rings.spread(6.0)
     shape = rings.position.shape[:2]
     uneven = np.linspace(0.0, 2.0, shape[1])

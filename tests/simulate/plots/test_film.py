@@ -1,4 +1,4 @@
-"""Pictures of the film, as matplotlib has them."""
+"""Pictures of the film, checked by the objects that matplotlib draws."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def test_draw_electrodes_draws_front_and_back_at_their_positions():
 
 
 def test_draw_charge_map_covers_the_whole_disk():
-    """By charges that are the place itself: the shades reach to the rim on all sides."""
+    """The shaded area extends to the edge of the domain on all sides."""
     charge_map = FunctionMap(lambda contact: contact[:, :1], ("A",), Domain(8.0, (0.1, 1.0)))
     axes = Figure().subplots()
     draw_charge_map(axes, charge_map, 0)
@@ -41,7 +41,7 @@ def test_draw_probe_draws_the_footprint_at_its_position():
 
 @pytest.mark.parametrize(("at", "distance"), [((3.0, -4.0), 5.0), ((0.0, 0.0), 0.0)])
 def test_draw_section_goes_through_the_probe(at, distance):
-    """From rim to rim, deepest under the probe, below its mark."""
+    """The section extends from rim to rim. The deflection is largest under the mark of the probe."""
     axes = Figure().subplots()
     draw_section(axes, press(load_sensor("three-25um-biaxial").film, Circle(1.0), at, 1.0))
     film, mark = axes.lines

@@ -202,7 +202,10 @@ def test_pressure_charge_of_an_ellipse_on_an_electrode():
 
 @pytest.mark.parametrize("share_of_radius", [-0.9, -0.3, 0.0, 0.5, 0.99])
 def test_force_share_of_a_finger_on_a_half_plane_is_the_closed_form(share_of_radius):
-    """Integrated across the footprint, Hertzian pressure is 3/4 (1 - c^2), so (2 - 3 c + c^3) / 4 lies beyond c."""
+    """The share of the Hertzian pressure beyond a line at the distance c (in radii) is (2 - 3 c + c^3) / 4.
+
+    The integral of the pressure along such a line is proportional to 3/4 (1 - c^2).
+    """
     finger = Finger(5.0)
     edge = 5.0 * share_of_radius
     beyond = np.array([(edge, -50.0), (50.0, -50.0), (50.0, 50.0), (edge, 50.0)])

@@ -169,7 +169,7 @@ def test_invalid_trace_raises_error(path, width, message):
 
 
 def test_area_of_a_union_counts_overlaps_once():
-    """A mitred trace is as large as its middle line is long; what lies on the square or on another trace is there."""
+    """The area of a trace is its width times the length of its middle line. Overlapping metal counts once."""
     assert TRACED.area == pytest.approx(9.0 + 0.5 * (14.0 - 1.5), rel=1e-12)
     twice = TRACED.with_trace(((9.0, 0.0), (4.0, 0.0)), 0.5)
     assert twice.area == pytest.approx(TRACED.area, rel=1e-12)

@@ -81,7 +81,7 @@ def at(table: dict[str, Any], path: tuple[str, ...]) -> dict[str, Any]:
 
 
 CLOSED = [path for path in tables(whole()) if path not in (("electrodes",), ("calibration", "gain"))]
-"""Tables whose keys are fixed; in the other two they are the names of electrodes."""
+"""Tables with fixed keys. The keys of the other two tables are the names of electrodes."""
 
 KEYS = [(*path, key) for path in tables(whole()) for key in at(whole(), path)]
 
@@ -165,7 +165,7 @@ WRONG = (None, "3.0", True, [1.0], [1.0, "2"], {}, {"x": 1.0}, float("nan"), flo
 
 @pytest.mark.parametrize("path", KEYS, ids=".".join)
 def test_error_message_names_the_key_of_the_wrong_type(path):
-    """Every key with every kind of wrong value: a SensorError that names the key, never another exception."""
+    """Each wrong value of each key raises a SensorError that names the key."""
     for value in WRONG:
         if (path[-1] in ("calibration", "gain") and value == {}) or (path == ("name",) and value == "3.0"):
             continue
@@ -300,7 +300,7 @@ def test_sensor_that_cannot_be_written_raises_error(tmp_path, name, message):
 
 
 def test_write_and_load_round_trip(tmp_path):
-    """Names that TOML has to quote, a polygon with a trace and metal of the back, a calibration."""
+    """The sensor has names that TOML must quote, a polygon with a trace and metal on the back, and a calibration."""
     pad = ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0))
     traced = replace(Electrode("a.b", pad).with_trace(((-10.0, 5.0), (-10.0, 20.0)), 0.5), back=(pad,))
     electrodes = (traced, Electrode.of_square('"#]', (6.0, 0.0), 3.0))

@@ -20,7 +20,7 @@ SMALL = (
 
 
 def dense_solution(mesh: Template, matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """numpy.linalg.solve with (U1, U2, W) fixed on the rim, U2 on the line of symmetry, and nothing else."""
+    """Solve with numpy. The displacements (U1, U2, W) are fixed on the rim, and U2 also on the line of symmetry."""
     components = matrix.shape[2]
     free = np.ones((mesh.n_node, components), dtype=bool)
     free[mesh.on_rim, :3] = False
@@ -33,7 +33,7 @@ def dense_solution(mesh: Template, matrix: np.ndarray, right: np.ndarray) -> np.
 
 
 def random_matrices(mesh: Template, components: int, seed: int) -> np.ndarray:
-    """Symmetric, positive definite, full: every component coupled to every other."""
+    """Return random symmetric, positive definite matrices of the elements, in which all components are coupled."""
     size = components * mesh.nodes.shape[1]
     root = np.random.default_rng(seed).standard_normal((mesh.n_element, size, size))
     matrix = root @ root.transpose(0, 2, 1) + size * np.eye(size)
@@ -53,7 +53,7 @@ def test_sparse_solution_equals_dense_solution(resolution, probe, components):
 
 @pytest.mark.parametrize("bending", [0.0, 1e-7, 1e-3, 10.0])
 def test_sparse_solution_with_the_tangent_of_a_film_equals_dense_solution(mesh, bending):
-    """Badly scaled and, with bending, indefinite: a matrix that is factorised without pivoting."""
+    """The matrix is badly scaled and, with bending, indefinite. It is factorised without pivoting."""
     elastic = ElasticFilm(mesh.geometry, DimensionlessGroups(0.01, 1.0, 5.0 if bending == 0.0 else 0.0, bending, 0.34))
     field = 0.01 * mesh.random_field(1)
     matrix = elastic.tangent(field, 0.0 if bending == 0.0 else 1.0)

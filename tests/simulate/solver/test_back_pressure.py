@@ -1,4 +1,4 @@
-"""Air behind the film and static pressure: against a closed form, a collocation and scikit-fem."""
+"""Air behind the film and static pressure, compared with a closed form, a collocation and scikit-fem."""
 
 import json
 from dataclasses import replace

@@ -40,8 +40,11 @@ SCENES = {
     "inside, a taut film under a needle": (0.01606, 18.99, 0.271, Circle(0.1916), 23.39, 4.0),
     "inside, a plate under a needle": (0.4, 0.0, 0.11, Circle(0.157), 25.5, 1.2e-5),
 }
-"""Thickness, pretension, Poisson's ratio, probe, distance from the centre, force. Beside the rim the shapes of the
-elements promise 0.1 % or better and are wrong by up to 70 times; just inside that, by 1.3."""
+"""Thickness, pretension, Poisson's ratio, probe, distance from the centre, force.
+
+An estimate from the shapes of the elements would be at most 0.1 % for these presses. Near the rim, the error is up to
+70 times this estimate, and slightly farther inside 1.3 times.
+"""
 
 
 def worst_error(film: Film, rough, fine) -> float:

@@ -21,7 +21,10 @@ def test_stress_of_a_slack_membrane_grows_with_the_force_to_two_thirds():
 
 
 def test_stress_of_a_plate():
-    """6 M / h^2, M = F (1 + nu) / (4 pi) (ln(a / R) + R^2 / (4 a^2)) at the middle (Timoshenko 1959, art. 19)."""
+    """The stress of a plate in the centre is 6 M / h^2 (Timoshenko 1959, art. 19).
+
+    The moment is M = F (1 + nu) / (4 pi) (ln(a / R) + R^2 / (4 a^2)).
+    """
     plate = replace(FILM, thickness=2.0, pretension=0.0)
     radius = 5.0
     a = plate.radius

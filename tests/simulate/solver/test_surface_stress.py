@@ -32,10 +32,11 @@ def thick(film):
 
 
 def outer(film, force: float, c: float, r: float) -> tuple[float, float]:
-    """(s_r, s_theta) of bending at the touched side of a clamped plate, r >= c, a disk of radius c pressing.
+    """Return the bending stress (s_r, s_theta) on the touched side of a clamped plate at the radius r, MPa.
 
-    w = F / (16 pi D) (a^2 - r^2 - 2 r^2 ln(a / r) - c^2 (ln(a / r) - (1 - (r / a)^2) / 2)) from Michell's function and
-    its mean over the disk; curvatures w'' and w' / r; touched side: s = E h / 2 (1 - nu^2) (w'' + nu w' / r).
+    The force acts on a disk of radius c, and r >= c. The mean of Michell's function over the disk is
+    w = F / (16 pi D) (a^2 - r^2 - 2 r^2 ln(a / r) - c^2 (ln(a / r) - (1 - (r / a)^2) / 2)).
+    The curvatures are w'' and w' / r, and the stress is s_r = E h / (2 (1 - nu^2)) (w'' + nu w' / r).
     """
     a = film.radius
     h = film.thickness
@@ -69,7 +70,10 @@ def test_bending_stress_outside_the_footprint(thick, share):
 
 @pytest.mark.parametrize("share", [0.1, 0.9])
 def test_bending_stress_under_the_centre_of_the_probe(thick, share):
-    """M = F (1 + nu) / 4 pi (ln(a / c) + c^2 / 4 a^2) compresses the touched side (Timoshenko, art. 19), 6 M / h^2."""
+    """The stress on the touched side is the compression 6 M / h^2 (Timoshenko, art. 19).
+
+    The moment is M = F (1 + nu) / (4 pi) (ln(a / c) + c^2 / (4 a^2)).
+    """
     c = share * thick.radius
     solved = press(thick, Circle(c), (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
     moment = FORCE * (1.0 + thick.poisson) / (4.0 * np.pi) * (np.log(1.0 / share) + 0.25 * share**2)
