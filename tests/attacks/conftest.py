@@ -1,7 +1,7 @@
-"""How a reader is attacked and judged.
+"""Fixtures that send faulty inputs to a reader and check its behaviour.
 
-An input may be refused by an error of ours, or be taken. It may raise nothing else, take no seconds and no memory.
-`make attack` sends more than a million; the part in `make test` sends the same kinds, a hundredth of each.
+A reader may accept an input or refuse it by an `IsochargeError`. It may not raise other errors, and its time and memory
+are limited. `make attack` sends more than a million inputs, and `make test` a hundredth of the inputs of each kind.
 """
 
 import random
@@ -16,14 +16,16 @@ FAST_SHARE = 0.01
 """Share of the inputs in `make test`."""
 
 LONGEST_S, MOST_BYTES = 3.0, 200e6
-"""What no input may take: processor time, s, of which a busy machine counts up to twice as much, and how much it may
-raise the peak of memory, bytes."""
+"""Largest processor time of an input, s, and largest increase of the peak memory, bytes.
+
+On a busy machine, the measured processor time may be twice as large as on an idle one.
+"""
 
 WAITS = 5
-"""How much longer an input may take by the clock, with other programs on the same cores."""
+"""Largest elapsed time of an input relative to the largest processor time."""
 
 LONGEST_MESSAGE = 5000
-"""Characters of an error for people."""
+"""Largest number of characters of an error message."""
 
 
 def pytest_addoption(parser):
@@ -32,7 +34,7 @@ def pytest_addoption(parser):
 
 @pytest.fixture
 def share(request):
-    """Share of the inputs to send."""
+    """Share of the inputs that are sent."""
     return 1.0 if request.config.getoption("--all-attacks") else FAST_SHARE
 
 
@@ -42,21 +44,24 @@ def peak_bytes():
 
 @pytest.fixture
 def attack(share):
-    """Send inputs to a reader: `attack(name, read, inputs, count)`; inputs(rng) makes one, and read may refuse it."""
+    """Function that sends inputs to a reader, `attack(name, read, inputs, count)`.
+
+    `inputs(rng)` returns one input, and `read(data)` reads it.
+    """
 
     def send(name, read, inputs, count, longest_s=LONGEST_S):
         rng, before = random.Random(name), None
         for _ in range(max(20, round(count * share))):
             judge(name, read, inputs(rng), longest_s)
-            before = before or peak_bytes()  # once the reader has imported what it needs
+            before = before or peak_bytes()  # measured after the first input, when the reader has imported its modules
         assert peak_bytes() - before < MOST_BYTES, name
 
     return send
 
 
 def judge(name, read, data, longest_s):
-    """Fail if a reader does with an input what it may not do."""
-    for _ in range(2):  # another program may have had the core
+    """Fail if a reader raises a wrong error for an input, or exceeds its limits."""
+    for _ in range(2):  # the input is tried again, because another program may have used the core
         began, computed = time.perf_counter(), time.thread_time()
         try:
             read(data)
@@ -65,7 +70,7 @@ def judge(name, read, data, longest_s):
                 pytest.fail(f"{name}: a long message for {data!r:.3000}")
         except Exception as error:
             raise AssertionError(f"{name}: {error!r} for {data!r:.3000}") from error
-        computed = time.thread_time() - computed  # its work, whoever else has the core; and its waiting, at most
+        computed = time.thread_time() - computed  # processor time, which does not depend on other programs
         if computed < longest_s and time.perf_counter() - began < WAITS * longest_s:
             return
     pytest.fail(f"{name}: more than {longest_s} s for {data!r:.3000}")

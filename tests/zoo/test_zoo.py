@@ -60,20 +60,20 @@ def offset_binary(k, q):
 
 
 def csv_counts(k, q):
-    """Counts without a header: number, a clock of 16 bits that wraps, six inputs of which two are dead."""
+    """Counts without a header: frame number, a clock of 16 bits that wraps, and six inputs, two of them constant."""
     a, b, c, d = counts(q, 0.05, 2048)
     clock = (65_000 + round(2.5 * k)) % 65536
     return f"{k % 256},{clock},{a},0,{b},{c},4095,{d}\r\n".encode()
 
 
 def other_names(k, q):
-    """JSON with names of its own."""
+    """JSON with unusual names of its keys."""
     names = dict(zip(("north", "east", "south", "west"), (round(x, 3) for x in q.tolist()), strict=True))
     return json.dumps({"id": "rig 7", "n": k, "uptime": round(12.0 + k / 400, 4), "q": names}).encode() + b"\n"
 
 
 def length_prefixed(k, q):
-    """Sync, length, payload, checksum; now and then a frame of another kind."""
+    """Sync, length, payload and checksum, and a frame of another kind every 50 frames."""
 
     def frame(payload):
         data = bytes([len(payload)]) + payload
@@ -88,28 +88,28 @@ def teleplot(k, q):
 
 
 def arduino_plotter(_, q):
-    """Fixed lines for the scale, as the serial plotter wants them."""
+    """Values with constant limits, which fix the scale of the serial plotter of Arduino."""
     return ("Min:-1500,Max:1500," + ",".join(f"S{n}:{x:.3f}" for n, x in enumerate(q)) + "\r\n").encode()
 
 
 def answer(_, q):
-    """A line on request."""
+    """A line that the board sends when it is requested."""
     return ("\t".join(f"{x:.3f}" for x in q) + "\r\n").encode()
 
 
 def modbus_reply(_, q):
-    """The answer of a Modbus slave: big-endian registers, the checksum little-endian."""
+    """The answer of a Modbus slave, with big-endian registers and a little-endian checksum."""
     data = struct.pack(">BBB4h", 17, 4, 8, *counts(q, 0.0625))
     return data + struct.pack("<H", modbus(data))
 
 
 def volts(k, q):
-    """An inverting amplifier of 1 nF about half of 3.3 V."""
+    """Voltages of an inverting amplifier with 1 nF, whose zero is half of 3.3 V."""
     return (f"{k / 400:.4f};" + ";".join(f"{1.65 - x / 1000:.6f}" for x in q) + "\n").encode()
 
 
 def bare_struct(k, q):
-    """A struct as it lies in memory; the datagram is its frame."""
+    """A struct as it is stored in memory, without header or checksum. A datagram contains one struct."""
     return struct.pack("<I4f", k, *q)
 
 
@@ -125,14 +125,22 @@ def stuffed_by_slip(k, q):
 
 
 def ticks(k, q):
-    """A clock of 32768 Hz, a temperature, doubles' little sisters in big-endian, ones' complement of the sum."""
+    """A clock of 32768 Hz, a temperature, big-endian floats, and the ones' complement of the sum of all bytes."""
     data = b"\xff\xfa" + struct.pack(">IH4f", round(k * 81.92) & 0xFFFFFFFF, 2941 + k % 2, *q)
     return data + bytes([~sum(data[2:]) & 0xFF])
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A board, what its user knows of the gain, and what doctor asks for without it."""
+    """A board for the test of doctor.
+
+    Attributes:
+        encode: Function that returns the frame of a number and charges (pC).
+        gain: Section `gain` of the device file, which the user provides; empty if the board sends pC.
+        model: Name of the model.
+        url: Port of the board.
+        request: Request to which the board answers; None if it sends by itself.
+    """
 
     encode: Callable[[int, np.ndarray], bytes]
     gain: dict = field(default_factory=dict)

@@ -29,9 +29,9 @@ def claims(solves: Solves, accuracy: Accuracy) -> Entry:
     warm = thermal_charge(replace(sensor, piezo=replace(sensor.piezo, pyro=PYRO)), KELVIN)[0]
     pyro = Row(
         "pyroelectric charge",
-        "can dominate; left out",
+        "can dominate; not considered",
         f"{warm:.0f} pC on each electrode for {KELVIN:g} K",
-        f"{PYRO:g} uC/(m^2 K) on {sensor.electrodes[0].area:g} mm^2; the same on all, a press is not",
+        f"{PYRO:g} uC/(m^2 K) on {sensor.electrodes[0].area:g} mm^2; it is equal on all electrodes, unlike a press",
     )
     linear = Row(
         "the material stays linear",
@@ -48,7 +48,7 @@ def claims(solves: Solves, accuracy: Accuracy) -> Entry:
         "drawn_with_reference_noise": {name: e.numbers() for name, e in accuracy.drawn_noisy.items()},
     }
     rows = [edges, pressure, pyro, linear, _fourth(accuracy, solves.choices.degree), _known(accuracy)]
-    return Entry("Claims", "What the text says, in numbers.", None, rows, numbers)
+    return Entry("Claims", "Statements of the text, compared with computed values.", None, rows, numbers)
 
 
 def _edges(solves: Solves) -> tuple[Row, dict[str, object]]:
@@ -64,9 +64,10 @@ def _edges(solves: Solves) -> tuple[Row, dict[str, object]]:
     row = Row(
         "edge averages (eq. 3) give the charge",
         "\"precise\"",
-        f"off the whole electrode's charge by {middle:.2f} % at the median, {most:.1f} % at 95 %, {worst:.1f} % most, "
-        f"within {solves.choices.radius:g} mm",
-        "an electrode collects from all of its area; edges are a quadrature that misses the stress beside the probe",
+        f"the difference from the charge of the whole electrode within {solves.choices.radius:g} mm has a median of "
+        f"{middle:.2f} %, a 95th percentile of {most:.1f} % and a maximum of {worst:.1f} %",
+        "an electrode collects charge from all of its area; the mean over its edges does not contain the stress beside "
+        "the probe",
     )  # fmt: skip
     return row, {"median": middle, "p95": most, "worst": worst}
 
@@ -81,11 +82,11 @@ def _d33(solves: Solves) -> tuple[Row, dict[str, object]]:
     row = Row(
         "d33 where the probe overlaps an electrode",
         "no charge",
-        f"up to {extra.max():.1f} pC, {100 * share.max():.1f} % of the charge there "
-        f"({(extra > TOUCHED * whole).any(axis=1).sum()} of {len(points)} presses of the scheme); "
-        f"{whole:.0f} pC if the electrode carried all of the force",
-        f"a thin film does carry the probe's pressure; d33 = {D33:g} pC/N. Small beside the stretching: leaving "
-        "it out is right, the reason given is not",
+        f"up to {extra.max():.1f} pC, which is {100 * share.max():.1f} % of the charge of this press "
+        f"({(extra > TOUCHED * whole).any(axis=1).sum()} of {len(points)} presses have such a charge); "
+        f"{whole:.0f} pC if the whole force acts on the electrode",
+        f"a thin film also carries the pressure of the probe; d33 = {D33:g} pC/N. The charge is small compared with "
+        "that of the stretching, so it can be omitted, but not for the stated reason",
     )
     return row, {"largest": extra.max(), "largest_share": share.max()}
 
@@ -94,10 +95,10 @@ def _fourth(accuracy: Accuracy, degree: int) -> Row:
     """Compare the position errors of three and four electrodes."""
     changes = []
     for name, three, four in (
-        ("as the paper, no noise", accuracy.drawn["three", degree], accuracy.drawn["four", degree]),
-        ("from the field, no noise", accuracy.field["three"], accuracy.field["four"]),
-        ("as the paper, noise", accuracy.drawn_noisy["three"], accuracy.drawn_noisy["four"]),
-        ("from the field, noise", accuracy.noisy["three"], accuracy.noisy["four"]),
+        ("contours of the paper, no noise", accuracy.drawn["three", degree], accuracy.drawn["four", degree]),
+        ("contours of the charge map, no noise", accuracy.field["three"], accuracy.field["four"]),
+        ("contours of the paper, noise", accuracy.drawn_noisy["three"], accuracy.drawn_noisy["four"]),
+        ("contours of the charge map, noise", accuracy.noisy["three"], accuracy.noisy["four"]),
     ):
         medians, most = ([e.percentile(share) for e in (three, four)] for share in (50, 95))
         changes.append(
@@ -105,11 +106,12 @@ def _fourth(accuracy: Accuracy, degree: int) -> Row:
             f"95 %, {100 * three.share_found:.0f} to {100 * four.share_found:.0f} % found"
         )
     return Row(
-        "a fourth electrode, three to four",
+        "effect of a fourth electrode",
         "a more accurate position",
         "; ".join(changes),
-        "noise is 1 pC and 0.2 % of each charge. Averaging triples helps less than it could: contours of opposite "
-        "electrodes touch near the centre, and their crossing is poor there; a fourth charge finds more presses",
+        "the noise is 1 pC and 0.2 % of each charge. The mean over triples of electrodes improves the position little, "
+        "because contours of opposite electrodes are nearly parallel near the centre. With a fourth charge, more "
+        "presses are found",
     )
 
 
@@ -123,8 +125,8 @@ def _known(accuracy: Accuracy) -> Row:
     return Row(
         "shape and size of the object must be known",
         "must be known",
-        "taken for a triangle of 4 mm on a slack film, median error: " + "; ".join(errors_by_name),
-        "known force; a film that is a little taut costs more than the wrong probe",
+        "median errors if a triangle of 4 mm on a film without pretension is assumed: " + "; ".join(errors_by_name),
+        "the force is known; a small pretension causes larger errors than another probe",
     )
 
 
@@ -143,14 +145,16 @@ def what_choices_change(solves: Solves, accuracy: Accuracy) -> Entry:
     for name, errors in accuracy.mistaken.items():
         kind, _, value = name.partition(" ")
         changes = solves.changes(name)
-        position = f"{errors.percentile(50):.3f} mm" if errors.found_mm.size else "no contours met"
+        position = f"{errors.percentile(50):.3f} mm" if errors.found_mm.size else "not found, because no contours meet"
         change = (
-            f"charges by {100 * np.median(changes):+.1f} % at the median, at most {100 * np.abs(changes).max():.1f} %; "
-            f"position if not known: {position}"
+            f"the charges change by {100 * np.median(changes):+.1f} % at the median and by at most "
+            f"{100 * np.abs(changes).max():.1f} %; position error if this value is not known: {position}"
         )
-        rows.append(Row(f"{kind}: {value}", "not given", change, f"our choice {ours[kind]}"))
+        rows.append(Row(f"{kind}: {value}", "not given", change, f"chosen here: {ours[kind]}"))
         numbers[name] = {"largest_change": np.abs(changes).max()}
-    linear = f"charges are linear in them; biaxial {piezo.d31:g} and {piezo.d32:g} pC/N"
-    agreement = f"eq. 4 agrees with d31 = {piezo.d31 / solves.eq_4[1]:.1f} pC/N, all else as ours"
+    linear = f"the charges are linear in both; chosen here for a biaxial film: {piezo.d31:g} and {piezo.d32:g} pC/N"
+    d31_of_eq_4 = piezo.d31 / solves.eq_4[1]
+    agreement = f"eq. 4 agrees with d31 = {d31_of_eq_4:.1f} pC/N if all other values are those chosen here"
     rows.append(Row("d31, d32", "not given", linear, agreement))
-    return Entry("What the paper does not give", "Our choices, and what others would change.", None, rows, numbers)
+    caption = "Values that are chosen here, and the effect of other values."
+    return Entry("What the paper does not give", caption, None, rows, numbers)

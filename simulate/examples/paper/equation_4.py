@@ -127,7 +127,7 @@ def eq_4(solves: Solves) -> Entry:
     }
     return Entry(
         "Eq. 4",
-        "Charge of A against force at the place of eq. 4's press, films of several thicknesses and pretensions.",
+        "Charge of A against force at the position of the press of eq. 4, for several thicknesses and pretensions.",
         figure,
         [*_rows_of_press(solves, films[-1]), *_rows_of_cubic(films), *_rows_of_line(films)],
         numbers,
@@ -143,22 +143,24 @@ def _rows_of_press(solves: Solves, thick: list[ChargeForce]) -> list[Row]:
     away = np.hypot(x, y + 10.0)
     return [
         Row(
-            "where eq. 4's press was",
+            "position of the press of eq. 4",
             "not given",
-            f"({x:.2f}, {y:.2f}) mm: {away:.2f} mm from A at {angle:.0f}°",
-            "from the ratios of its three charges at 1 N, on our film of 25 um; the scheme's presses are 4 mm from A",
+            f"({x:.2f}, {y:.2f}) mm, which is {away:.2f} mm from A at {angle:.0f}°",
+            "computed from the ratios of its three charges at 1 N for a film of 25 um; the first presses of the lines "
+            "in the paper are 4 mm from A",
         ),
         Row(
-            "charges there at 1 N, A, B, C",
-            ", ".join(f"{q:.0f}" for q in pC) + " pC (eq. 4, said to be 1 mm)",
-            ", ".join(f"{factor * q:.0f}" for q in pC) + " pC at 25 um",
-            f"one factor of {factor:.2f} for all three (d31, E, probe): these are the charges of a film of 25 um",
+            "charges of A, B and C at this position at 1 N",
+            ", ".join(f"{q:.0f}" for q in pC) + " pC (eq. 4, for a film of 1 mm according to the paper)",
+            ", ".join(f"{factor * q:.0f}" for q in pC) + " pC for 25 um",
+            f"all three charges differ by the same factor of {factor:.2f}, which d31, E or the probe may explain: "
+            "eq. 4 describes a film of 25 um",
         ),
         Row(
-            f"can a film of {thick[0].thickness:g} mm give eq. 4's charges?",
+            f"does a film of {thick[0].thickness:g} mm have the charges of eq. 4?",
             f"{pC[0]:.0f} pC on A at 1 N",
-            f"no: {thick_pC:.1f} pC without pretension, at most {most:.1f} pC with it",
-            f"{pC[0] / thick_pC:.0f} times too little: a thick film bends and hardly stretches",
+            f"no: {thick_pC:.1f} pC without pretension, and at most {most:.1f} pC with pretension",
+            f"the charge of eq. 4 is {pC[0] / thick_pC:.0f} times as large; a thick film bends and hardly stretches",
         ),
     ]
 
@@ -174,23 +176,26 @@ def _rows_of_cubic(films: list[list[ChargeForce]]) -> list[Row]:
     same = ", ".join(f"{film.name} ({film.misfit:.3f})" for film in nearest if film.misfit <= BAND)
     return [
         Row(
-            f"can a film of {thick[0].thickness:g} mm give eq. 4's shape?",
+            f"does the curve of a film of {thick[0].thickness:g} mm have the shape of eq. 4?",
             cubic,
             f"{'yes' if best_thick[0].misfit <= BAND else 'no'}: {_coefficients(thick[0].cubic)} without pretension; "
-            f"nearest {best_thick[0].misfit:.2f} away, at {best_thick[0].pretension:g} MPa",
-            "charge of A over its value at 1 N, a cubic of the force in N, 0.25 to 2 N",
+            f"the smallest difference is {best_thick[0].misfit:.2f}, for {best_thick[0].pretension:g} MPa",
+            "coefficients of a cubic of the force in N, for the charge of A relative to its value at 1 N, from 0.25 to "
+            "2 N",
         ),
         Row(
-            f"the same at {thin.um}, no pretension",
+            f"does the curve of a film of {thin.um} without pretension have this shape?",
             cubic,
-            f"{_coefficients(thin.cubic)}; the curve is within {thin.misfit:.4f} of the paper's from 0.25 to 2 N",
-            "charge goes with F^(2/3) on a slack membrane; a cubic with a constant at zero force is its fit",
+            f"{_coefficients(thin.cubic)}; the curve differs by at most {thin.misfit:.4f} from 0.25 to 2 N",
+            "the charge of a membrane without pretension is proportional to F^(2/3); a cubic that is fitted to it is "
+            "not zero at zero force",
         ),
         Row(
-            f"films that fit eq. 4's cubic to {BAND:g}",
+            f"films whose curve differs from eq. 4 by at most {BAND:g}",
             "1 mm",
             same or "none",
-            f"nearest: {nearest[0].name}, {nearest[0].misfit:.4f}; any film so thin that it stretches, and slack",
+            f"the smallest difference is {nearest[0].misfit:.4f}, for {nearest[0].name}; thin films without pretension "
+            "have nearly the same curve",
         ),
     ]
 
@@ -204,25 +209,27 @@ def _rows_of_line(films: list[list[ChargeForce]]) -> list[Row]:
         Row(
             f"linear up to {LINEAR_N:g} N",
             "yes (25 um)",
-            f"{slack[0].um}, slack: {100 * slack[0].bent:.0f} % off a line; " + _linear_films(films),
-            "F^(2/3) where stretching carries the load, F^2 where pretension or bending does; linear on the way",
+            f"{slack[0].um} without pretension: {100 * slack[0].bent:.0f} % from a line; " + _linear_films(films),
+            "the charge is proportional to F^(2/3) if stretching carries the load, and to F^2 if pretension or bending "
+            "does; between these cases, it is nearly linear",
         ),
         Row(
-            "thicker is more linear",
+            "a thicker film is more linear",
             "linearity is enhanced, nonlinearity remains",
-            f"{off} off a line up to {LINEAR_N:g} N, slack",
-            "on the way from F^(2/3) to F^2 the exponent passes through 1 at some hundred um",
+            f"differences from a line up to {LINEAR_N:g} N without pretension: {off}",
+            "between F^(2/3) and F^2, the exponent is 1 at a thickness of some hundred um",
         ),
         Row(
-            f"local exponent at {', '.join(f'{f:g}' for f in SHOWN_N)} N, slack",
+            f"local exponent at {', '.join(f'{f:g}' for f in SHOWN_N)} N without pretension",
             "not given",
             exponents,
-            "2/3: membrane; 2: plate",
+            "the exponent is 2/3 for a membrane and 2 for a plate",
         ),
     ]
 
 
 def _coefficients(cubic: Array) -> str:
+    """Format the coefficients of a cubic."""
     return "(" + ", ".join(f"{c:.4f}" for c in cubic) + ")"
 
 
@@ -233,8 +240,8 @@ def _linear_films(films: list[list[ChargeForce]]) -> str:
         return f"none within {100 * LINEAR:g} %"
     names = ", ".join(f"{film.name} ({100 * film.bent:.1f} %)" for film in linear[:6])
     more = f" and {len(linear) - 6} more" if len(linear) > 6 else ""
-    bends = f"{linear[0].name} then bends over, exponent {linear[0].exponent(2.0):.2f} at 2 N"
-    return f"within {100 * LINEAR:g} %: {names}{more}; {bends}"
+    exponent = f"the exponent of {linear[0].name} at 2 N is {linear[0].exponent(2.0):.2f}"
+    return f"within {100 * LINEAR:g} %: {names}{more}; {exponent}"
 
 
 def _draw_curves(axes: Any, films: list[list[ChargeForce]]) -> None:
