@@ -1,11 +1,12 @@
-"""One network for all films: against networks trained on single films, and its time beside today's released model.
+"""A network for all films, compared with networks that were trained on single films, and its times.
 
     python tests/benchmarks/bench_films.py [--model NAME] [--films 4] [--seed 0] [--seconds 2] [--json]
 
-Each film is drawn from the prior, swept with solves of its own (no family of films in it) and trained on alone, as
-`train fit` does, half a minute each. Both networks answer the same noisy charges of presses that neither was trained
-on. Asked: an rms of at most 1.06 times that of the single network, a prediction in at most 1.05 times the time of the
-released model of the same sensor, folding under 1 s. `--train FOLDER` times the training, too, from nothing.
+Each film is drawn from the prior and swept with solves of its own, and a network is trained on this film alone as in
+`train fit`, which takes half a minute. Both networks estimate the contacts of the same noisy charges, on which neither
+was trained. The aims are an rms error of at most 1.06 times that of the single network, a prediction in at most 1.05
+times the time of the released model of the same sensor, and a model of a film in less than 1 s. With `--train FOLDER`,
+the time of a complete training is measured as well.
 """
 
 import time
@@ -29,7 +30,13 @@ SAMPLES = 24_000
 
 
 def one_film(films: FilmsModel, parameters: np.ndarray, seed: int) -> dict[str, Any]:
-    """Errors of both networks on the same presses of one film, each knowing or trained on that film."""
+    """Measure the errors of both networks on the same presses of one film.
+
+    Args:
+        films: The network for all films, which gets the parameters of the film.
+        parameters: Parameters of the film.
+        seed: Seed of the noise.
+    """
     sensor, probe = films.prior.film(parameters)
     with TemporaryDirectory() as folder:
         sweep = Sweep(films.domain.radius, films.domain.force_range, SAMPLES)
@@ -38,7 +45,7 @@ def one_film(films: FilmsModel, parameters: np.ndarray, seed: int) -> dict[str, 
     charge = presses.noisy(films.noise, seed)
     answers = {"all films": films.fold(parameters).predict(charge)[0], "alone": single.predict(charge)[0]}
     position = {name: rms(position_error(contact, presses.contact)) for name, contact in answers.items()}
-    force = {name: 100.0 * rms(c[:, 2] / presses.contact[:, 2] - 1.0) for name, c in answers.items()}
+    force = {name: 100.0 * rms(contact[:, 2] / presses.contact[:, 2] - 1.0) for name, contact in answers.items()}
     return {
         "pretension_MPa": round(float(parameters[0]), 2),
         "position_rms_mm": position,
@@ -49,15 +56,14 @@ def one_film(films: FilmsModel, parameters: np.ndarray, seed: int) -> dict[str, 
 
 
 def contender(name: str) -> Contender:
-    """A prediction of one press."""
+    """Return the prediction of one press by a model, given by its name."""
     predictor = Predictor(find_model(name))
-    return Contender(
-        name, 1, partial(predictor.predict, [300.0, 310.0, 320.0, 330.0][: len(predictor.metadata.electrodes)])
-    )
+    charge_pC = [300.0 + 10.0 * number for number in range(len(predictor.metadata.electrodes))]
+    return Contender(name, 1, partial(predictor.predict, charge_pC))
 
 
 def folding_time(films: FilmsModel, parameters: np.ndarray) -> float:
-    """From parameters to a served model on disk, s: the best of three."""
+    """Return the shortest of three times in which the model of a film is computed and written, s."""
     times = []
     with TemporaryDirectory() as folder:
         for number in range(3):
@@ -68,8 +74,9 @@ def folding_time(films: FilmsModel, parameters: np.ndarray) -> float:
 
 
 def training_time(films: FilmsModel, folder: Path) -> float:
-    """From nothing to a released folder, s, in a process for each core."""
-    config, begin = FilmsConfig(radius=films.domain.radius), time.perf_counter()
+    """Train a network for all films with one process for each core, and return the time up to its release, s."""
+    config = FilmsConfig(radius=films.domain.radius)
+    begin = time.perf_counter()
     with local_workers(cores()) as executor:
         release_films(fit_films(films.prior, config, executor=executor), folder)
     return time.perf_counter() - begin

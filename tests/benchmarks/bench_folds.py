@@ -5,14 +5,17 @@
     python tests/benchmarks/bench_folds.py --model ./three-25um-uniaxial [--slides 1000] [--rate-hz 1000]
         [--noise reference] [--force 1] [--gain 0] [--json]
 
-A press of 30 ms, at rest for 0.2 s, straight on at one of 5 to 200 mm/s (uniform in the logarithm) to a place beyond a
-fold, at rest for 0.2 s; charges of the simulator with noise, each electrode's gain off by `--gain` (a standard
-deviation). Frames count from the first crossing on, but for the 20 ms after each. A contact is known where no other is
-said beside it.
+In each slide, the force rises for 30 ms, and the contact is at rest for 0.2 s. The contact then moves along a straight
+line to a position beyond a fold, with a speed of 5 to 200 mm/s (uniform in the logarithm), and is at rest for another
+0.2 s. The charges are simulated with noise. The gains have random errors with the standard deviation `--gain`.
+
+The frames after the first crossing of a fold are counted, except for the first 20 ms after each crossing. A contact is
+known if the tracker reports no other possible contact.
 """
 
 import argparse
 import time
+from typing import NamedTuple
 
 import numpy as np
 from shared import options, print_results
@@ -25,86 +28,174 @@ from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
-PRESS_S, REST_S, WAIT_S = 0.03, 0.2, 0.02
-SLOWEST, FASTEST, LONGEST_S, SHORTEST_MM = 5.0, 200.0, 1.0, 2.0
-BEYOND_MM = 2.0
+RISE_TIME_s = 0.03
+"""Time in which the force rises, s."""
+
+REST_s = 0.2
+"""Time at rest before and after the movement, s."""
+
+WAIT_s = 0.02
+"""Time after a crossing in which frames are not counted, s."""
+
+MIN_SPEED_mm_per_s = 5.0
+MAX_SPEED_mm_per_s = 200.0
+MAX_MOVEMENT_s = 1.0
+"""Longest duration of a movement, s."""
+
+MIN_MOVEMENT_mm = 2.0
+"""Shortest movement, mm."""
+
+MAP_MARGIN_mm = 2.0
+"""Distance beyond the domain of the tracker up to which charges are simulated, mm."""
+
+
+class Slide(NamedTuple):
+    """A simulated slide.
+
+    Attributes:
+        t_s: Time of each frame, shape (n,), s.
+        contact: True contacts (x, y, F), shape (n, 3), mm and N.
+        side: Side of the folds, -1 or 1, shape (n,).
+    """
+
+    t_s: np.ndarray
+    contact: np.ndarray
+    side: np.ndarray
+
+
+class CountedFrame(NamedTuple):
+    """Result of a counted frame.
+
+    Attributes:
+        is_known: Whether the tracker reports a single contact.
+        is_right: Whether the tracked contact is on the right side of the folds.
+        is_one_right: Whether the tracked contact or the other reported contact is on the right side.
+        error_mm: Distance of the tracked contact from the true one, mm.
+    """
+
+    is_known: bool
+    is_right: bool
+    is_one_right: bool
+    error_mm: float
 
 
 def sides(film: ChargeMap, contact: np.ndarray) -> np.ndarray:
-    """On which side of the folds contacts (n, 3) are: -1 or 1, shape (n,)."""
+    """Return the sides of the folds on which contacts lie, shape (n,).
+
+    The determinant of the derivatives changes its sign at a fold.
+    """
     return np.sign(np.linalg.det(film.derivatives(contact)))
 
 
-def slide(
-    film: ChargeMap, radius: float, asked: argparse.Namespace, rng: np.random.Generator
-) -> tuple[np.ndarray, ...]:
-    """Times (n,), s, contacts (n, 3) and their sides (n,), of a slide within a radius, mm, that crosses a fold."""
+def draw_slide(film: ChargeMap, radius: float, asked: argparse.Namespace, rng: np.random.Generator) -> Slide:
+    """Draw slides until one crosses a fold.
+
+    Args:
+        film: Map from contacts to charges.
+        radius: Largest distance of the ends from the centre, mm.
+        asked: Options of the benchmark.
+        rng: Random number generator.
+    """
+    min_force, _ = film.domain.force_range
     while True:
         start, end = radius * np.sqrt(rng.random(2)) * np.exp(2j * np.pi * rng.random(2))
-        lasts_s = abs(end - start) / np.exp(rng.uniform(np.log(SLOWEST), np.log(FASTEST)))
-        t = np.arange(0.0, PRESS_S + 2.0 * REST_S + lasts_s, 1.0 / asked.rate_hz)
-        place = start + (end - start) * np.clip((t - PRESS_S - REST_S) / lasts_s, 0.0, 1.0)
-        force = np.maximum(asked.force * np.minimum((t + 0.002) / PRESS_S, 1.0) ** 1.5, film.domain.force_range[0])
-        contact = np.column_stack([place.real, place.imag, force])
+        distance = abs(end - start)
+        speed = np.exp(rng.uniform(np.log(MIN_SPEED_mm_per_s), np.log(MAX_SPEED_mm_per_s)))
+        duration_s = distance / speed
+        t_s = np.arange(0.0, RISE_TIME_s + 2.0 * REST_s + duration_s, 1.0 / asked.rate_hz)
+        position = start + (end - start) * np.clip((t_s - RISE_TIME_s - REST_s) / duration_s, 0.0, 1.0)
+        relative_force = np.minimum((t_s + 0.002) / RISE_TIME_s, 1.0) ** 1.5
+        force = np.maximum(asked.force * relative_force, min_force)
+        contact = np.column_stack([position.real, position.imag, force])
         side = sides(film, contact)
-        if abs(end - start) > SHORTEST_MM and lasts_s < LONGEST_S and (side != side[0]).any():
-            return t, contact, side
+        if distance > MIN_MOVEMENT_mm and duration_s < MAX_MOVEMENT_s and (side != side[0]).any():
+            return Slide(t_s, contact, side)
 
 
-def counted(t: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """The frames after the first crossing, but for the first ones after each."""
-    crossed = t[1:][np.diff(side) != 0]
-    return (t >= crossed[0]) & ~((t[:, None] >= crossed) & (t[:, None] < crossed + WAIT_S)).any(axis=1)
+def is_counted(slide: Slide) -> np.ndarray:
+    """Return which frames of a slide are counted, shape (n,)."""
+    t_s = slide.t_s
+    crossing_s = t_s[1:][np.diff(slide.side) != 0]
+    is_after_crossing = (t_s[:, None] >= crossing_s) & (t_s[:, None] < crossing_s + WAIT_s)
+    return (t_s >= crossing_s[0]) & ~is_after_crossing.any(axis=1)
+
+
+def into_map(contact: np.ndarray, film: ChargeMap) -> np.ndarray:
+    """Return contacts (x, y, F), shape (n, 3), moved to the nearest contacts of the map."""
+    moved = contact.copy()
+    moved[:, 2] = np.clip(contact[:, 2], *film.domain.force_range)
+    distance = np.hypot(contact[:, 0], contact[:, 1])
+    moved[:, :2] *= np.minimum(film.domain.radius / distance, 1.0)[:, None]
+    return moved
+
+
+def examine_frame(
+    film: ChargeMap, tracked: Contact, other: Contact | None, truth: np.ndarray, side: float
+) -> CountedFrame:
+    """Compare the contacts that the tracker reports with the true contact.
+
+    Args:
+        film: Map from contacts to charges.
+        tracked: The tracked contact.
+        other: The other possible contact; None if there is none.
+        truth: The true contact (x, y, F), shape (3,), mm and N.
+        side: Side of the folds of the true contact.
+    """
+    reported = np.array([contact[:3] for contact in (tracked, other) if contact is not None])
+    is_right_side = sides(film, into_map(reported, film)) == side
+    true_x, true_y, _ = truth
+    error_mm = float(np.hypot(tracked.x_mm - true_x, tracked.y_mm - true_y))
+    return CountedFrame(other is None, bool(is_right_side[0]), bool(is_right_side.any()), error_mm)
 
 
 def main() -> None:
     asked = options(__doc__, slides=1000, rate_hz=1000.0, force=1.0, noise="reference", gain=0.0)
-    touch, rng, noise = Predictor(asked.model), np.random.default_rng(asked.seed), noise_model(asked.noise)
-    about = touch.metadata
-    mixture = contact_mixture(touch)
+    predictor = Predictor(asked.model)
+    rng = np.random.default_rng(asked.seed)
+    noise = noise_model(asked.noise)
+    metadata = predictor.metadata
+    mixture = contact_mixture(predictor)
     if mixture is None:
         raise SystemExit(f"{asked.model}: no charges.npz: its map does not fold; give the model of the lines above")
     tracker = Tracker(mixture=mixture)
     radius = mixture.charges.radius_mm
-    forces = about.force_range_N
-    sensor = sensor_from_dict(dict(about.sensor))
-    film = with_fast_derivatives(ForwardMap.build(sensor, Circle(1.0), radius + BEYOND_MM, forces))
-    rows, steps_s, frames = [], 0.0, 0
+    sensor = sensor_from_dict(dict(metadata.sensor))
+    forward_map = ForwardMap.build(sensor, Circle(1.0), radius + MAP_MARGIN_mm, metadata.force_range_N)
+    film = with_fast_derivatives(forward_map)
+
+    counted_frames = []
+    tracking_s = 0.0
+    frame_count = 0
     for _ in range(asked.slides):
-        t, contact, side = slide(film, radius, asked, rng)
-        gains = np.exp(asked.gain * rng.standard_normal(len(about.electrodes)))
-        charge, found = noise.add(film.charges(contact) * gains, rng), []
-        answers = [Contact(*row) for row in np.asarray(touch.predict_batch(charge)).tolist()]
+        slide = draw_slide(film, radius, asked, rng)
+        gains = np.exp(asked.gain * rng.standard_normal(len(metadata.electrodes)))
+        charge = noise.add(film.charges(slide.contact) * gains, rng)
+        contacts = [Contact(*row) for row in np.asarray(predictor.predict_batch(charge)).tolist()]
         tracker.reset()
-        began = time.thread_time()
-        for answer, t_s, row in zip(answers, t.tolist(), charge, strict=True):
-            found.append((tracker.update(answer, t_s, (), row)[0], tracker.other))
-        steps_s, frames = steps_s + time.thread_time() - began, frames + len(t)
-        for k in np.flatnonzero(counted(t, side)):
-            tracked, other = found[k]
-            said = np.array([one[:3] for one in (tracked, other) if one is not None])
-            said[:, 2] = np.clip(said[:, 2], *forces)
-            said[:, :2] *= np.minimum((radius + BEYOND_MM) / np.hypot(*said[:, :2].T), 1.0)[:, None]
-            right = sides(film, said) == side[k]
-            rows.append(
-                (
-                    other is None,
-                    right[0],
-                    right.any(),
-                    np.hypot(tracked.x_mm - contact[k, 0], tracked.y_mm - contact[k, 1]),
-                )
-            )
-    known, right, said, error = np.array(rows, dtype=float).T
+        reports = []
+        start_s = time.thread_time()
+        for contact, t_s, frame_charge in zip(contacts, slide.t_s.tolist(), charge, strict=True):
+            tracked, *_ = tracker.update(contact, t_s, (), frame_charge)
+            reports.append((tracked, tracker.other))
+        tracking_s += time.thread_time() - start_s
+        frame_count += len(reports)
+        for frame in np.flatnonzero(is_counted(slide)):
+            tracked, other = reports[frame]
+            counted_frames.append(examine_frame(film, tracked, other, slide.contact[frame], slide.side[frame]))
+
+    is_known = np.array([frame.is_known for frame in counted_frames])
+    is_right = np.array([frame.is_right for frame in counted_frames])
+    known_errors_mm = [frame.error_mm for frame in counted_frames if frame.is_known]
     results = {
-        "known_percent": 100.0 * known.mean(),
-        "right_percent": 100.0 * right.mean(),
-        "right_of_known_percent": 100.0 * right[known == 1.0].mean(),
-        "right_or_said_percent": 100.0 * said.mean(),
-        "error_of_known_median_mm": float(np.median(error[known == 1.0])),
-        "error_of_known_95_percent_mm": float(np.quantile(error[known == 1.0], 0.95)),
-        "step_us": steps_s / frames * 1e6,
+        "known_percent": 100.0 * is_known.mean(),
+        "right_percent": 100.0 * is_right.mean(),
+        "right_of_known_percent": 100.0 * is_right[is_known].mean(),
+        "right_or_said_percent": 100.0 * float(np.mean([frame.is_one_right for frame in counted_frames])),
+        "error_of_known_median_mm": float(np.median(known_errors_mm)),
+        "error_of_known_95_percent_mm": float(np.quantile(known_errors_mm, 0.95)),
+        "step_us": tracking_s / frame_count * 1e6,
     }
-    print_results("folds", asked, {"frames": len(rows), "slides": results})
+    print_results("folds", asked, {"frames": len(counted_frames), "slides": results})
 
 
 if __name__ == "__main__":

@@ -1,16 +1,20 @@
-"""One press: CPU time against error, for several meshes, without and with bending.
+"""CPU time and error of a solve for several meshes, without and with bending.
 
     python tests/benchmarks/bench_solve.py [--positions 20] [--seed 1] [--plot FILE.png] [--json]       (ten minutes)
 
-Time is the process CPU time of `press` (mesh, Newton) and `touch_charge` (readout) with imports, templates and symbolic
-work done, from flat ("cold") and from a press 0.5 mm away with a tenth more force ("warm"). Errors are of each charge,
-relative to itself, over the built-in sensors, against a solve of the same theory on a far finer mesh whose electrodes
-are read with 60 x 60 points; so they contain mesh and readout, but not what a theory leaves out.
+The time is the CPU time of `press` (mesh and Newton's method) and `touch_charge` (readout). Imports, templates and the
+symbolic factorisation are done before. A solve starts from the flat film ("cold"), or from a press 0.5 mm away with 1.1
+times the force ("warm").
+
+The errors are relative errors of each charge of the built-in sensors. The reference is a solve with the same theory on
+a far finer mesh, whose electrodes are read at 60 x 60 points. The errors therefore contain those of mesh and readout,
+but not the effects that a theory neglects.
 """
 
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,6 +24,7 @@ from isocharge.simulate import (
     Circle,
     Equilibrium,
     Polygon,
+    Probe,
     Resolution,
     SolveSettings,
     Theory,
@@ -32,106 +37,168 @@ from isocharge.simulate.forward.readout import ReadoutPoints
 from isocharge.simulate.mesh.template import template_for
 
 SENSORS = [load_sensor(f"{layout}-25um-{kind}") for layout in ("three", "four") for kind in ("biaxial", "uniaxial")]
-FILM, PROBE = SENSORS[0].film, Circle(1.0)
-MEMBRANE, BENT = (Theory(stretching=True, bending=bending, pretensioned=False) for bending in (False, True))
-REFINED = {MEMBRANE: Resolution(10, 8, 8), BENT: Resolution(9, 8, 8, 2)}
+FILM = SENSORS[0].film
+PROBE = Circle(1.0)
+MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
+WITH_BENDING = Theory(stretching=True, bending=True, pretensioned=False)
+REFERENCE_MESHES = {MEMBRANE: Resolution(10, 8, 8), WITH_BENDING: Resolution(9, 8, 8, 2)}
+"""Meshes of the reference solves."""
+
 MESHES = {
     MEMBRANE: ((3, 8, 4), (4, 8, 4), (4, 8, 6), (5, 8, 6), (6, 8, 6), (7, 8, 6)),
-    BENT: ((3, 8, 4, 1), (4, 8, 6, 1), (5, 8, 6, 1), (6, 8, 6, 1), (7, 8, 6, 2)),
+    WITH_BENDING: ((3, 8, 4, 1), (4, 8, 6, 1), (5, 8, 6, 1), (6, 8, 6, 1), (7, 8, 6, 2)),
 }
+"""Meshes that are measured, as the arguments of `Resolution`. The first number is the order of the elements."""
+
 PROBES = (PROBE, Polygon.triangle(4.0, 0.5), Polygon.rectangle(4.0, 2.0, 0.5))
+"""Probes for which the mesh that `press` chooses is measured."""
+
+References = dict[tuple[Theory, str, int], Equilibrium]
+"""Reference solves by the theory, the name of the group of presses, and the number of the press."""
 
 
-def contacts(count: int, seed: int, *, on_electrode: bool) -> np.ndarray:
-    """Presses (x, y, F), mm and N: within 10 mm and 4 mm from all electrodes, or on or beside one; 0.05 to 2 N."""
+def draw_contacts(count: int, seed: int, *, on_electrode: bool) -> np.ndarray:
+    """Draw presses of 0.05 to 2 N.
+
+    Args:
+        count: Number of presses.
+        seed: Seed of the presses.
+        on_electrode: Whether the presses are within 2.5 mm of the centre of an electrode. Otherwise they are at least
+            4 mm from all centres and within 10 mm of the centre of the film.
+
+    Returns:
+        Contacts (x, y, F), shape (count, 3), mm and N.
+    """
     rng = np.random.default_rng([seed, on_electrode])
     centres = np.array([complex(*electrode.centre) for sensor in SENSORS for electrode in sensor.electrodes])
-    z = 12.0 * np.sqrt(rng.random(500 * count)) * np.exp(2j * np.pi * rng.random(500 * count))
-    nearest = np.abs(z[:, None] - centres).min(axis=1)
-    z = z[nearest < 2.5 if on_electrode else (nearest > 4.0) & (np.abs(z) < 10.0)][:count]
-    return np.stack([z.real, z.imag, np.exp(rng.uniform(np.log(0.05), np.log(2.0), count))], axis=1)
+    candidate_count = 500 * count
+    position = 12.0 * np.sqrt(rng.random(candidate_count)) * np.exp(2j * np.pi * rng.random(candidate_count))
+    distance = np.abs(position[:, None] - centres).min(axis=1)
+    is_near_electrode = distance < 2.5
+    is_away = (distance > 4.0) & (np.abs(position) < 10.0)
+    chosen = position[is_near_electrode if on_electrode else is_away][:count]
+    force = np.exp(rng.uniform(np.log(0.05), np.log(2.0), count))
+    return np.stack([chosen.real, chosen.imag, force], axis=1)
 
 
-def timed(contact: np.ndarray, settings: SolveSettings, probe=PROBE, start=None) -> tuple[float, Equilibrium]:
-    """CPU time of solve and readout, ms, and the equilibrium."""
-    (x, y, force), began = contact.tolist(), time.process_time()
+def solve(
+    contact: np.ndarray, settings: SolveSettings, probe: Probe = PROBE, start: Equilibrium | None = None
+) -> tuple[Equilibrium, float]:
+    """Solve a press, and return the equilibrium and the CPU time of solve and readout, ms."""
+    x, y, force = contact.tolist()
+    start_s = time.process_time()
     solved = press(FILM, probe, (x, y), force, settings, start=start)
     touch_charge(SENSORS[0], solved)
-    return 1e3 * (time.process_time() - began), solved
+    return solved, 1e3 * (time.process_time() - start_s)
 
 
-def worst_error(solved: Equilibrium, exact: Equilibrium) -> list[float]:
-    """Relative errors of all charges of all sensors."""
+def relative_errors(solved: Equilibrium, reference: Equilibrium) -> list[float]:
+    """Return the relative errors of all charges of all sensors."""
     errors = []
     for sensor in SENSORS:
         rule = ReadoutPoints.of(sensor, 60)
-        stress = touch_stress(exact, rule.points.reshape(-1, 2)).reshape(*rule.points.shape[:2], 3)
+        n_electrode, n_point, _ = rule.points.shape
+        stress = touch_stress(reference, rule.points.reshape(-1, 2)).reshape(n_electrode, n_point, 3)
         errors += np.abs(touch_charge(sensor, solved) / rule.charge(stress) - 1.0).tolist()
     return errors
 
 
-def measure(theory: Theory, mesh: tuple[int, ...], groups: dict[str, np.ndarray], exact: dict) -> dict:
-    """One line of the table."""
+def measure_mesh(
+    theory: Theory, mesh: tuple[int, ...], groups: dict[str, np.ndarray], references: References
+) -> dict[str, Any]:
+    """Measure times and errors of a mesh.
+
+    Args:
+        theory: Theory of the film.
+        mesh: Arguments of `Resolution`.
+        groups: Presses, shape (n, 3) each, by the name of the group.
+        references: Reference solves of these presses.
+    """
     settings = SolveSettings(theory=theory, resolution=Resolution(*mesh))
-    cold, warm, errors = [], [], {name: [] for name in groups}
+    cold_ms = []
+    warm_ms = []
+    errors: dict[str, list[float]] = {name: [] for name in groups}
     for name, group in groups.items():
         for number, contact in enumerate(group):
-            neighbour = timed(contact * [1.0, 1.0, 1.1] + [0.3, -0.4, 0.0], settings)[1]
-            spent, solved = timed(contact, settings)
-            cold.append(spent)
-            warm.append(timed(contact, settings, start=neighbour)[0])
-            errors[name] += worst_error(solved, exact[theory, name, number])
+            neighbour_contact = contact * [1.0, 1.0, 1.1] + [0.3, -0.4, 0.0]
+            neighbour, _ = solve(neighbour_contact, settings)
+            solved, cold_time_ms = solve(contact, settings)
+            _, warm_time_ms = solve(contact, settings, start=neighbour)
+            cold_ms.append(cold_time_ms)
+            warm_ms.append(warm_time_ms)
+            errors[name] += relative_errors(solved, references[theory, name, number])
     return {
         "theory": theory.name,
         "mesh": mesh,
         "unknowns": 3 * template_for(PROBE, settings.resolution).n_node,
-        "cold_ms": np.quantile(cold[1:], [0.5, 0.95]).tolist(),
-        "warm_ms": np.quantile(warm[1:], [0.5, 0.95]).tolist(),
+        "cold_ms": np.quantile(cold_ms[1:], [0.5, 0.95]).tolist(),
+        "warm_ms": np.quantile(warm_ms[1:], [0.5, 0.95]).tolist(),
         **{f"error_{name}": [float(np.median(values)), max(values)] for name, values in errors.items()},
     }
 
 
-def chosen(theory: Theory, probe, group: np.ndarray) -> dict:
-    """The mesh that `press` takes by itself, for a probe."""
-    spent, errors = [], []
-    for contact in group:
-        _, solved = timed(contact, SolveSettings(theory=theory), probe)
+def measure_chosen_mesh(theory: Theory, probe: Probe, contacts: np.ndarray) -> dict[str, Any]:
+    """Measure time and error of the mesh that `press` chooses for a probe.
+
+    The reference solve has elements whose order is higher by three.
+    """
+    settings = SolveSettings(theory=theory)
+    cold_ms = []
+    errors = []
+    for contact in contacts:
+        solved, _ = solve(contact, settings, probe)
         finer = replace(solved.mesh.resolution, order=solved.mesh.resolution.order + 3)
-        errors += worst_error(solved, timed(contact, SolveSettings(theory=theory, resolution=finer), probe)[1])
-        spent.append(timed(contact, SolveSettings(theory=theory), probe)[0])
-    mesh = list(asdict(solved.mesh.resolution).values())
+        reference, _ = solve(contact, SolveSettings(theory=theory, resolution=finer), probe)
+        errors += relative_errors(solved, reference)
+        _, time_ms = solve(contact, settings, probe)  # the first solve also computed the template
+        cold_ms.append(time_ms)
     return {
-        "theory": theory.name, "probe": probe.notation, "mesh": mesh,
-        "cold_ms": float(np.median(spent)), "error_worst": max(errors),
-    }  # fmt: skip
-
-
-def record(positions: int, seed: int) -> dict:
-    """Everything that is measured."""
-    groups = {"away": contacts(positions, seed, on_electrode=False), "on": contacts(positions, seed, on_electrode=True)}
-    exact = {
-        (theory, name, number): timed(contact, SolveSettings(theory=theory, resolution=resolution))[1]
-        for theory, resolution in REFINED.items()
-        for name, group in groups.items()
-        for number, contact in enumerate(group)
-    }
-    return {
-        "meshes": [measure(theory, mesh, groups, exact) for theory, meshes in MESHES.items() for mesh in meshes],
-        "chosen": [chosen(theory, probe, groups["away"][:3]) for probe in PROBES for theory in MESHES],
+        "theory": theory.name,
+        "probe": probe.notation,
+        "mesh": list(asdict(solved.mesh.resolution).values()),
+        "cold_ms": float(np.median(cold_ms)),
+        "error_worst": max(errors),
     }
 
 
-def plot(result: dict, path: Path) -> None:
-    """Time against error."""
+def measure_all(positions: int, seed: int) -> dict[str, Any]:
+    """Measure all meshes.
+
+    Args:
+        positions: Number of presses of each group.
+        seed: Seed of the presses.
+    """
+    groups = {
+        "away": draw_contacts(positions, seed, on_electrode=False),
+        "on": draw_contacts(positions, seed, on_electrode=True),
+    }
+    references: References = {}
+    for theory, resolution in REFERENCE_MESHES.items():
+        settings = SolveSettings(theory=theory, resolution=resolution)
+        for name, group in groups.items():
+            for number, contact in enumerate(group):
+                references[theory, name, number], _ = solve(contact, settings)
+    return {
+        "meshes": [
+            measure_mesh(theory, mesh, groups, references) for theory, meshes in MESHES.items() for mesh in meshes
+        ],
+        "chosen": [measure_chosen_mesh(theory, probe, groups["away"][:3]) for probe in PROBES for theory in MESHES],
+    }
+
+
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Draw the largest error against the CPU time, with the order of the elements beside each point."""
     figure = Figure(figsize=(7.2, 4.4), layout="constrained")
     axes = figure.subplots()
     for theory in MESHES:
         rows = [row for row in result["meshes"] if row["theory"] == theory.name]
-        for place, marker in (("away", "o"), ("on", "s")):
-            seconds, errors = [1e-3 * row["cold_ms"][0] for row in rows], [row[f"error_{place}"][1] for row in rows]
-            axes.loglog(seconds, errors, marker, ms=5, label=f"{theory.name}, probe {place} electrodes")
-            for row, *at in zip(rows, seconds, errors, strict=True):
-                axes.annotate(row["mesh"][0], at, xytext=(4, 4), textcoords="offset points", fontsize=7)
+        for group, marker in (("away", "o"), ("on", "s")):
+            times_s = [1e-3 * row["cold_ms"][0] for row in rows]
+            errors = [row[f"error_{group}"][1] for row in rows]
+            axes.loglog(times_s, errors, marker, ms=5, label=f"{theory.name}, probe {group} electrodes")
+            for row, time_s, error in zip(rows, times_s, errors, strict=True):
+                order = row["mesh"][0]
+                axes.annotate(order, (time_s, error), xytext=(4, 4), textcoords="offset points", fontsize=7)
     axes.set(xlabel="CPU time of one press, s", ylabel="worst error of a charge", title="Numbers: order of elements")
     axes.grid(True, color="0.9")
     axes.legend(fontsize=7)
@@ -140,7 +207,7 @@ def plot(result: dict, path: Path) -> None:
 
 def main() -> None:
     asked = arguments(__doc__, positions=20, seed=1, plot=None, json=False)
-    result = record(asked.positions, asked.seed)
+    result = measure_all(asked.positions, asked.seed)
     if asked.plot:
         plot(result, asked.plot)
     print_results("solve", asked, result)

@@ -1,17 +1,11 @@
-"""A calibrated film whose pretension drifts, followed live by touches whose place and force nobody tells."""
+"""Tests of following the pretension of a calibrated film by touches of unknown place and force."""
 
 import json
-import shutil
-import tempfile
-from dataclasses import replace
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.train.calibration.conftest import presses_of
+from tests.train.calibration.conftest import DEGREE_MPa, film_of, rms_errors
 
-from isocharge.common.errors import ModelError
 from isocharge.serve import (
     Chunk,
     Frame,
@@ -26,110 +20,88 @@ from isocharge.serve import (
 from isocharge.serve.flags import FILM
 from isocharge.serve.live import recorded_stream
 from isocharge.serve.live.recorded_stream import RecordedStream
-from isocharge.serve.model.pretensions import read_pretensions
-from isocharge.serve.signal_chain.thermal import TRIED_PC, ThermalRule
-from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule, PeakFrame
-from isocharge.simulate import Circle, load_sensor
-from isocharge.train import CalibrationProblem, calibrate, write_calibration
-from isocharge.train.calibration import contact_error
-from isocharge.train.calibration.film_directions import film_directions
-from isocharge.train.calibration.problem import FilmEstimate
-from isocharge.train.calibration.result import film_without_presses
+from isocharge.serve.tracking.film_follower import FilmFollower, PeakFrame
 from isocharge.train.data.presses import draw_contacts
-from kept import kept
 
 pytestmark = pytest.mark.usefixtures("no_closed_backs")
 
-DEGREE_MPa = 0.35
-"""What a degree of the room does on a ring of aluminium."""
+N_TARE = 110
+"""Number of frames without a touch at the beginning of a stream."""
 
-REST, TOUCH = np.zeros(20), np.sqrt(np.sin(np.linspace(0.0, np.pi, 42)[1:-1]))
-"""Force over its peak in the frames between touches and in those of one."""
+N_REST = 20
+"""Number of frames without a touch before each touch."""
 
-PERIOD = REST.size + TOUCH.size
+TOUCH_SHAPE = np.sqrt(np.sin(np.linspace(0.0, np.pi, 42)[1:-1]))
+"""Force in the frames of a touch, relative to its largest force."""
+
+PERIOD = N_REST + TOUCH_SHAPE.size
+"""Number of frames from one touch to the next."""
+
+MIN_FORCE_N = 0.05
+"""Smallest force of the forward maps. Below it, charges are proportional to the force to the power 2/3."""
 
 FOLLOWING = device_from_table({"follow": {"on": True}}, "test")
 
 
-def film_of(problem):
-    """Parameters of a film that is not as described, at 1 MPa."""
-    return np.append(1.0, problem.prior.draw(np.random.default_rng(1), 1)[0][1:])
+def follow(mine, problem, film, pretensions, gain=1.0, before_touch=None):
+    """Send touches through a stream that follows the film.
 
+    Args:
+        mine: Folder of the calibrated model.
+        problem: The films.
+        film: Function that returns the forward map with a pretension.
+        pretensions: Pretension during each touch, MPa.
+        gain: Gains of the electrodes; a number or an array.
+        before_touch: Function that is called with the stream and the number of each touch before the touch.
 
-def calibrated_files(sensor: str, seed: int) -> dict[str, bytes]:
-    """The model folder of a film calibrated by twenty presses: its files by their paths."""
-    problem, rng = CalibrationProblem.of(load_sensor(sensor), Circle(1.0)), np.random.default_rng(seed)
-    contact = draw_contacts(rng, problem.domain, 20)
-    charge = problem.noise.add(problem.charges.charges(film_of(problem), contact), rng)
-    contact *= np.exp([0.0, 0.0, 0.01] * rng.standard_normal((20, 3)))
-    contact[:, :2] += 0.1 * rng.standard_normal((20, 2))
-    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        # The directions of the film need more contacts than the fixture `coarse` sets.
-        patch.setattr(contact_error, "N_CONTACTS", 200)
-        path = Path(folder) / "mine"
-        write_calibration(calibrate(presses_of(problem, contact, charge), problem), path)
-        return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
-
-
-@pytest.fixture(scope="module")
-def mine(tmp_path_factory) -> Path:
-    """The folder of the calibrated film."""
-    folder = tmp_path_factory.mktemp("films") / "mine"
-    for name, data in kept(calibrated_files, "four-25um-biaxial", 5).items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(data)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def film(problem):
-    """Forward maps of the film by its pretension, to 0.01 MPa."""
-    parameters = film_of(problem)
-
-    @cache
-    def at(hundredths):
-        return problem.charges.forward_map(np.append(0.01 * hundredths, parameters[1:]))
-
-    return lambda pretension: at(round(100 * pretension))
-
-
-def follow(mine, problem, film, pretensions, gain=1.0, ask=None):
-    """Records of the hardest frames of touches, one at each pretension (MPa), and errors, mm and of ln F, (n, 2)."""
-    stream, records = TouchStream(Predictor(mine), FOLLOWING), []
+    Returns:
+        Record of the frame with the largest force of each touch, and errors of the position, mm, and of ln F, shape
+        (n_touch, 2).
+    """
+    stream = TouchStream(Predictor(mine), FOLLOWING)
+    records = []
     contact, chunks = touches(problem, film, pretensions, gain)
     for number, chunk in enumerate(chunks):
-        if ask and (number - 110) % PERIOD == 0:
-            ask(stream, (number - 110) // PERIOD)
+        touch_number, frame_in_period = divmod(number - N_TARE, PERIOD)
+        if before_touch is not None and frame_in_period == 0:
+            before_touch(stream, touch_number)
         records += stream.feed(chunk)
-    hardest = records[110 + REST.size + TOUCH.size // 2 :: PERIOD]
-    errors = [
-        (np.hypot(r.x_mm - x, r.y_mm - y), np.log(r.force_N / F)) for r, (x, y, F) in zip(hardest, contact, strict=True)
+    hardest = records[N_TARE + N_REST + TOUCH_SHAPE.size // 2 :: PERIOD]
+    position_error = [
+        np.hypot(record.x_mm - x, record.y_mm - y) for record, (x, y, _) in zip(hardest, contact, strict=True)
     ]
-    return hardest, np.array(errors)
+    log_force_error = [np.log(record.force_N / force) for record, (_, _, force) in zip(hardest, contact, strict=True)]
+    return hardest, np.column_stack([position_error, log_force_error])
 
 
 def touches(problem, film, pretensions, gain=1.0):
-    """Contacts, shape (n, 3), and the chunks of a board that begins at rest, one for each frame."""
-    rng, low, rows = np.random.default_rng(3), 0.05, []
+    """Return the contacts of touches, shape (n, 3), and the data of a board, one chunk for each frame.
+
+    The arguments are those of `follow`. The data begin without a touch.
+    """
+    rng = np.random.default_rng(3)
     contact = draw_contacts(rng, problem.domain, len(pretensions))
-    for (x, y, peak), pretension in zip(contact, pretensions, strict=True):
-        at = np.column_stack([np.tile([x, y], (TOUCH.size, 1)), np.maximum(peak * TOUCH, low)])
-        charge = film(pretension).charges(at) * (np.minimum(peak * TOUCH / low, 1.0) ** (2 / 3))[:, None]
-        rows += [np.zeros((REST.size, charge.shape[1])), charge * gain]
-    raw = problem.noise.add(np.vstack([np.zeros((110, charge.shape[1])), *rows]), rng)
-    frames = [Frame(number, 5000 * number, tuple(row.tolist())) for number, row in enumerate(raw)]
+    n_electrode = len(problem.electrodes)
+    charges = [np.zeros((N_TARE, n_electrode))]
+    for (x, y, largest_force), pretension in zip(contact, pretensions, strict=True):
+        force = largest_force * TOUCH_SHAPE
+        position = np.tile([x, y], (force.size, 1))
+        mapped_charge = film(pretension).charges(np.column_stack([position, np.maximum(force, MIN_FORCE_N)]))
+        small_force_factor = np.minimum(force / MIN_FORCE_N, 1.0) ** (2.0 / 3.0)
+        charges += [np.zeros((N_REST, n_electrode)), mapped_charge * small_force_factor[:, None] * gain]
+    noisy_charge = problem.noise.add(np.vstack(charges), rng)
+    frames = [Frame(number, 5000 * number, tuple(row.tolist())) for number, row in enumerate(noisy_charge)]
     return contact, [Chunk(encode_frame(frame), 1.7e9 + 0.005 * frame.seq, 0) for frame in frames]
 
 
-def rms(errors):
-    """Errors of place, mm, and of force, %."""
-    return np.sqrt(np.mean(errors**2, axis=0)) * [1.0, 100.0]
-
-
 def differences_from_known_film(problem, pretension, records):
-    """Return how far records are from the answers to their charges of the network that is told the film: mm, and ln F.
+    """Compare records with the contacts that the network of the true film estimates from the same charges.
 
-    The noise of the charges changes both answers alike, so that the differences depend little on the touches.
+    The noise of the charges changes both contacts in the same way, so that the differences depend little on the
+    touches.
+
+    Returns:
+        Differences of the position, mm, and of ln F, shape (n, 2).
     """
     network = problem.films.fold(np.append(pretension, film_of(problem)[1:]))
     answer, *_ = network.predict(np.array([list(record.charge_pC.values()) for record in records]))
@@ -138,341 +110,139 @@ def differences_from_known_film(problem, pretension, records):
     return np.column_stack([position, log_force])
 
 
-def test_it_follows_a_degree_and_goes_back_when_asked(mine, problem, film):
-    """After 60 touches the answers are within 0.08 mm and 3 % of those for the known film.
+def reset_film_before(number):
+    """Return a function for `follow` that resets the film before the touch with this number."""
 
-    As calibrated, the errors would be 0.3 mm and 14 %. The rms error of the place after 60 touches is between 0.17 and
-    0.20 mm for different sets of touches, of which 0.15 to 0.17 mm are due to the noise of the charges.
-    """
-    back = lambda stream, touch: touch == 110 and stream.reset_film()  # noqa: E731
-    records, errors = follow(mine, problem, film, [1.0 + DEGREE_MPa] * 118, ask=back)
-    start, still = rms(errors[:8]), rms(errors[60:110])
-    assert start[1] > 10.0
-    from_known_film = rms(differences_from_known_film(problem, 1.0 + DEGREE_MPa, records[60:110]))
-    assert from_known_film[0] < 0.08
-    assert still[0] < 0.2
-    assert still[1] < 3.0
-    before, after, last = (records[n].film for n in (0, 109, 111))
-    change = after.pretension_MPa - before.pretension_MPa
-    assert change == pytest.approx(DEGREE_MPa, abs=2.0 * after.pretension_std_MPa)
-    assert after.pretension_std_MPa < 0.09  # computed limit after 30 touches on this layout
-    assert after.touches == pytest.approx(95, abs=15)
-    assert before.touches == 0
-    force_std = [record.force_std_N / record.force_N for record in records[60:110]]
-    assert np.mean(np.abs(errors[60:110, 1]) < 2.0 * np.array(force_std)) > 0.9  # 0.84 without the pretension's
-    assert last.pretension_MPa == before.pretension_MPa
-    assert last.pretension_std_MPa == before.pretension_std_MPa
-    assert rms(errors[111:])[1] > 10.0
+    def reset(stream, touch_number):
+        if touch_number == number:
+            stream.reset_film()
+
+    return reset
 
 
-def test_it_follows_a_drift_that_lasts(mine, problem, film):
-    _, errors = follow(mine, problem, film, 1.0 + DEGREE_MPa * np.linspace(0.0, 1.0, 100))
-    assert rms(errors[50:])[1] < 5.5  # 12 % as calibrated; a slow drift could also be an offset that grows
-
-
-def test_a_film_that_stays_is_left_as_it_is(mine, problem, film):
-    _, errors = follow(mine, problem, film, [1.0] * 80)
-    _, alone = follow(mine, problem, film, [1.0] * 80, ask=lambda stream, _: stream.reset_film())
-    followed, alone = rms(errors), rms(alone)
-    np.testing.assert_array_less(followed, np.hypot(1.05 * alone, [0.0, 0.75]))  # each gain may drift by 1 %; F ~ Q^1.5
-
-
-def test_a_replay_follows_and_goes_back_as_the_stream_did(mine, problem, film, tmp_path):
-    _, chunks = touches(problem, film, [1.0 + DEGREE_MPa] * 40)
-    model, path, clock = Predictor(mine), tmp_path / "touches.rec", RecordedClock()
-    with Recorder(path, model.metadata.label, "every", FOLLOWING.table) as recorder:
-        live = RecordedStream(TouchStream(model, FOLLOWING), recorder)
-
-        def asking():
-            for number, chunk in enumerate(chunks):
-                if number == 110 + 36 * PERIOD:
-                    live.request_film_reset()
-                yield chunk
-
-        lines = [record.to_json() for record in live.follow(asking())]
-    pretensions = [json.loads(line)["film"]["pretension_MPa"] for line in lines]
-    assert max(pretensions) > pretensions[0] + 0.2
-    assert pretensions[-1] == pretensions[0]
-    recording = Recording(path)
-    again = TouchStream(Predictor(mine), device_from_table(recording.device, "test"), now_ns=clock)
-    assert [record.to_json() for record in recorded_stream.replay(recording, again, clock)] == lines
-
-
-@pytest.mark.parametrize(("electrode", "change", "flagged"), [(0, -0.03, True), (3, 0.015, False)])
-def test_a_gain_that_is_wrong_is_not_followed(mine, problem, film, electrode, change, flagged):
-    """The charges could nearly be those of a film 0.2 to 0.3 MPa from this one, and the force wrong by 8 to 14 %."""
-    records, _ = follow(mine, problem, film, [1.0] * 80, gain=1.0 + change * np.eye(4)[electrode])
-    apart = [record.film.pretension_MPa - records[0].film.pretension_MPa for record in records]
-    assert max(map(abs, apart[40:])) < 0.06
-    assert (FILM in records[-1].flags) == flagged
-
-
-def test_a_gain_that_goes_off_late_is_not_followed(mine, problem, film):
-    """By 0.3 MPa if 25 minutes of good touches had told the gains for good."""
-    follower, rng, pretensions = FilmFollower(Predictor(mine)), np.random.default_rng(4), []
-    charge = problem.noise.add(film(1.0).charges(draw_contacts(rng, problem.domain, 360)), rng)
-    charge[300:, 0] *= 0.985
-    for number, row in enumerate(charge):
-        follower.observe_touch(PeakFrame(follower.predictor.predict(row), row), 5.0 * number)
-        pretensions.append(follower.film.pretension_MPa)
-    assert np.ptp(pretensions[299:]) < 0.1
-
-
-def follow_touches(follower, charges, interval_s=5.0):
-    """Let a follower observe the hardest frames of touches, charges of shape (n, 4), pC, with the model's flags."""
-    for number, charge in enumerate(charges):
-        contact = follower.predictor.predict(charge)
-        flags = follower.predictor.flags(contact)
-        follower.observe_frame(charge, contact, flags, interval_s * number)
-        follower.observe_frame(None, None, (), interval_s * (number + 0.5))
-
-
-def touch_charges(problem, film, predictor, pretension, count, seed):
-    """Contacts below the yield force, shape (n, 3), and their noisy charges, shape (n, 4), pC."""
-    rng = np.random.default_rng(seed)
-    contact = draw_contacts(rng, problem.domain, count)
-    contact[:, 2] = np.minimum(contact[:, 2], 0.95 * predictor.validity.yield_force_N)
-    return contact, problem.noise.add(film(pretension).charges(contact), rng)
-
-
-WARM_TOUCHES = np.arange(120)
-
-OFFSETS = {
-    "constant": np.ones(WARM_TOUCHES.size),
-    "varying": 1.0 + 0.5 * np.random.default_rng(9).standard_normal(WARM_TOUCHES.size),
-    "decaying": np.exp(-WARM_TOUCHES / 30.0),
-    "warming": 1.0 - np.exp(-WARM_TOUCHES / 30.0),
-}
-"""Offset of each touch over the largest offset of the session."""
-
-
-@pytest.mark.parametrize(
-    "size_pC", [-30.0, 10.0, pytest.param(-10.0, marks=pytest.mark.slow), pytest.param(30.0, marks=pytest.mark.slow)]
-)
-@pytest.mark.parametrize("kind", OFFSETS)
-def test_common_offset_of_warm_fingers_is_not_taken_for_pretension(mine, problem, film, kind, size_pC):
-    """Without an offset among its unknowns the follower moved by 0.3 to 1.2 MPa, up to six standard deviations."""
-    model = Predictor(mine)
-    follower = FilmFollower(model)
-    calibrated_MPa = follower.film.pretension_MPa
-    contact, charge = touch_charges(problem, film, model, 1.0, 130, seed=8)
-    warm = slice(0, 120)
-    cold = slice(120, None)
-    follow_touches(follower, charge[warm] + size_pC * OFFSETS[kind][:, None])
-
-    change_MPa = follower.film.pretension_MPa - calibrated_MPa
-    assert follower.is_lost or abs(change_MPa) < 2.0 * follower.film.pretension_std_MPa
-    for (x_mm, y_mm, force_N), row in zip(contact[cold], charge[cold], strict=True):
-        answer = follower.follow_contact(follower.predictor.predict(row), row).contact
-        assert follower.is_lost or abs(answer.x_mm - x_mm) < 4.0 * answer.x_std_mm
-        assert follower.is_lost or abs(answer.y_mm - y_mm) < 4.0 * answer.y_std_mm
-        assert follower.is_lost or abs(answer.force_N - force_N) < 4.0 * answer.force_std_N
-
-
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_changed_film_is_followed_although_offsets_are_possible(mine, problem, film, sign):
-    follower = FilmFollower(Predictor(mine))
-    calibrated_MPa = follower.film.pretension_MPa
-    _, charge = touch_charges(problem, film, follower.predictor, 1.0 + sign * DEGREE_MPa, 60, seed=8)
-    follow_touches(follower, charge)
-    change_MPa = follower.film.pretension_MPa - calibrated_MPa
-    assert not follower.is_lost
-    assert change_MPa == pytest.approx(sign * DEGREE_MPa, abs=0.15)
-
-
-def test_offset_beyond_the_setting_stops_the_following(mine, problem, film):
-    follower = FilmFollower(Predictor(mine), FollowRule(largest_offset_pC=3.0))
-    _, charge = touch_charges(problem, film, follower.predictor, 1.0, 60, seed=8)
-    follow_touches(follower, charge + 15.0)
-    assert follower.is_lost
-
-
-def test_without_an_offset_setting_warmth_is_taken_for_pretension(mine, problem, film):
-    """`largest_offset_pC = 0` assumes that there are no offsets, as the follower once did."""
-    follower = FilmFollower(Predictor(mine), FollowRule(largest_offset_pC=0.0))
-    calibrated_MPa = follower.film.pretension_MPa
-    _, charge = touch_charges(problem, film, follower.predictor, 1.0, 60, seed=8)
-    follow_touches(follower, charge + 10.0)
-    assert abs(follower.film.pretension_MPa - calibrated_MPa) > 0.25
-
-
-def test_offset_that_differs_between_electrodes_is_recognised_by_its_ratio(mine, problem, film):
-    ratio = np.array([1.4, 0.6, 1.4, 0.6])
-    follower = FilmFollower(Predictor(mine), offset_ratio=ratio)
-    calibrated_MPa = follower.film.pretension_MPa
-    _, charge = touch_charges(problem, film, follower.predictor, 1.0, 60, seed=8)
-    follow_touches(follower, charge + 10.0 * ratio)
-    assert abs(follower.film.pretension_MPa - calibrated_MPa) < 2.0 * follower.film.pretension_std_MPa
-
-
-def warming_without_noise(predictor, charge):
-    """Return the warming that minimises the squared misfit of each row of charges, where temperature is separable."""
-    warming_pC = []
-    for row in charge:
-        squared_misfits = np.square(predictor.predict_batch(row - TRIED_PC[:, None]).misfit, dtype=float)
-        curvature, slope, _ = np.polyfit(TRIED_PC, squared_misfits, 2)
-        is_separable = curvature > (ThermalRule().noise / ThermalRule().blind_pC) ** 2
-        if is_separable:
-            warming_pC.append(np.clip(-slope / (2.0 * curvature), TRIED_PC[0], TRIED_PC[-1]))
-    return np.array(warming_pC)
-
-
-def test_followed_film_shows_little_warming_anywhere(mine, problem, film):
-    """A film that is a degree tauter shows 17 pC of warming that is not there, rms over places, as calibrated."""
-    follower = FilmFollower(Predictor(mine))
-    _, charge = touch_charges(problem, film, follower.predictor, 1.0 + DEGREE_MPa, 60, seed=8)
-    contact = draw_contacts(np.random.default_rng(1), problem.domain.within(6.0), 40)
-    held_charge = film(1.0 + DEGREE_MPa).charges(contact)
-    calibrated_pC = warming_without_noise(follower.predictor, held_charge)
-    follow_touches(follower, charge)
-    followed_pC = warming_without_noise(follower.predictor, held_charge)
-    assert np.sqrt(np.mean(calibrated_pC**2)) > 15.0
-    assert np.sqrt(np.mean(followed_pC**2)) < 5.0
-
-
-def test_common_mode_estimates_warming_by_the_followed_film(mine, problem, film):
-    """The signal chain uses the misfit of the followed film, here at one place.
-
-    As calibrated, the mean of the warming at this place would be -16 pC.
-    """
-    device = device_from_table({"follow": {"on": True}, "common_mode": {"on": True}}, "test")
-    stream = TouchStream(Predictor(mine), device)
-    _, charge = touch_charges(problem, film, stream.predictor, 1.0 + DEGREE_MPa, 60, seed=8)
-    follow_touches(stream._film_stage.follower, charge)
-    held = film(1.0 + DEGREE_MPa).charges(np.array([[4.0, 3.0, 0.5]]))
-    clean = np.vstack([np.zeros((110, 4)), np.tile(held, (400, 1))])
-    raw = problem.noise.add(clean, np.random.default_rng(0))
-    frames = [Frame(number, 5000 * number, tuple(row.tolist())) for number, row in enumerate(raw)]
-    records = [
-        record for frame in frames for record in stream.feed(Chunk(encode_frame(frame), 1.7e9 + 0.005 * frame.seq, 0))
-    ]
-    warming_pC = [record.charge_raw_pC["A"] - record.charge_pC["A"] for record in records[300:]]
-    assert abs(np.mean(warming_pC)) < 6.0
-
-
-def estimated_film(problem, gain_std=0.0, coefficients=None):
-    """Return an estimate of a film of 1 MPa without presses, in which only the gain of the first electrode is unknown.
-
-    Args:
-        problem: The films.
-        gain_std: Standard deviation of the logarithm of this gain.
-        coefficients: Coefficients of the first modes of the film.
-    """
-    layout = problem.charges.layout
-    variance = np.full(layout.film_count, 1e-8)
-    first_gain = layout.parameter_count - len(problem.electrodes)
-    variance[first_gain] = (gain_std / problem.prior.spread.gain) ** 2
-    film_coefficients = np.zeros(layout.coefficient_count)
-    if coefficients is not None:
-        film_coefficients[: len(coefficients)] = coefficients
-    joint = np.diag(variance)
-    covariance = joint[layout.parameters, layout.parameters]
-    estimate = FilmEstimate(film_of(problem), covariance, film_coefficients, joint)
-    return film_without_presses(problem, estimate, "estimated")
-
-
-def test_directions_of_an_unknown_gain_change_one_charge(problem):
-    directions = film_directions(estimated_film(problem, gain_std=0.2))
-    contact = draw_contacts(np.random.default_rng(5), problem.domain, 50)
-    log_changes = np.abs(directions.log_changes(contact)[:, 0])
-    np.testing.assert_allclose(log_changes, np.tile([0.2, 0.0, 0.0, 0.0], (50, 1)), atol=0.01)
-
-
-def test_network_at_another_pretension_has_the_uneven_tension_of_the_film(problem):
-    """An uneven tension changes the charges of a tauter film less than those of the calibrated film."""
-    result = estimated_film(problem, coefficients=[2.0, -1.5])
-    tauter = result.posterior.unknowns.copy()
-    tauter[0] += 2.0 * DEGREE_MPa
-    parameters = tauter[problem.charges.layout.parameters]
-    contact = draw_contacts(np.random.default_rng(6), problem.domain, 200)
-    charge = problem.charges.charges(tauter, contact)
-    answer, *_ = result.fitted_film(parameters).network.predict(charge)
-    log_force_error = np.log(answer[:, 2] / contact[:, 2])
-    assert np.sqrt(np.mean(log_force_error**2)) < 0.006
+def reset_film_before_each(stream, _):
+    """Reset the film, for `follow`, so that the calibrated model is used for every touch."""
+    stream.reset_film()
 
 
 @pytest.fixture(scope="module")
-def film_with_unknown_gain(problem, tmp_path_factory) -> Path:
-    """The folder of a film whose first gain is known to 3 %."""
-    folder = tmp_path_factory.mktemp("films") / "unknown-gain"
-    write_calibration(estimated_film(problem, gain_std=0.03), folder)
-    return folder
+def followed_degree(mine, problem, film):
+    """Records and errors of touches on a film that is one kelvin colder than in the calibration.
+
+    The film is reset before touch 110.
+    """
+    return follow(mine, problem, film, [1.0 + DEGREE_MPa] * 118, before_touch=reset_film_before(110))
 
 
-def followed_error(folder, problem, film, gain):
-    """Return the errors of a follower of a film with a wrong gain after 60 touches: of places, mm, and forces, %."""
-    follower = FilmFollower(Predictor(folder))
-    contact, charge = touch_charges(problem, film, follower.predictor, 1.0, 160, seed=8)
-    charge[:, 0] *= gain
-    follow_touches(follower, charge[:60])
-    answer = [follower.follow_contact(follower.predictor.predict(row), row).contact for row in charge[60:]]
-    place_error = [np.hypot(one.x_mm - x, one.y_mm - y) for one, (x, y, _) in zip(answer, contact[60:], strict=True)]
-    log_force_error = [np.log(one.force_N / force) for one, (_, _, force) in zip(answer, contact[60:], strict=True)]
-    return rms(np.column_stack([place_error, log_force_error]))
+def test_change_by_a_degree_is_followed(followed_degree, problem):
+    """After 60 touches the contacts are within 0.08 mm and 3 % of those for the known film.
+
+    With the calibrated model, the errors would be 0.3 mm and 14 %. The rms error of the position after 60 touches is
+    0.17 to 0.20 mm for different sets of touches. The noise of the charges alone causes 0.15 to 0.17 mm.
+    """
+    records, errors = followed_degree
+    _, first_force_error_percent = rms_errors(errors[:8])
+    assert first_force_error_percent > 10.0
+    later = slice(60, 110)
+    difference_mm, _ = rms_errors(differences_from_known_film(problem, 1.0 + DEGREE_MPa, records[later]))
+    position_error_mm, force_error_percent = rms_errors(errors[later])
+    assert difference_mm < 0.08
+    assert position_error_mm < 0.2
+    assert force_error_percent < 3.0
 
 
-def test_gain_that_the_calibration_left_uncertain_is_followed(film_with_unknown_gain, problem, film, tmp_path):
-    """Without the file of directions, the gain is wrong in every answer, and may be taken for a change of the film."""
-    with_directions = followed_error(film_with_unknown_gain, problem, film, gain=1.04)
-    folder = shutil.copytree(film_with_unknown_gain, tmp_path / "without")
-    (folder / "1" / "film_directions.npz").unlink()
-    without_directions = followed_error(folder, problem, film, gain=1.04)
-    assert with_directions[0] < 0.19
-    assert with_directions[0] < 0.7 * without_directions[0]
-    assert with_directions[1] < 2.5
+def test_followed_pretension_has_the_stated_standard_deviation(followed_degree):
+    records, errors = followed_degree
+    before = records[0].film
+    after = records[109].film
+    assert before.touches == 0
+    assert after.touches == pytest.approx(95, abs=15)
+    change_MPa = after.pretension_MPa - before.pretension_MPa
+    assert change_MPa == pytest.approx(DEGREE_MPa, abs=2.0 * after.pretension_std_MPa)
+    assert after.pretension_std_MPa < 0.09  # computed limit after 30 touches on this layout
+
+    # The force intervals include the uncertainty of the pretension; without it, the share would be 0.84.
+    later = slice(60, 110)
+    log_force_std = np.array([record.force_std_N / record.force_N for record in records[later]])
+    log_force_error = np.abs(errors[later, 1])
+    assert np.mean(log_force_error < 2.0 * log_force_std) > 0.9
 
 
-def test_between_its_pretensions_it_is_the_network_for_all_films(mine, problem):
-    """Interpolated weights against the network that `calibrate` folds for that film."""
-    known, folder = read_pretensions(mine / "1"), mine / "1"
-    table = json.loads((folder / "calibration.json").read_text("utf-8"))
-    values = [entry["value"] for entry in table["parameters"].values()]
-    middle = float(known.node_MPa[3:5].mean())
-    parameters = problem.prior.parameters_of(load_sensor(folder / "sensor.toml"), problem.probe)
-    parameters[problem.prior.names.index("probe_radius")] = 1e3 * values[problem.prior.names.index("probe_radius")]
-    parameters[0] = middle
-    at = draw_contacts(np.random.default_rng(2), problem.domain, 300)
-    charge = problem.noise.add(problem.charges.charges(parameters, at), np.random.default_rng(3))
-    folded = problem.films.fold(parameters).predict(charge)[0]
-    answer = np.asarray(Predictor(mine).with_constants(known.constants(middle)).predict_batch(charge))
-    apart = np.hypot(*(answer[:, :2] - folded[:, :2]).T)
-    assert np.sqrt(np.mean(apart**2)) < 0.06  # what the film has besides its parameters was taught to the one alone
-    nodes = known.at(np.linspace(*known.range_MPa, 29))
-    misfits = [nodes.misfits(row, np.array([middle]))[0] for row in charge[:20]]
-    followed = Predictor(mine).with_constants(known.constants(middle)).predict_batch(charge[:20]).misfit
-    np.testing.assert_allclose(misfits, followed, atol=0.05)
+def test_reset_film_restores_the_calibrated_pretension(followed_degree):
+    records, errors = followed_degree
+    before = records[0].film
+    after_reset = records[111].film
+    assert after_reset.pretension_MPa == before.pretension_MPa
+    assert after_reset.pretension_std_MPa == before.pretension_std_MPa
+    _, force_error_percent = rms_errors(errors[111:])
+    assert force_error_percent > 10.0
 
 
-@pytest.mark.parametrize(
-    ("flags", "counted"), [((), 1), (("stress",), 1), (("saturated",), 0), (("misfit",), 0), (("thermal",), 0)]
-)
-def test_touches_that_do_not_count(mine, flags, counted):
-    follower, charge = FilmFollower(Predictor(mine)), np.array([500.0, 480.0, 520.0, 510.0])
-    contact = follower.predictor.predict(charge)
-    for frame in (("outside", "misfit"), (), flags):
-        follower.observe_frame(charge, contact, frame, 0.0)
-    follower.observe_frame(charge, None, (), 0.1)
-    assert follower.film.touches == counted
+def test_lasting_drift_is_followed(mine, problem, film):
+    """With the calibrated model, the force error would be 12 %.
+
+    The error is larger than after a single change, because a slow drift could also be a growing offset.
+    """
+    _, errors = follow(mine, problem, film, 1.0 + DEGREE_MPa * np.linspace(0.0, 1.0, 100))
+    _, force_error_percent = rms_errors(errors[50:])
+    assert force_error_percent < 5.5
 
 
-@pytest.mark.parametrize("change", ["gone", "damaged", "another model", "another model without checksums"])
-def test_a_file_that_cannot_be_used(mine, tmp_path, change):
-    folder = tmp_path / "mine"
-    for name in ("model.onnx", "golden.json", "pretensions.npz"):
-        (folder / "1").mkdir(parents=True, exist_ok=True)
-        (folder / "1" / name).write_bytes((mine / "1" / name).read_bytes())
-    path = folder / "1" / "pretensions.npz"
-    if change == "gone":
-        path.unlink()
-    elif change == "damaged":
-        path.write_bytes(path.read_bytes()[:-100])
-    else:
-        known = read_pretensions(folder / "1")
-        weights = {name: 1.01 * rows for name, rows in known.weights.items()}
-        path.write_bytes(replace(known, weights=weights).to_bytes())
-    if change == "another model without checksums":
-        golden = json.loads((folder / "1" / "golden.json").read_text("utf-8"))
-        del golden["files"]
-        (folder / "1" / "golden.json").write_text(json.dumps(golden), "utf-8")
-    with pytest.raises(ModelError, match=r"pretensions\.npz.*calibrate"):
-        FilmFollower(Predictor(folder))
+def test_following_an_unchanged_film_hardly_increases_the_errors(mine, problem, film):
+    """A drift of each gain by 1 % is possible, which adds 0.75 % to the force errors."""
+    _, followed_errors = follow(mine, problem, film, [1.0] * 80)
+    _, calibrated_errors = follow(mine, problem, film, [1.0] * 80, before_touch=reset_film_before_each)
+    allowed = np.hypot(1.05 * rms_errors(calibrated_errors), [0.0, 0.75])
+    np.testing.assert_array_less(rms_errors(followed_errors), allowed)
+
+
+def test_replay_follows_and_resets_the_film_like_the_stream(mine, problem, film, tmp_path):
+    _, chunks = touches(problem, film, [1.0 + DEGREE_MPa] * 40)
+    reset_frame = N_TARE + 36 * PERIOD
+    model = Predictor(mine)
+    path = tmp_path / "touches.rec"
+    with Recorder(path, model.metadata.label, "every", FOLLOWING.table) as recorder:
+        live = RecordedStream(TouchStream(model, FOLLOWING), recorder)
+
+        def chunks_with_reset():
+            for number, chunk in enumerate(chunks):
+                if number == reset_frame:
+                    live.request_film_reset()
+                yield chunk
+
+        lines = [record.to_json() for record in live.follow(chunks_with_reset())]
+    pretensions_MPa = [json.loads(line)["film"]["pretension_MPa"] for line in lines]
+    assert max(pretensions_MPa) > pretensions_MPa[0] + 0.2
+    assert pretensions_MPa[-1] == pretensions_MPa[0]
+
+    recording = Recording(path)
+    clock = RecordedClock()
+    replayed = TouchStream(Predictor(mine), device_from_table(recording.device, "test"), now_ns=clock)
+    assert [record.to_json() for record in recorded_stream.replay(recording, replayed, clock)] == lines
+
+
+@pytest.mark.parametrize(("electrode", "change", "is_flagged"), [(0, -0.03, True), (3, 0.015, False)])
+def test_wrong_gain_is_not_taken_for_a_change_of_pretension(mine, problem, film, electrode, change, is_flagged):
+    """The charges are similar to those of a film whose pretension differs by 0.2 to 0.3 MPa.
+
+    Such a film would change the force by 8 to 14 %.
+    """
+    gains = np.ones(4)
+    gains[electrode] += change
+    records, _ = follow(mine, problem, film, [1.0] * 80, gain=gains)
+    changes_MPa = [record.film.pretension_MPa - records[0].film.pretension_MPa for record in records]
+    assert max(abs(change_MPa) for change_MPa in changes_MPa[40:]) < 0.06
+    assert (FILM in records[-1].flags) == is_flagged
+
+
+def test_gain_that_changes_late_is_not_taken_for_a_change_of_pretension(mine, problem, film):
+    """If the gains were considered as known after 25 minutes, the pretension would change by 0.3 MPa."""
+    follower = FilmFollower(Predictor(mine))
+    rng = np.random.default_rng(4)
+    charge = problem.noise.add(film(1.0).charges(draw_contacts(rng, problem.domain, 360)), rng)
+    charge[300:, 0] *= 0.985
+    pretensions_MPa = []
+    for number, row in enumerate(charge):
+        follower.observe_touch(PeakFrame(follower.predictor.predict(row), row), 5.0 * number)
+        pretensions_MPa.append(follower.film.pretension_MPa)
+    assert np.ptp(pretensions_MPa[299:]) < 0.1
