@@ -1,4 +1,4 @@
-"""An export, compiled and called through ctypes."""
+"""Fixtures that export models to C, compile them, and call them through ctypes."""
 
 import ctypes
 import shutil
@@ -18,18 +18,28 @@ STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 
 
 def compile_strictly(compiler, folder, output, *sources, options=("-O2",)):
-    """Compile sources of an export strictly; skips if the compiler is not installed."""
+    """Compile sources of an export with all warnings as errors, and return the output file.
+
+    If the compiler is not installed, the test is skipped.
+    """
     if shutil.which(compiler) is None:
         pytest.skip(f"{compiler} is not installed")
     command = [compiler, *STRICT, *options, "-I", str(folder), "-o", str(output), *map(str, sources), "-lm"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    completed = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert completed.returncode == 0, completed.stderr
     return output
 
 
 @dataclass(frozen=True)
 class Exported:
-    """A compiled export of a model and a board."""
+    """A compiled export of a model and a board. `bridge.c` defines the functions of the library.
+
+    Attributes:
+        library: The shared library.
+        electrodes: Number of electrodes.
+        numbers: Number of values of a contact: 10, or 7 of a model without correlations.
+        source: Text of `isocharge_model.c`.
+    """
 
     library: ctypes.CDLL
     electrodes: int
@@ -37,80 +47,106 @@ class Exported:
     source: str
 
     def predict(self, charge_pC):
-        """Contacts, shape (n, 10), or (n, 7) of a model without correlations."""
+        """Return contacts, shape (n, numbers), from charges of shape (n, electrodes), pC."""
         charges = np.ascontiguousarray(charge_pC, dtype=np.float32)
         contacts = np.empty((len(charges), self.numbers), np.float32)
-        self.library.bridge_predict(_of(charges), len(charges), 1, _of(contacts))
+        self.library.bridge_predict(_pointer(charges), len(charges), 1, _pointer(contacts))
         return contacts
 
     def chain(self, values, t_s, dt_s, limited=None, tare=None):
-        """Touch charges, tares, contact and flags of frames, one row each."""
-        n = len(values)
-        values, t_s, dt_s = (np.ascontiguousarray(given, dtype=float) for given in (values, t_s, dt_s))
-        marks = [np.zeros(n, np.int32) if given is None else np.int32(given) for given in (limited, tare)]
-        charge = np.empty_like(values)
-        base = np.empty_like(values)
-        contact = np.empty(n, np.int32)
-        flags = np.empty(n, np.uint32)
-        arrays = [values, t_s, dt_s, *marks]
-        self.library.bridge_chain(*map(_of, arrays), n, *map(_of, (charge, base, contact, flags)))
-        return charge, base, contact, flags
+        """Process frames with the signal chain.
+
+        Args:
+            values: Values of the frames, shape (n, electrodes).
+            t_s: Times of the frames, shape (n,), s.
+            dt_s: Times since the previous frame, shape (n,), s.
+            limited: Whether each frame is limited, shape (n,); by default none.
+            tare: Whether to measure the tare again at each frame, shape (n,); by default never.
+
+        Returns:
+            Touch charges, tares, shape (n, electrodes) each, contact states and flags, shape (n,) each.
+        """
+        count = len(values)
+        no_marks = np.zeros(count, np.int32)
+        limited_marks = no_marks if limited is None else np.int32(limited)
+        tare_marks = no_marks if tare is None else np.int32(tare)
+        columns = [np.ascontiguousarray(column, dtype=float) for column in (values, t_s, dt_s)]
+        inputs = [*columns, limited_marks, tare_marks]
+        charge = np.empty((count, self.electrodes))
+        tare_charge = np.empty_like(charge)
+        contact = np.empty(count, np.int32)
+        flags = np.empty(count, np.uint32)
+        outputs = [charge, tare_charge, contact, flags]
+        self.library.bridge_chain(*map(_pointer, inputs), count, *map(_pointer, outputs))
+        return charge, tare_charge, contact, flags
 
     def frames(self, data):
-        """Frames in bytes as (seq, t_us, flags, values), and the counters."""
+        """Parse bytes.
+
+        Returns:
+            The frames as (seq, t_us, flags, values), and the counters of the parser.
+        """
         counts = (ctypes.c_ulong * 4)()
-        most = len(data) // 12 + 1
-        head = np.empty((most, 4), np.uint32)
-        values = np.empty((most, 255), np.float32)
-        n = self.library.bridge_frames(data, len(data), counts, _of(head), _of(values))
-        frames = [
-            (int(row[0]), int(row[1]), int(row[3]), tuple(numbers[: row[2]].tolist()))
-            for row, numbers in zip(head[:n], values[:n], strict=True)
-        ]
+        max_count = len(data) // 12 + 1
+        heads = np.empty((max_count, 4), np.uint32)
+        values = np.empty((max_count, 255), np.float32)
+        count = self.library.bridge_frames(data, len(data), counts, _pointer(heads), _pointer(values))
+        frames = []
+        for (seq, t_us, n_value, flags), frame_values in zip(heads[:count].tolist(), values[:count], strict=True):
+            frames.append((seq, t_us, flags, tuple(frame_values[:n_value].tolist())))
         return frames, tuple(counts)
 
     def encode(self, seq, t_us, flags, values):
-        """The bytes of a frame."""
+        """Return the bytes of a frame."""
         charges = np.array(values, dtype=np.float32)
         data = ctypes.create_string_buffer(2000)
-        size = self.library.bridge_encode(seq, ctypes.c_uint32(t_us), len(values), flags, _of(charges), data)
+        size = self.library.bridge_encode(seq, ctypes.c_uint32(t_us), len(values), flags, _pointer(charges), data)
         return data.raw[:size]
 
     def clock(self, t_us):
-        """Clock and steps, s."""
+        """Return the times and the steps of a clock, s, from time stamps of a board, us."""
         ticks = np.array(t_us, dtype=np.uint32)
         t_s = np.empty(len(ticks))
         dt_s = np.empty(len(ticks))
-        self.library.bridge_clock(_of(ticks), len(ticks), _of(t_s), _of(dt_s))
+        self.library.bridge_clock(_pointer(ticks), len(ticks), _pointer(t_s), _pointer(dt_s))
         return t_s, dt_s
 
 
 @pytest.fixture(scope="session")
 def build(tmp_path_factory):
-    """Exports a model for a board and compiles it: `build(model, device, options)`; the same network only once."""
+    """A function that exports a model for a board and compiles it. Each network is compiled only once."""
     networks = {}
 
     def build(model, device=ANY_BOARD, options=("-O2",), compiler="gcc"):
         folder = export_c(find_model(model), tmp_path_factory.mktemp("c") / "export", device)
-        if (model, compiler, options) not in networks:
-            words = (*options, "-fPIC", "-c")
-            networks[model, compiler, options] = compile_strictly(
-                compiler, folder, folder / "network.o", "isocharge_model.c", options=words
-            )
-        parts = (HERE / "bridge.c", "isocharge_chain.c", "isocharge_frames.c", networks[model, compiler, options])
-        library = compile_strictly(
-            compiler, folder, folder / "bridge.so", *parts, options=(*options, "-fPIC", "-shared")
+        key = (model, compiler, options)
+        if key not in networks:
+            object_file = folder / "network.o"
+            object_options = (*options, "-fPIC", "-c")
+            networks[key] = compile_strictly(compiler, folder, object_file, "isocharge_model.c", options=object_options)
+        sources = (HERE / "bridge.c", "isocharge_chain.c", "isocharge_frames.c", networks[key])
+        library_options = (*options, "-fPIC", "-shared")
+        library = compile_strictly(compiler, folder, folder / "bridge.so", *sources, options=library_options)
+        header = (folder / "isocharge_model.h").read_text()
+        return Exported(
+            library=ctypes.CDLL(str(library)),
+            electrodes=_defined_number(header, "ISOCHARGE_ELECTRODES"),
+            numbers=_defined_number(header, "ISOCHARGE_CONTACT_NUMBERS"),
+            source=(folder / "isocharge_model.c").read_text(),
         )
-        header, source = ((folder / f"isocharge_model.{kind}").read_text() for kind in ("h", "c"))
-        sizes = (int(header.split(f"ISOCHARGE_{name} ")[1].split()[0]) for name in ("ELECTRODES", "CONTACT_NUMBERS"))
-        return Exported(ctypes.CDLL(str(library)), *sizes, source)
 
     return build
 
 
+def _defined_number(header, name):
+    """Return the number that a header defines by `#define name number`."""
+    _, after_name = header.split(f"{name} ")[:2]
+    return int(after_name.split()[0])
+
+
 @pytest.fixture(scope="session")
 def compile_c():
-    """The function that compiles sources of an export strictly."""
+    """The function `compile_strictly`."""
     return compile_strictly
 
 
@@ -121,5 +157,6 @@ def exports(tmp_path_factory):
     return [export_c(find_model(name), folder / name) for name in ("three-25um-biaxial", "four-25um-biaxial-films")]
 
 
-def _of(array):
+def _pointer(array):
+    """Return a pointer to the data of an array."""
     return array.ctypes.data_as(ctypes.c_void_p)

@@ -1,4 +1,6 @@
-"""The signal chain and the binary frame in C against ours, frame by frame and on any bytes."""
+"""Tests of the signal chain and of the binary frame in C against those in Python."""
+
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,8 +16,14 @@ from isocharge.serve.signal_chain.chain import SignalChain
 from isocharge.train.export_c.folder import device_header
 
 BITS = {TARE: 1, SATURATED: 2, NEGATIVE: 4, THERMAL: 8, BLIND: 16, INVALID: 32}
+"""Bit of each flag in C."""
+
 TARE_FAILED = 64
-WARMING = BITS[THERMAL] | BITS[BLIND]
+"""Bit for a tare that failed."""
+
+ALL_BITS = 127
+WARMING_BITS = BITS[THERMAL] | BITS[BLIND]
+"""Bits of the flags that depend on the estimated warming."""
 
 GAIN = {"A": 0.5, "B": -0.5, "C": 0.25, "D": 1.0}
 
@@ -37,57 +45,96 @@ BOARDS = {
 }
 
 
+ELECTRODES = ("A", "B", "C", "D")
+RATE_Hz = 200.0
+HUM_Hz = 60.0
+
+
 def device(board):
+    """Return the device of a board by its name in `BOARDS`."""
     return device_from_table(BOARDS[board], board)
 
 
-def recording(board, seed, electrodes=4, seconds=20.0):
-    """What a board sends: rest, presses, leak, hum, drift, noise, a limit, and values that are no charges.
+class Frames(NamedTuple):
+    """Frames of a board.
 
-    Returns:
-        Values, shape (n, electrodes), times and steps, shape (n,), s, and marks of limited frames and of new tares.
+    Attributes:
+        values: Values, shape (n, 4), in the unit of the board.
+        t_s: Times, shape (n,), s.
+        dt_s: Times since the previous frame, shape (n,), s.
+        limited: Whether each frame is limited, shape (n,).
+        tare: Whether the tare is measured again at each frame, shape (n,).
     """
+
+    values: np.ndarray
+    t_s: np.ndarray
+    dt_s: np.ndarray
+    limited: np.ndarray
+    tare: np.ndarray
+
+
+def draw_frames(board, seed, seconds=20.0):
+    """Draw the frames of a board: presses with noise, hum, drift and spikes, lost frames, and invalid values."""
     rng = np.random.default_rng(seed)
-    n = int(200 * seconds)
-    rate_Hz = 200.0
-    dt_s = rng.uniform(0.5, 1.5, n) / rate_Hz
-    dt_s[rng.random(n) < 0.01] *= 20.0  # frames were lost
+    n_electrode = len(ELECTRODES)
+    count = int(RATE_Hz * seconds)
+    dt_s = rng.uniform(0.5, 1.5, count) / RATE_Hz
+    dt_s[rng.random(count) < 0.01] *= 20.0  # frames were lost
     dt_s[0] = 0.0
     t_s = 5.0 + np.cumsum(dt_s)
-    shape = rng.uniform(0.6, 1.4, electrodes)
-    press = np.zeros(n)
+
+    ratio = rng.uniform(0.6, 1.4, n_electrode)
+    press_pC = np.zeros(count)
     for begin in np.cumsum(rng.integers(200, 700, 8)):
-        press[begin : begin + int(rng.integers(20, 400))] = rng.uniform(20.0, 1500.0)
-    charge = press[:, None] * shape + 0.3 * rng.standard_normal((n, electrodes)) + rng.uniform(-20.0, 20.0, electrodes)
-    charge += rng.uniform(0.0, 1.0) * np.sin(2 * np.pi * 60.0 * t_s)[:, None] + rng.uniform(-0.1, 0.1) * t_s[:, None]
-    charge += np.where(press > 0, 30.0, 0.0)[:, None] * rng.random()
-    charge[rng.choice(np.flatnonzero(press > 0), 3)] *= 40.0  # spikes are no peaks
-    chain = device(board).chain(("A", "B", "C", "D")[:electrodes])
+        end = begin + int(rng.integers(20, 400))
+        press_pC[begin:end] = rng.uniform(20.0, 1500.0)
+    is_pressed = press_pC > 0.0
+    noise_pC = 0.3 * rng.standard_normal((count, n_electrode))
+    offset_pC = rng.uniform(-20.0, 20.0, n_electrode)
+    charge = press_pC[:, None] * ratio + noise_pC + offset_pC
+    hum_pC = rng.uniform(0.0, 1.0) * np.sin(2 * np.pi * HUM_Hz * t_s)
+    drift_pC = rng.uniform(-0.1, 0.1) * t_s
+    charge += (hum_pC + drift_pC)[:, None]
+    charge += np.where(is_pressed, 30.0, 0.0)[:, None] * rng.random()
+    charge[rng.choice(np.flatnonzero(is_pressed), 3)] *= 40.0  # spikes, which are not peaks of a press
+
+    chain = device(board).chain(ELECTRODES)
     values = charge if chain.gain_pC is None else charge / chain.gain_pC
-    values += 0.0 if chain.zero is None else chain.zero
-    for bad in (np.nan, np.inf, -np.inf, 3e9, 1e300):
-        values[rng.integers(0, n, 2), rng.integers(0, electrodes, 2)] = bad
-    return values, t_s, dt_s, rng.random(n) < 0.003, np.isin(np.arange(n), rng.integers(n // 2, n, 1))
+    if chain.zero is not None:
+        values += chain.zero
+    for invalid in (np.nan, np.inf, -np.inf, 3e9, 1e300):
+        values[rng.integers(0, count, 2), rng.integers(0, n_electrode, 2)] = invalid
+    limited = rng.random(count) < 0.003
+    tare = np.isin(np.arange(count), rng.integers(count // 2, count, 1))
+    return Frames(values, t_s, dt_s, limited, tare)
 
 
-def ours(chain, values, t_s, dt_s, limited, tare, misfit):
-    """Readings of the chain in Python as arrays, as `Exported.chain` gives them."""
-    running = SignalChain(chain, values.shape[1], misfit)
-    rows = []
-    for value, t, dt, at_limit, again in zip(values, t_s, dt_s, limited, tare, strict=True):
-        if again:
-            running.reset_tare()
-        reading = running.advance(value, float(t), float(dt), limited=bool(at_limit))
-        zero = np.zeros_like(value)
-        rows.append(
-            (
-                zero if reading.charge_pC is None else reading.charge_pC,
-                zero if reading.tare is None else reading.tare.charge_pC,
-                reading.contact,
-                sum(BITS[word] for word in reading.flags),
-            )
-        )
-    return tuple(map(np.array, zip(*rows, strict=True)))
+def python_chain(chain, frames, misfit):
+    """Process frames with the signal chain in Python, and return arrays like those of `Exported.chain`.
+
+    Args:
+        chain: Settings of the chain.
+        frames: The frames.
+        misfit: Function from charges to misfits, for the estimate of the warming.
+    """
+    n_electrode = frames.values.shape[1]
+    signal_chain = SignalChain(chain, n_electrode, misfit)
+    charge = np.zeros_like(frames.values)
+    tare_charge = np.zeros_like(frames.values)
+    contact = []
+    flags = []
+    for index, values in enumerate(frames.values):
+        if frames.tare[index]:
+            signal_chain.reset_tare()
+        is_limited = bool(frames.limited[index])
+        reading = signal_chain.advance(values, float(frames.t_s[index]), float(frames.dt_s[index]), limited=is_limited)
+        if reading.charge_pC is not None:
+            charge[index] = reading.charge_pC
+        if reading.tare is not None:
+            tare_charge[index] = reading.tare.charge_pC
+        contact.append(reading.contact)
+        flags.append(sum(BITS[flag] for flag in reading.flags))
+    return charge, tare_charge, np.array(contact), np.array(flags)
 
 
 @pytest.fixture(scope="module")
@@ -97,69 +144,90 @@ def misfit():
 
 
 @pytest.mark.parametrize("board", BOARDS)
-def test_states_and_charges_are_ours_frame_by_frame(board, build, misfit):
+def test_c_and_python_give_the_same_charges_and_states_for_each_frame(board, build, misfit):
+    """The estimated warming depends on the network, whose values in C have other rounding errors."""
     exported = build("four-25um-biaxial", device(board))
-    chain = device(board).chain(("A", "B", "C", "D"))
+    chain = device(board).chain(ELECTRODES)
+    estimates_warming = chain.thermal is not None
+    tolerance_pC = 0.2 if estimates_warming else 1e-9
+    max_share_of_other_flags = 0.002 if estimates_warming else 0.0
+    other_bits = ALL_BITS - WARMING_BITS
     for seed in range(2):
-        frames = recording(board, seed)
-        mine = ours(chain, *frames, misfit)
-        theirs = exported.chain(*frames)
-        warming = chain.thermal is not None  # estimated with the network, so its rounding stands in it
-        np.testing.assert_array_equal(theirs[2], mine[2])
-        np.testing.assert_array_equal(theirs[3] & (127 - WARMING), mine[3] & (127 - WARMING))
-        assert np.mean(theirs[3] != mine[3]) <= (0.002 if warming else 0.0)
-        tolerance = 0.2 if warming else 1e-9
-        np.testing.assert_allclose(theirs[0], mine[0], rtol=0, atol=tolerance)
-        np.testing.assert_allclose(theirs[1], mine[1], rtol=0, atol=tolerance)
-        assert mine[2].mean() > 0.05  # something touched
-        assert np.count_nonzero(np.diff(mine[2].astype(int)) < 0) >= 3 or chain.touch is None
+        frames = draw_frames(board, seed)
+        expected_charge, expected_tare, expected_contact, expected_flags = python_chain(chain, frames, misfit)
+        charge, tare, contact, flags = exported.chain(*frames)
+        np.testing.assert_array_equal(contact, expected_contact)
+        np.testing.assert_array_equal(flags & other_bits, expected_flags & other_bits)
+        assert np.mean(flags != expected_flags) <= max_share_of_other_flags
+        np.testing.assert_allclose(charge, expected_charge, rtol=0, atol=tolerance_pC)
+        np.testing.assert_allclose(tare, expected_tare, rtol=0, atol=tolerance_pC)
+        assert expected_contact.mean() > 0.05
+        release_count = np.count_nonzero(np.diff(expected_contact.astype(int)) < 0)
+        assert release_count >= 3 or chain.touch is None
 
 
 @pytest.mark.parametrize("board", ["any board", "leak", "gain and limit", "hum"])
-def test_single_precision_is_within_a_twentieth_of_a_picocoulomb(board, build, misfit):
-    """And nothing in it becomes a double on the way, which a small processor would have to emulate."""
+def test_single_precision_changes_charges_by_less_than_a_twentieth_of_a_picocoulomb(board, build, misfit):
+    """The compiler option -Wdouble-promotion refuses double precision, which small processors would emulate."""
     exported = build(
         "four-25um-biaxial", device(board), options=("-O2", "-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion")
     )
-    values, t_s, dt_s, limited, tare = recording(board, seed=4)
-    values[np.abs(values) > 1e30] = np.inf
-    mine = ours(device(board).chain(("A", "B", "C", "D")), values, t_s, dt_s, limited, tare, misfit)
-    theirs = exported.chain(values, t_s, dt_s, limited, tare)
-    np.testing.assert_array_equal(theirs[2], mine[2])
-    np.testing.assert_array_equal(theirs[3], mine[3])
-    np.testing.assert_allclose(theirs[0], mine[0], rtol=0, atol=0.05)
+    frames = draw_frames(board, seed=4)
+    frames.values[np.abs(frames.values) > 1e30] = np.inf
+    chain = device(board).chain(ELECTRODES)
+    expected_charge, _, expected_contact, expected_flags = python_chain(chain, frames, misfit)
+    charge, _, contact, flags = exported.chain(*frames)
+    np.testing.assert_array_equal(contact, expected_contact)
+    np.testing.assert_array_equal(flags, expected_flags)
+    np.testing.assert_allclose(charge, expected_charge, rtol=0, atol=0.05)
 
 
-def test_a_film_that_is_never_quiet_is_said_at_the_same_frame(build):
-    board = device_from_table({"tare": {"frames": 20, "patience": 50}}, "board")
+@pytest.fixture(scope="module")
+def restless_frames():
+    """Seventy frames of a film that is never at rest."""
     values = 100.0 * np.random.default_rng(0).standard_normal((70, 3))
-    steps = np.full(70, 0.005)
+    dt_s = np.full(70, 0.005)
+    never = np.zeros(70, dtype=bool)
+    return Frames(values, np.cumsum(dt_s), dt_s, limited=never, tare=never)
+
+
+IMPATIENT_BOARD = device_from_table({"tare": {"frames": 20, "patience": 50}}, "board")
+"""Board whose tare fails after 50 frames."""
+
+
+def test_failed_tare_is_reported_after_the_patience_of_the_board(build, restless_frames):
     with pytest.raises(TareError):
-        ours(board.chain(("A", "B", "C")), values, np.cumsum(steps), steps, np.zeros(70), np.zeros(70), None)
-    exported = build("three-25um-biaxial", board)
-    flags = exported.chain(values, np.cumsum(steps), steps)[3]
-    assert np.flatnonzero(flags & TARE_FAILED)[0] == 49
-    again = np.arange(70) == 10  # a second tare never gives up
-    flags = exported.chain(values, np.cumsum(steps), steps, tare=again)[3]
+        python_chain(IMPATIENT_BOARD.chain(("A", "B", "C")), restless_frames, None)
+    exported = build("three-25um-biaxial", IMPATIENT_BOARD)
+    _, _, _, flags = exported.chain(*restless_frames)
+    first_failed, *_ = np.flatnonzero(flags & TARE_FAILED)
+    assert first_failed == 49
+
+
+def test_second_tare_does_not_fail(build, restless_frames):
+    exported = build("three-25um-biaxial", IMPATIENT_BOARD)
+    with_second_tare = restless_frames._replace(tare=np.arange(70) == 10)
+    _, _, _, flags = exported.chain(*with_second_tare)
     assert not (flags & TARE_FAILED).any()
 
 
-def test_a_tare_that_no_state_holds_is_refused():
+def test_tare_that_is_too_long_for_c_is_refused():
     with pytest.raises(DeviceError, match=r"board: tare.frames: expected a whole number from 1 to 10000.*got 50000"):
         device_header(device_from_table({"tare": {"frames": 50_000}}, "board"), ("A", "B", "C"))
 
 
-SINGLE = st.floats(width=32, allow_nan=False)
+FLOAT32 = st.floats(width=32, allow_nan=False)
 FRAMES = st.builds(
     Frame,
     seq=st.integers(0, 65535),
     t_us=st.integers(0, T_US_MODULUS - 1),
-    values=st.lists(SINGLE, max_size=255).map(tuple),
+    values=st.lists(FLOAT32, max_size=255).map(tuple),
     flags=st.integers(0, 255),
 )
-LONG = st.binary(min_size=1050, max_size=1100)
-PIECES = st.one_of(FRAMES.map(encode_frame), st.binary(max_size=40), st.just(b"\0"), LONG)
+TOO_LONG = st.binary(min_size=1050, max_size=1100)
+PIECES = st.one_of(FRAMES.map(encode_frame), st.binary(max_size=40), st.just(b"\0"), TOO_LONG)
 DAMAGE = st.lists(st.tuples(st.integers(0, 3000), st.integers(0, 255)), max_size=3)
+"""Positions of damaged bytes and their values."""
 
 
 @pytest.fixture(scope="module")
@@ -169,36 +237,39 @@ def exported(build):
 
 @given(pieces=st.lists(PIECES, max_size=6), damage=DAMAGE)
 @settings(max_examples=300, deadline=None)
-def test_any_bytes_give_the_frames_and_counters_of_ours(exported, pieces, damage):
+def test_c_and_python_parse_any_bytes_into_the_same_frames_and_counters(exported, pieces, damage):
     data = bytearray(b"".join(pieces) + b"\0")
-    for place, value in damage:
-        data[place % len(data)] = value
+    for position, value in damage:
+        data[position % len(data)] = value
     data += b"\0"
     parser = BinaryParser()
-    frames = [(frame.seq, frame.t_us, frame.flags, frame.values) for frame in parser.feed(bytes(data))]
-    counts = parser.counts
-    theirs, their_counts = exported.frames(bytes(data))
-    np.testing.assert_equal(theirs, frames)
-    assert their_counts == (counts.frames, counts.crc_errors, counts.malformed, counts.bytes_dropped)
+    expected_frames = [(frame.seq, frame.t_us, frame.flags, frame.values) for frame in parser.feed(bytes(data))]
+    expected = parser.counts
+    frames, counts = exported.frames(bytes(data))
+    np.testing.assert_equal(frames, expected_frames)
+    assert counts == (expected.frames, expected.crc_errors, expected.malformed, expected.bytes_dropped)
 
 
 @given(frame=FRAMES)
 @settings(max_examples=200, deadline=None)
-def test_frames_are_written_as_ours(exported, frame):
+def test_c_and_python_write_the_same_frames(exported, frame):
     assert exported.encode(frame.seq, frame.t_us, frame.flags, frame.values) == encode_frame(frame)
 
 
-@pytest.mark.parametrize("n", [0, 1, 60, 61, 62, 63, 124, 125, 126, 255])
-def test_frames_without_a_zero_are_cut_at_254_bytes(exported, n):
-    frame = Frame(0x0101, 0x01010101, (np.frombuffer(b"\1\1\1\1" * n, np.float32)).tolist(), 1)
+@pytest.mark.parametrize("n_value", [0, 1, 60, 61, 62, 63, 124, 125, 126, 255])
+def test_frames_without_a_zero_byte_are_divided_after_254_bytes(exported, n_value):
+    values = np.frombuffer(b"\1\1\1\1" * n_value, np.float32).tolist()
+    frame = Frame(0x0101, 0x01010101, values, 1)
     assert exported.encode(frame.seq, frame.t_us, frame.flags, frame.values) == encode_frame(frame)
-    assert exported.frames(encode_frame(frame))[0] == [(frame.seq, frame.t_us, 1, tuple(frame.values))]
+    frames, _ = exported.frames(encode_frame(frame))
+    assert frames == [(frame.seq, frame.t_us, 1, tuple(frame.values))]
 
 
-def test_the_clock_wraps_and_restarts_as_ours(exported):
+def test_clock_overflows_and_restarts_in_c_as_in_python(exported):
+    """A time stamp that is more than half of the range ahead counts as a step back."""
     t_us = (4_294_000_000 + np.cumsum(np.random.default_rng(0).integers(0, 20_000, 500))) % T_US_MODULUS
     t_us[300:] = (t_us[300:] - t_us[300] + 17) % T_US_MODULUS  # the board was reset
-    t_us[400:] = (t_us[400:] + (1 << 31) + 500_000) % T_US_MODULUS  # half its range ahead counts as back
+    t_us[400:] = (t_us[400:] + (1 << 31) + 500_000) % T_US_MODULUS
     clock = DeviceClock()
     times = [clock.read(int(t), T_US_MODULUS, 0.0) for t in t_us]
     t_s, dt_s = exported.clock(t_us)

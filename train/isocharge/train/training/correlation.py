@@ -1,6 +1,7 @@
-"""Correlations of the errors of x, y and ln F: additional answers of a trained network, whose other answers stay.
+"""Correlations of the errors of x, y and ln F, as additional answers of a trained network.
 
-A correlation matrix is the Gram matrix of three unit vectors. The vectors
+The other answers of the network do not change. A correlation matrix is the Gram matrix of three unit vectors. The
+vectors
 
     (1, 0, 0),  (cos a, sin a, 0),  (cos b, sin b cos c, sin b sin c)
 
@@ -10,9 +11,9 @@ are sums of cosines, so the correlations are linear in eight cosines:
     xy = cos a,  xF = cos b,
     yF = (cos(a - b) + cos(a + b)) / 2 + (cos(a - b - c) + cos(a - b + c) - cos(a + b - c) - cos(a + b + c)) / 4.
 
-In the exported graph this takes one node for the cosines and one for the sums. The angles are linear in the last hidden
-layer of the contact perceptron and in the input features. They are fitted to the network's errors by maximum
-likelihood.
+In the exported graph, one node computes the cosines and one node their sums. The angles are linear functions of the
+last hidden layer of the contact perceptron and of the input features. These functions are fitted to the errors of the
+network by maximum likelihood.
 """
 
 import logging

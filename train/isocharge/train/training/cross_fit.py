@@ -1,10 +1,10 @@
 """Training of a network on measured presses alone, for a sensor that is not simulated.
 
-Five networks are trained, each without a fifth of the places (cross-validation). Their answers at the places on which
-they were not trained give the errors and the factors of the standard deviations: with these factors, intervals contain
-the truth as often as they state (split conformal prediction, Papadopoulos et al. 2002). The mean of the five networks
-has smaller errors than a single one. One further network learns this mean (Hinton et al. 2015), so the released model
-is as small and fast as those of simulated sensors.
+Five networks are trained, each without a fifth of the places (cross-validation). The errors of the model are measured
+with the answers of each network at the places on which it was not trained. The same answers give factors of the
+standard deviations, with which the intervals contain the truth as often as they state (split conformal prediction,
+Papadopoulos et al. 2002). The mean of the five networks has smaller errors than a single network. One further network
+learns this mean (Hinton et al. 2015), so that the released model is as small and fast as those of simulated sensors.
 
 The noise of the presses is estimated from the presses (`isocharge.train.data.channel_noise`). In every training step,
 half of this noise is added to the charges as a regularisation.
@@ -48,22 +48,22 @@ from isocharge.train.training.network import InverseNetwork, as_tensor, fold_net
 _log = logging.getLogger(__name__)
 
 N_FOLDS = 5
-"""Number of folds of the cross-validation, and of networks."""
+"""Number of folds of the cross-validation, and of networks that are trained for it."""
 
 CHANNELS = (3, 8)
 """Smallest and largest number of channels."""
 
 FIRST_STEPS = 1_200
-"""Number of steps that is tried first; it is doubled as long as the validation score improves. Networks soon overfit
-presses with noise."""
+"""Number of steps that is tried first. It is doubled as long as the validation score improves, because networks soon
+overfit presses with noise."""
 
 TRAINING_NOISE_FACTOR = 0.5
-"""Noise that is added in every step, relative to the noise of the presses. With more noise the network blurs the map;
-with less noise it overfits."""
+"""Noise that is added in every step, relative to the noise of the presses. With a larger factor, the network cannot
+resolve the map. With a smaller factor, it overfits the presses."""
 
 DISTILLATION_NOISE_FACTORS = (0.0, 0.5, 0.5, 1.0, 1.0, 2.0)
-"""Noise that is added to the copies of the presses from which the last network learns, relative to the noise of the
-presses; one factor for each copy."""
+"""Noise that is added to each copy of the presses from which the last network learns, relative to the noise of the
+presses."""
 
 PRESSES_FILE = "presses.csv"
 """Name of the file in the version folder with the presses on which the model was trained."""
@@ -85,18 +85,19 @@ def fit_presses(
 ) -> Fitted:
     """Train a network on measured presses of any sensor with three to eight channels.
 
-    A warning is logged if presses are left out, and if all presses have the same force.
+    The steps are those of the module: cross-validation, distillation of the mean of its networks into one network, and
+    training of the misfit. A warning is logged if presses are left out, and if all presses have the same force.
 
     Args:
         presses: At least 500 presses at 50 places. Presses with an unknown place, force or charge are left out.
         name: Name of the sensor.
         config: Settings. `steps` is the largest number of steps; `noise` and `hold_out` are not used.
         probes: Notations of the probes.
-        run: Saves the state, so that an interrupted training can be continued.
+        run: Run that saves the state, so that an interrupted training can be continued.
 
     Raises:
-        PressError: If there are too few presses or places, not three to eight channels, or a fault that
-            `check_measured_presses` finds.
+        PressError: If there are too few presses or places, fewer than three or more than eight channels, or if
+            `check_measured_presses` finds a fault.
         ConfigError: If a setting is out of its range.
         TrainingError: If the loss is not finite.
     """
@@ -168,8 +169,8 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
     A warning is logged if presses are left out, and if all presses have the same force.
 
     Raises:
-        PressError: If there are too few presses or places, not three to eight channels, or a fault that
-            `check_measured_presses` finds.
+        PressError: If there are too few presses or places, fewer than three or more than eight channels, or if
+            `check_measured_presses` finds a fault.
     """
     names = presses.electrodes
     fewest_channels, most_channels = CHANNELS
@@ -198,14 +199,15 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
 
 
 def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]:
-    """Compute factors of the standard deviations with which intervals contain the truth as often as they state.
+    """Compute the factors by which standard deviations must be multiplied to agree with the errors.
 
-    Each factor is the geometric mean of two factors: the one with which the 68 % intervals contain 68 % of the true
-    values, and the one with which the 95 % intervals contain 95 %.
+    With one factor, the 68 % intervals contain 68 % of the true values. With another factor, the 95 % intervals contain
+    95 %. The geometric mean of both factors is returned.
 
     Args:
-        contact: Contacts (x, y, F) by networks that were not trained on the presses, shape (n, 3), mm and N.
-        std: Their standard deviations, shape (n, 3).
+        contact: Contacts (x, y, F) that were estimated by networks without training on these presses, shape (n, 3), mm
+            and N.
+        std: Standard deviations of the estimated contacts, shape (n, 3).
         truth: True contacts, shape (n, 3).
 
     Returns:
@@ -216,7 +218,11 @@ def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]
 
 
 def _std_factor(deviation: Array) -> float:
-    """Compute one factor from errors over standard deviations, of any shape."""
+    """Compute one factor; see `std_factors`.
+
+    Args:
+        deviation: Absolute errors divided by their standard deviations, any shape.
+    """
     one_std, two_std = np.quantile(deviation, [ONE_STD_COVERAGE, TWO_STD_COVERAGE])
     return float(np.sqrt(one_std * two_std / 1.96))
 
@@ -232,7 +238,7 @@ def _train_members(
     """Train each network on the presses of the other folds.
 
     The number of steps is doubled until the validation score of the first network no longer improves. All networks are
-    then trained with the best number.
+    then trained with the best number of steps.
 
     Args:
         members: Networks, one for each fold.
@@ -240,7 +246,7 @@ def _train_members(
         fold: Fold of each press, shape (n,).
         noise: Noise of the presses.
         config: Largest number of steps, learning rate and seed.
-        run: Saves the state.
+        run: Run that saves the state; None to save nothing.
 
     Returns:
         Number of steps.
@@ -293,11 +299,11 @@ def _cross_validated_contact(members: list[InverseNetwork], charge: Array, fold:
     contact = np.empty((len(charge), 3))
     std = np.empty((len(charge), 3))
     for number, member in enumerate(members):
-        rows = fold == number
+        is_in_fold = fold == number
         with torch.no_grad():
             member_contact, member_std, _ = member(as_tensor(charge))
-        contact[rows] = member_contact.double().numpy()[rows]
-        std[rows] = member_std.double().numpy()[rows]
+        contact[is_in_fold] = member_contact.double().numpy()[is_in_fold]
+        std[is_in_fold] = member_std.double().numpy()[is_in_fold]
     return contact, std
 
 
@@ -313,8 +319,8 @@ def _distillation_stage(
     Args:
         network: The network that is trained.
         members: Networks whose mean outputs are the targets.
-        presses: All presses. The inputs are copies of their charges with noise of several sizes, in random order. A
-            number of copies that is half the number of presses is used for validation.
+        presses: All presses. The inputs are copies of their charges with noise of several sizes, in random order. The
+            last copies, half as many as there are presses, are used for validation.
         noise: Noise of the presses.
         config: Number of steps, batch size and seed.
     """
@@ -329,7 +335,7 @@ def _distillation_stage(
     network.contact.fit_linear_part(network.inputs(charge[:n_train]), target_mean[:n_train])
 
     def divergence(rows: Tensor | slice) -> Tensor:
-        """Return the divergence of the outputs of the network from the targets, for some rows of the charges."""
+        """Return the divergence of the outputs of the network from the targets for some of the inputs."""
         mean, log_std = network.posterior(charge[rows])
         return distillation_loss(mean, log_std, target_mean[rows], target_log_std[rows])
 
@@ -377,7 +383,7 @@ def _misfit_examples(
 def _cross_validated_misfit(
     presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, fold: Integers
 ) -> Array:
-    """Compute the distance of each press from the presses of the other folds.
+    """Compute the misfit of each press with planes through the presses of the other folds.
 
     Args:
         presses: All presses.
@@ -392,7 +398,7 @@ def _cross_validated_misfit(
     level = noise.level(presses.charge)
     misfit = np.empty((len(presses), 1))
     for number in range(N_FOLDS):
-        rows = fold == number
-        planes = LocalPlanes.through(unit[~rows], level[~rows])
-        misfit[rows] = np.linalg.norm(planes.residuals(level[rows]), axis=1, keepdims=True)
+        is_in_fold = fold == number
+        planes = LocalPlanes.through(unit[~is_in_fold], level[~is_in_fold])
+        misfit[is_in_fold] = np.linalg.norm(planes.residuals(level[is_in_fold]), axis=1, keepdims=True)
     return misfit

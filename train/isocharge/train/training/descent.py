@@ -158,7 +158,7 @@ class Descent:
         self.stage.network.load_state_dict(self.best_weights)
 
     def take_step(self) -> Tensor:
-        """Change the weights by one step of the optimisers and return the loss before it."""
+        """Change the weights by one step of the optimisers, and return the loss before the step."""
         network = self.stage.network
         rate = self.rate * self.stage.rate_factor * _relative_rate(self.step / self.stage.steps)
         for optimiser in self.optimisers:
@@ -223,7 +223,7 @@ def tensor_bytes(state: object) -> bytes:
 
 
 def tensors(data: bytes) -> Any:
-    """Return what `tensor_bytes` was given. No code in the bytes is executed."""
+    """Return the tensors, numbers and texts in bytes of `tensor_bytes`. Code in the bytes is not executed."""
     return torch.load(io.BytesIO(data), weights_only=True)
 
 

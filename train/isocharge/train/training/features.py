@@ -48,6 +48,7 @@ class WhitenedFeatures:
 
     @classmethod
     def _fit(cls, charge_features: ChargeFeatures, charge: Array) -> "WhitenedFeatures":
+        """Fit mean and whitening matrix to the features of charges, shape (n, n_electrode), pC."""
         mean, matrix = whitening(charge_features.evaluate(charge))
         return cls(charge_features, mean, matrix)
 

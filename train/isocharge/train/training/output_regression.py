@@ -74,8 +74,9 @@ def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent: Array, c
 
     # Linear map from the features of `charge` to those of `equivalent`, by least squares
     design = np.column_stack([features, np.ones(len(features))])
-    *matrix, shift = np.linalg.lstsq(design, equivalent_features)[0]
-    transformed = transform_inputs(network.layers, Layer(np.array(matrix), shift))
+    coefficients, *_ = np.linalg.lstsq(design, equivalent_features)
+    matrix, shift = np.split(coefficients, [features.shape[1]])
+    transformed = transform_inputs(network.layers, Layer(matrix, shift[0]))
 
     def contact_targets(outputs: Array) -> Array:
         """Return the outputs for the equivalent charges, with the standard deviations of the present outputs."""
@@ -137,10 +138,12 @@ def add_variance(network: FoldedNetwork, charge: Array, variance: Array) -> Fold
         variance: Variances of (x, y, ln F) to add there, shape (n, 3), mm^2, mm^2 and 1.
     """
 
-    def larger_std(present: Array) -> Array:
-        target = present.copy()
-        target[:, LOG_STD] += 0.5 * np.log1p(variance * np.exp(-2.0 * relative_log_std(present)))
-        return target
+    def larger_std(outputs: Array) -> Array:
+        """Return the outputs with the logarithms of the larger standard deviations."""
+        relative_increase = variance * np.exp(-2.0 * relative_log_std(outputs))  # added over present variance
+        targets = outputs.copy()
+        targets[:, LOG_STD] += 0.5 * np.log1p(relative_increase)
+        return targets
 
     features = network.features.evaluate(charge)
     return replace(network, layers=refit_last_layer(network.layers, features, [Regression(larger_std, EXACT_RIDGE)]))
