@@ -1,4 +1,8 @@
-"""Errors of a contact that four effects of a bench cause: trapped air, a warm film, static pressure and a side force.
+"""
+Which errors do effects of the bench cause?
+===========================================
+
+Trapped air, a warm film, static pressure and a side force change the position and the force of a contact.
 
 The charges are computed with the effect. The contact is then estimated from the charges by a linear inverse of the film
 without the effect.
