@@ -82,7 +82,7 @@ def _d33(solves: Solves) -> tuple[Row, dict[str, object]]:
     row = Row(
         "d33 where the probe overlaps an electrode",
         "no charge",
-        f"up to {extra.max():.1f} pC, which is {100 * share.max():.1f} % of the charge of this press "
+        f"up to {extra.max():.1f} pC, and up to {100 * share.max():.1f} % of the charge of a press "
         f"({(extra > TOUCHED * whole).any(axis=1).sum()} of {len(points)} presses have such a charge); "
         f"{whole:.0f} pC if the whole force acts on the electrode",
         f"a thin film also carries the pressure of the probe; d33 = {D33:g} pC/N. The charge is small compared with "
