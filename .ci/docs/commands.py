@@ -1,4 +1,4 @@
-"""Generation of the page that lists all commands, from the declarations that `--help` uses."""
+"""Generate the page that lists all commands from the same declarations as the output of `--help`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,7 +33,7 @@ def write_page(path: Path) -> None:
 
 
 def _commands(group: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield each command of a group and of its subgroups, with the words that call the command."""
+    """Yield each command of a group and of its subgroups, and the words that call this command."""
     for name in group.list_commands(None):
         _, command, _ = group.resolve_command(None, [name])
         if hasattr(command, "list_commands"):

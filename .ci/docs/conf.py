@@ -64,7 +64,7 @@ sphinx_gallery_conf = {
 
 
 def add_contents(_app: Any, page: str, source: list[str]) -> None:
-    """Append the table of contents to the first page, and insert links to the playground into its page."""
+    """Append the table of contents to the first page, and insert links into the page about the playground."""
     if page == HOME:
         source[0] += (ROOT / ".ci" / "docs" / "contents.md").read_text("utf-8")
     if page == PLAYGROUND:
@@ -72,7 +72,7 @@ def add_contents(_app: Any, page: str, source: list[str]) -> None:
 
 
 def add_whole_pages(app: Any, error: Exception | None) -> None:
-    """Add the playground to the site, and a copy of the first page with the file name that web servers expect."""
+    """Add the playground to the site, and copy the first page to the file name that web servers expect."""
     if error is None:
         folder = Path(app.outdir)
         shutil.copy(folder / f"{HOME}.html", folder / "index.html")

@@ -86,7 +86,7 @@ def is_of_scikit_learn(_app: Any, _kind: str, name: str, _object: Any, skip: boo
 
 
 def plain_text(_app: Any, kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
-    """Convert a docstring from plain text with names in backticks to reStructuredText.
+    """Convert a docstring in plain text, in which names have backticks, to reStructuredText.
 
     Indented lines after a blank line become code.
     """
@@ -105,7 +105,7 @@ def plain_text(_app: Any, kind: str, _name: str, _object: Any, _options: Any, li
 
 
 def list_attributes(_app: Any, _kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
-    """Write the attributes of a class as a list of names with their descriptions.
+    """Write the attributes of a class as a list of names and descriptions.
 
     Napoleon writes a field `:ivar NAMES: text` for each attribute. If there are several names, as in `x_mm, y_mm`,
     Sphinx would interpret the first name as a type. The fields `:vartype NAME:`, which contain the types, are omitted.

@@ -1,4 +1,4 @@
-"""Activation functions of hidden layers, with the name of each in NumPy, PyTorch, ONNX and C.
+"""Activation functions of hidden layers, and the names of these functions in NumPy, PyTorch, ONNX and C.
 
 `ACTIVATIONS` is the only list of these functions. The configuration of a training, the evaluations of a network, the
 ONNX export and the C export all read it.

@@ -26,8 +26,8 @@ class Series:
     def values(self, coordinates: Array) -> Array:
         """Evaluate the series and its derivatives with respect to the three coordinates.
 
-        The series is evaluated in chunks of `CHUNK_SIZE` points. Each chunk is first summed over the polynomials in x
-        and y, and then over the polynomials in the logarithm of the force.
+        The series is evaluated in chunks of `CHUNK_SIZE` points. For the points of each chunk, the terms are first
+        summed over the polynomials in x and y, and then over the polynomials in the logarithm of the force.
 
         Args:
             coordinates: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.

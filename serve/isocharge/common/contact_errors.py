@@ -1,4 +1,4 @@
-"""Statistics of the errors of estimated contacts, which model cards, reports, the Bayes limit and the demo share."""
+"""Statistics of the errors of estimated contacts. Model cards, reports, the Bayes limit and the demo use them."""
 
 from dataclasses import dataclass
 
@@ -44,7 +44,10 @@ class ContactErrorStatistics:
 
     @classmethod
     def of(cls, contact: Array, truth: Array) -> "ContactErrorStatistics":
-        """Compute the statistics of contacts (x, y, F), mm and N, from the true contacts, shape (n, 3) each."""
+        """Compute the statistics of the errors.
+
+        Estimated and true contacts (x, y, F) have the shape (n, 3), mm and N.
+        """
         position_mm = position_error(contact, truth)
         force_percent = np.abs(force_error_percent(contact, truth))
         return cls(

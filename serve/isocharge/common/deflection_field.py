@@ -62,7 +62,7 @@ class DeflectionField:
     deflection_mm: Array
 
     def fits(self, film: Any) -> bool:
-        """Return whether a film, as a sensor file describes it, has the properties of this field's film."""
+        """Return whether the film that a sensor file describes has the same properties as the film of this field."""
         return is_same_film(film, self.film)
 
     def to_json(self) -> dict[str, Any]:
@@ -101,7 +101,7 @@ def _is_close(given: object, value: float) -> bool:
 
 
 def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, rings: Array, angles: int) -> Complexes:
-    """Compute the points of a field under a probe on the x axis, by the automorphism in the docstring of this module.
+    """Compute the points of a field for a probe on the x axis. The docstring of this module states the automorphism.
 
     Args:
         radius_mm: Radius of the film, mm.

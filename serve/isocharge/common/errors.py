@@ -38,15 +38,15 @@ class IsochargeError(Exception):
 
 
 class InputError(IsochargeError, ValueError):
-    """The input of the caller cannot be used. Nothing was computed."""
+    """An input, such as an argument or a file, is not valid. Nothing was computed."""
 
 
 class SensorError(InputError):
-    """A sensor description is wrong: unknown key, electrode off the film, impossible material."""
+    """A sensor description is wrong: an unknown key, an electrode outside the film, or an impossible material."""
 
 
 class SceneError(InputError):
-    """A press cannot exist: probe off the film, negative force, unknown probe notation."""
+    """A press is impossible: a probe outside the film, a negative force, or an unknown notation of the probe."""
 
 
 class ConfigError(InputError):
@@ -54,15 +54,15 @@ class ConfigError(InputError):
 
 
 class ChargeError(InputError):
-    """Charges do not fit the model: wrong number, NaN, infinite."""
+    """Charges cannot be used with the model: a wrong number of charges, NaN, or an infinite charge."""
 
 
 class PressError(InputError):
-    """Measured presses cannot be used: wrong column, not a number, force that is not positive."""
+    """Measured presses cannot be used: a wrong column, a value that is no number, or a force that is not positive."""
 
 
 class DeviceError(InputError):
-    """The description of a device is wrong: unknown key, unknown checksum, fields that do not fill the frame."""
+    """A device description is wrong: an unknown key, an unknown checksum, or fields that do not fill the frame."""
 
 
 class RecordingError(InputError):
@@ -158,7 +158,7 @@ class NoFramesError(PortError):
 
 
 class PressCheckError(IsochargeError, RuntimeError):
-    """The expected presses of a check were not made, or do not distinguish the channels."""
+    """The presses that a check expects were not made, or they do not distinguish the channels."""
 
 
 class TareError(IsochargeError, RuntimeError):
@@ -171,7 +171,7 @@ class MissingExtra(IsochargeError, ImportError):
 
 @contextmanager
 def error_prefix(where: str, kind: type[IsochargeError]) -> Iterator[None]:
-    """Put the text `where` before the message of each error of the class `kind` that the block raises."""
+    """Prefix the message of each error of class `kind` that the block raises with the text `where`."""
     try:
         yield
     except kind as error:

@@ -15,8 +15,8 @@ def finite_or_none(value: float | None) -> float | None:
 def plain_values(value: object) -> object:
     """Convert a value so that `json.dumps(..., allow_nan=False)` accepts it.
 
-    Keys become texts, arrays and tuples become lists, NumPy numbers become Python numbers, and numbers that are not
-    finite become None.
+    Keys become texts. Arrays and tuples become lists. NumPy numbers become Python numbers. Numbers that are not finite
+    become None.
     """
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()

@@ -1,4 +1,4 @@
-"""Measured presses: charges of a film under presses whose position or force, or both, are known.
+"""Measured presses: charges of a film under presses. The position or the force of each press is known, or both.
 
 A file of presses is CSV or Parquet with the columns `x_mm`, `y_mm`, `force_N` and one column for each electrode (pC),
 in any order. An empty cell stands for an unknown value. A file may have four further columns:
@@ -85,7 +85,7 @@ MAX_NAME_CHARACTERS = 1_000
 class MeasuredPresses:
     """Charges and contacts of n measured presses.
 
-    Two objects are equal if their numbers and electrodes are equal, even if they come from different lines of a file.
+    Two objects are equal if they have the same values and electrodes, even if they come from different lines of a file.
 
     Attributes:
         contact: x_mm, y_mm and force_N, shape (n, 3); NaN if unknown. Either both x and y are known, or neither.
@@ -186,7 +186,7 @@ class MeasuredPresses:
 
     @property
     def columns(self) -> dict[str, Array]:
-        """Numbers of the presses by the names of their columns in a file, each of shape (n,).
+        """Columns of a file of these presses by their names, each of shape (n,).
 
         There is no column of the temperature if the temperature of no press is known.
         """
@@ -383,7 +383,7 @@ def presses_text(presses: MeasuredPresses) -> str:
 
 
 def row_words(rows: Sequence[int], row_noun: str, most: int = 10) -> str:
-    """List the numbers of presses for a message, as in "line 3" or "rows 3, 4 and 12 more".
+    """Return the lines or rows of presses in a file as text for a message, as in "line 3" or "rows 3, 4 and 12 more".
 
     Args:
         rows: Numbers of the presses in their file.

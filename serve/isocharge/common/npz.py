@@ -116,12 +116,12 @@ def finite_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int |
 
 
 def finite_number(arrays: Mapping[str, np.ndarray], name: str) -> float:
-    """Return a finite number that a file contains as an array without dimensions; raise ValueError if there is none."""
+    """Return the finite number in an array without dimensions; raise ValueError if the array contains none."""
     return float(finite_array(arrays, name, ()))
 
 
 def text_item(arrays: Mapping[str, np.ndarray], name: str) -> str:
-    """Return a text that a file contains as an array without dimensions.
+    """Return the text in an array without dimensions.
 
     Args:
         arrays: Arrays of the file, by name.

@@ -1,7 +1,7 @@
 """Progress of long computations.
 
-A computation reports its progress to a listener. The listener is stored in a context variable, so that the functions on
-the way to the computation do not need an additional argument.
+A computation reports its progress to a listener. The listener is stored in a context variable, so that functions do not
+need an additional argument to pass it on.
 """
 
 import threading
@@ -52,7 +52,7 @@ def report(title: str, done: int, total: int, note: str = "") -> None:
 
 @contextmanager
 def second_thread() -> Iterator[Executor]:
-    """Run calls in a second thread, whose progress is reported to the listener of this thread.
+    """Run calls in a second thread, and report the progress of these calls to the listener of this thread.
 
     The end of the block waits for all calls. If the block raises an exception, waiting calls are cancelled, and the
     running call ends with a `CancelledError` at its next report.

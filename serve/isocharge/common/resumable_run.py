@@ -104,8 +104,8 @@ class ResumableRun:
     def storing_executor(self, name: str, executor: Executor | None = None) -> Executor:
         """Return an executor that stores the results of its tasks as parts of the run, and loads finished parts.
 
-        The results must be arrays of numbers. The tasks are numbered in the order in which they are submitted, so that
-        a resumed run must submit the same tasks in the same order.
+        The results must be arrays of numbers. The tasks are numbered in the order of their submission. A resumed run
+        must therefore submit the same tasks in the same order.
 
         Args:
             name: Beginning of the names of the parts.
@@ -118,7 +118,7 @@ class ResumableRun:
         return not any(self._parts.glob("*.sha256"))
 
     def _path(self, name: str, final: bool) -> Path:
-        """Return the path of a part; see `save` for the arguments."""
+        """Return the path of the file that stores a part of the run; see `save` for the arguments."""
         return (self.data if final else self._parts) / name
 
     def prepare(self) -> None:
@@ -178,7 +178,7 @@ class _StoringExecutor(Executor):
         return stored
 
     def _store(self, part: str, computed: Future[Any], stored: Future[Any]) -> None:
-        """Store the result of a task, and pass it on to the future that `submit` has returned.
+        """Store the result of a task, and set it as the result of the future that `submit` returned.
 
         Args:
             part: Name of the part in which the result is stored.
@@ -232,9 +232,10 @@ def refuse_finished(target: Path) -> None:
 
 @contextmanager
 def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
-    """Begin a run, or resume a run that was stopped. The target is created when the block ends without an error.
+    """Begin a run, or resume a run that was stopped. The target folder is created when the block ends without an error.
 
-    After an error the draft remains, unless no part is finished or the same error would occur again.
+    After an error, the draft is kept for the next run. It is removed if no part is finished, or if the same error would
+    occur again.
 
     Args:
         target: Folder that the run writes.

@@ -6,5 +6,5 @@ from isocharge.common.arrays import Array
 
 
 def rms(values: Array) -> float:
-    """Compute the root mean square of all elements of an array."""
+    """Compute the root mean square over all elements of an array."""
     return float(np.sqrt(np.mean(np.square(values))))

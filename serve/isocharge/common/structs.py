@@ -187,7 +187,7 @@ def _first_mistake(value: object, kind: Any, cause: Exception) -> str:
 
 
 def _mistakes(value: object, expected_type: Any, path: str) -> Iterator[str]:
-    """Yield descriptions of the mistakes in a value: first those in its keys or items, then those of the whole value.
+    """Yield descriptions of the mistakes in the keys or items of a value, and then of the mistakes in the whole value.
 
     Args:
         value: Value from TOML or JSON.

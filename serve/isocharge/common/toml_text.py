@@ -1,7 +1,7 @@
 """Writing of settings as TOML; `isocharge.common.structs` reads them.
 
-No library is used, because tomli-w writes each number of a list on its own line and writes no comments, and tomlkit is
-made for changing existing files.
+This module uses no library. tomli-w writes no comments, and writes each number of a list on its own line. tomlkit is
+intended for changes of existing files.
 """
 
 import json
@@ -66,5 +66,5 @@ def _value(value: object) -> str:
 
 
 def _text(text: str) -> str:
-    """Return a text as a basic string of TOML: the string of JSON with the escaped character U+007F."""
+    """Return a text as a basic string of TOML: the JSON string of the text, with the character U+007F also escaped."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -62,7 +62,7 @@ LATENCY_S = 0.5
 
 
 class FollowedPress(NamedTuple):
-    """One frame of the live part in which the model reports a press while the virtual sensor presses.
+    """Frame of the live part during a press of the virtual sensor that the model reports.
 
     Attributes:
         number: Number of the press, from 1.
@@ -124,7 +124,7 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
 
 @contextmanager
 def _step(name: str, description: str, durations_s: dict[str, float]) -> Iterator[None]:
-    """Print the title of a step, show its progress during the block, and store its duration.
+    """Print the title of a step, show the progress of the step during the block, and store its duration.
 
     Args:
         name: Name of the step.
@@ -145,7 +145,7 @@ def _free_name(base: Path) -> Path:
 
 
 def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, StreamTotals]:
-    """Play a virtual sensor, read its port, and print estimate and truth twice a second.
+    """Play a virtual sensor, read its port, and print the estimated and the true contact twice per second.
 
     Args:
         forward_map: Charges of the presses of the virtual sensor.

@@ -32,8 +32,8 @@ class LazyCommand(NamedTuple):
 def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer:
     """Return a group of commands that are imported only when they are needed.
 
-    A command is imported when it is called, completed, or asked for its help. The help of the group needs only the
-    summaries.
+    A command is imported when the user calls it, completes its options, or requests its help. The help of the group
+    needs only the summaries.
 
     Args:
         summary: Summary of the group.

@@ -111,8 +111,8 @@ def page_tls(live: str | None, certificate: Path | None, key: Path | None) -> Tl
 def given_token(token: str | None) -> str | None:
     """Return the token that the option or the environment contains.
 
-    If the environment contains an empty token, the function returns an empty text, although Typer treats this case as a
-    missing token.
+    If the environment contains an empty token, the function returns an empty text. Typer alone would treat an empty
+    token as a missing one.
     """
     return os.environ.get("ISOCHARGE_TOKEN") if token is None else token
 
@@ -150,7 +150,7 @@ def live_page(
     is_recording: bool = False,
     tls: Tls | None = None,
 ) -> Iterator[ReaderEnd]:
-    """Run the page of a stream in a process of its own, and print its address.
+    """Run the page of a stream in a separate process, and print the address of the page.
 
     Args:
         address: Address at which the page listens.
@@ -182,7 +182,7 @@ def live_page(
 
 
 class PageFeed:
-    """Sends the records of a stream to its page, and its counters a few times per second.
+    """Sender of the records of a stream to its live page. The counters of the stream are sent a few times per second.
 
     Args:
         link: The reader's end of the link to the page.
@@ -212,7 +212,7 @@ class PageFeed:
             self._send_state(record)
 
     def _rate_Hz(self) -> float | None:
-        """Compute the frame rate of the board from the times of the latest records, Hz; None if it is not known."""
+        """Compute the frame rate of the board (Hz) from the times of the latest records; None if it is unknown."""
         elapsed_s = self._timestamps_s[-1] - self._timestamps_s[0]
         if not elapsed_s > 0.0:
             return None

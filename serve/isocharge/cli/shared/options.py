@@ -112,7 +112,10 @@ def refuse(mistakes: Mapping[str, object]) -> None:
 
 
 def worker_count(workers: int | None) -> int:
-    """Return the number of processes from `--workers`; without the option, one for each core up to 64."""
+    """Return the value of `--workers`.
+
+    Without the option, return the number of processor cores, but not more than 64.
+    """
     from isocharge.simulate.execution.workers import cores
 
     return workers or min(cores(), 64)

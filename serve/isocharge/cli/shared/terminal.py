@@ -69,7 +69,7 @@ def discard_output(number: int) -> None:
 
 
 def show(text: str) -> None:
-    """Print a result for people on stdout, in printable characters."""
+    """Print a result as text on stdout, in which all characters that are not printable are escaped."""
     typer.echo(printable_lines(text))
 
 
@@ -137,7 +137,7 @@ def _write_all(descriptor: int, data: bytes) -> None:
 
 @contextmanager
 def until_stopped() -> Iterator[None]:
-    """Leave the block without an error at Ctrl-C, at SIGTERM, and when the reader of stdout closes it."""
+    """Leave the block without an error after Ctrl-C, after SIGTERM, or if the reader of stdout closes it."""
     previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
@@ -203,7 +203,7 @@ PROGRESS_LINE_INTERVAL_S = 5.0
 
 
 def say(message: str) -> None:
-    """Print a message for people on stderr, in printable characters.
+    """Print a message on stderr, in which all characters that are not printable are escaped.
 
     The command continues if stderr is full or closed.
     """
@@ -289,7 +289,7 @@ def _progress_bars() -> Iterator[Listener]:
         rows: dict[str, TaskID] = {}
 
         def show(title: str, done: int, total: int, note: str) -> None:
-            """Show the progress of the work with a title, in a bar of its own."""
+            """Show the progress of one piece of work in its own bar, which is identified by the title."""
             shown_title = printable(title)
             shown_note = printable(note)
             if shown_title not in rows:

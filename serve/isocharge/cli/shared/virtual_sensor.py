@@ -51,7 +51,7 @@ def random_script(forward_map: ForwardMap, seed: int, rate_Hz: float, max_force_
 
 
 def film_charges(forward_map: ForwardMap) -> Charges:
-    """Return the function from contacts, shape (n, 3), mm and N, to charges, shape (n, electrodes), pC.
+    """Return the function that computes charges, shape (n, electrodes), pC, from contacts, shape (n, 3), mm and N.
 
     Below the smallest force of the forward map, the charges of a contact are proportional to the force to the power of
     2/3, as on a membrane.
@@ -60,7 +60,7 @@ def film_charges(forward_map: ForwardMap) -> Charges:
 
 
 def film_charges_per_K(forward_map: ForwardMap) -> Charges | None:
-    """Return the function from contacts to the change of the touch charges per kelvin of the film, pC/K.
+    """Return the function that computes how much the touch charges of contacts change per kelvin of warming, pC/K.
 
     The result is None if the temperature of the film does not change its pretension. Otherwise further presses are
     solved.
@@ -78,7 +78,7 @@ def film_charges_per_K(forward_map: ForwardMap) -> Charges | None:
 
 
 def _charges(map_charges: Callable[[Array], Array], min_force_N: float, contact: Array) -> Array:
-    """Compute the charges of contacts, also below the smallest force of the forward map; see `film_charges`.
+    """Compute the charges of contacts, including those below the smallest force of the map; see `film_charges`.
 
     Args:
         map_charges: Function from contacts in the domain of the forward map to charges.

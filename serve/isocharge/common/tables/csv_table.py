@@ -141,7 +141,10 @@ class _LinesWithoutComments:
     """
 
     def __init__(self, lines: Iterable[str], names: Collection[str]) -> None:
-        """Store the lines, and the names of columns that are no comment even if they begin with #."""
+        """Store the lines and the names of columns.
+
+        A line whose first cell is one of these names is not a comment, even if it begins with #.
+        """
         self.at_row_start = True
         self._lines = iter(lines)
         self._names = names
@@ -213,7 +216,9 @@ def _decoding_advice(cause: UnicodeDecodeError, lines_before: int) -> str:
 
 
 def _other_format(data: bytes) -> str | None:
-    """Return a sentence that names another file format and what to do; None if the bytes may be text.
+    """If the bytes belong to another file format, return a sentence that names the format and states what to do.
+
+    Otherwise return None.
 
     Args:
         data: First bytes of the file.

@@ -1,8 +1,8 @@
 """Named columns of numbers from a file: the checks of names, values and rows that all formats share.
 
-Each format is a subclass of `NumberTable`. The subclass reads the header and converts the requested columns to float64
-arrays with NaN for an empty cell. All further checks are in this module, so that the same fault gets the same message
-in every format.
+Each format is a subclass of `NumberTable`. The subclass reads the header, and converts the requested columns to float64
+arrays in which NaN stands for an empty cell. All further checks are in this module, so that the same fault gets the
+same message in every format.
 """
 
 from abc import ABC, abstractmethod
@@ -51,7 +51,7 @@ class ColumnRule:
     meaning: ColumnMeaning = field(default_factory=ColumnMeaning)
 
     def violations(self, values: Array) -> Booleans:
-        """Return which values violate the rule, shape (n,). NaN stands for an empty cell."""
+        """Return a mask of the values that violate the rule, shape (n,). NaN stands for an empty cell."""
         is_empty = np.isnan(values)
         is_outside = (values < self.minimum) | (values > self.maximum)
         if self.is_positive:
@@ -104,7 +104,7 @@ class NumberColumns:
 
 
 def _value_text(value: float) -> str:
-    """Return a number for a message, with enough digits to recognise the number."""
+    """Return a number as text for an error message, with enough digits to recognise the number."""
     if np.isnan(value):
         return "an empty cell"
     short = f"{value:.6g}"
