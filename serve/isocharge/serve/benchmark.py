@@ -1,6 +1,7 @@
 """Measurement of the duration of calls.
 
-The contenders are measured in turns, so that a change of the speed of the machine affects all of them equally.
+A contender is one way to predict, such as a method of the predictor. The contenders are measured in turns, so that all
+of them are affected equally if the machine becomes slower or faster.
 """
 
 import os
@@ -78,7 +79,7 @@ class Timing(NamedTuple):
 
 
 def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = time.perf_counter_ns) -> list[Timing]:
-    """Time all contenders, one after another in each round.
+    """Measure the duration of the calls of all contenders. In each round, every contender has one turn.
 
     Args:
         contenders: The contenders.
@@ -120,7 +121,7 @@ def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
 
 
 def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0) -> Singles:
-    """Draw charges at random from the golden vectors of a model, without presses whose contacts have flags.
+    """Draw charges at random from the golden vectors of a model. Presses whose contacts have flags are excluded.
 
     Args:
         predictor: The model.
@@ -137,7 +138,7 @@ def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0) -> Si
 
 
 def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Contender]:
-    """Return a contender for every method of a predictor.
+    """Return the contenders that call the methods of a predictor, one for each method.
 
     Args:
         predictor: The model.
@@ -159,7 +160,7 @@ def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Cont
 
 
 def machine(packages: Sequence[str] = ("numpy", "onnxruntime")) -> dict[str, str]:
-    """Return a description of this machine: processor, cores, system, Python, and the versions of packages."""
+    """Return the processor, the operating system and the versions of Python and packages of this machine."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text("utf-8").splitlines() if info.exists() else []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))

@@ -22,7 +22,8 @@ SHORTEST_S = 0.5
 class ChannelHealth:
     """Health of one channel.
 
-    All values are in pC, after the conversion by the gain. Values are None if no value of the channel is a charge.
+    All values are in pC, after the conversion by the gain. All results are None if the channel has no value that can be
+    a charge.
 
     Attributes:
         name: Name that the device uses, or the number of the channel from 1.
@@ -45,7 +46,7 @@ class ChannelHealth:
 
 
 def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz: float) -> ChannelHealth:
-    """Measure the health of a channel, by a fit of a constant, a slope and the hum to its values.
+    """Measure the health of a channel. A constant, a slope and the hum are fitted to its values.
 
     The function ignores NaN and values whose magnitude is larger than `LARGEST_PC`.
 

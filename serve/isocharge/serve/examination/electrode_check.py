@@ -143,8 +143,8 @@ def check_electrodes(
 def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
     """Find the channel that changes most under the press near each electrode.
 
-    The forces of the presses and the gains of the channels differ. Dividing the rows and columns of the changes
-    alternately by their means removes both (Sinkhorn and Knopp 1967).
+    The forces of the presses and the gains of the channels differ. The rows and the columns of the changes are
+    therefore divided alternately by their means, which removes the forces and the gains (Sinkhorn and Knopp 1967).
 
     Args:
         changes: Change of each channel under the press near each electrode, shape (electrodes, channels), any unit.
@@ -179,7 +179,7 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
 
 
 def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str, Any]:
-    """Return the content of a device file that assigns each electrode to the channel that the presses have shown.
+    """Return the content of a device file in which the channel of each electrode is the one found by the presses.
 
     Settings for single electrodes, such as gains and offsets, belong to the amplifiers and move with the channels.
 
@@ -265,8 +265,8 @@ class _Blocks:
 def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
     """Wait for a press that begins and ends, and return the largest change of each channel, shape (channels,).
 
-    The change is the difference between a block and the rest level, which follows a slow drift until the press begins.
-    The press ends when the change has become small again.
+    The change is the difference between a block and the rest level. Until the press begins, the rest level is updated,
+    so that it follows a slow drift. The press ends when the change has become small again.
 
     Args:
         blocks: Source of the averaged values.

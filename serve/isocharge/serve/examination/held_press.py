@@ -1,6 +1,6 @@
 """Description of a press that is held during the port check.
 
-The charge of the press is constant, leaks, creeps or drifts.
+The description states whether the charge of the press is constant, leaks, creeps or drifts.
 
 The gain of the board may be unknown, so a press is not defined by a charge in pC. The press begins with the first large
 change of the channels within 0.2 s. The size of the press is the component of the channels along this change, minus the
@@ -124,7 +124,9 @@ def _extrapolate_rest(
 
 
 def _block_means(values: Array, times_s: Array) -> Array | None:
-    """Compute the means of the channels over blocks of `BLOCK_S`, without the last block, which may be incomplete.
+    """Compute the means of the channels over blocks of `BLOCK_S`.
+
+    The last block is left out, because it may be incomplete.
 
     Args:
         values: Values of the channels, shape (n, channels), in any unit.
@@ -178,7 +180,7 @@ def _with_drift(
 
 
 def _describe(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, float]]]:
-    """Describe how the charge of a press changes, without the drift of the rest.
+    """Describe how the charge of a press changes. A drift of the rest level is not included.
 
     Args:
         held_s: Times since the beginning of the press, shape (n,), s.

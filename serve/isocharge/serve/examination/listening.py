@@ -87,7 +87,9 @@ def listen(
     has_frames: Callable[[ReceivedData], bool],
     wait: float = 0.0,
 ) -> ReceivedData:
-    """Listen to a port at the first baud rate at which the bytes are frames, or at which no bytes arrive.
+    """Find the baud rate of a port, and listen to the port at this baud rate.
+
+    The chosen baud rate is the first one at which the bytes are frames, or at which no bytes arrive.
 
     Args:
         url: The port.

@@ -249,7 +249,7 @@ def _touch_sentence(
 def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
     """Return whether a tare of the film succeeds with the settings of a device file.
 
-    The result is also true if the device file has no tare, or if there are too few frames for two tares. The result is
+    If the device file has no tare, or there are too few frames for two tares, the result is also true. The result is
     false if there are no frames, or if reading the frames raises an error.
 
     Args:

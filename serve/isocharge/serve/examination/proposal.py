@@ -168,8 +168,8 @@ def unit_of(capture: Capture) -> str:
 def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...]) -> dict[str, int]:
     """Choose the channel of each electrode.
 
-    If there are channels with the names of the electrodes, these are chosen. Otherwise the electrodes are assigned in
-    their order to channels whose values vary. Without a model, each varying channel is an electrode.
+    If there are channels with the names of the electrodes, these channels are chosen. Otherwise the electrodes are
+    assigned in their order to channels whose values vary. Without a model, each varying channel is an electrode.
 
     Args:
         capture: The frames.
@@ -198,7 +198,7 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
 
 
 def _varying_channels(values: Array) -> list[int]:
-    """Return the positions of the channels that vary, except for channels with much less noise than the others.
+    """Return the positions of the channels that vary. Channels with much less noise than the others are left out.
 
     All positions are returned if no channel varies. A channel with a value that is not finite does not vary.
     """

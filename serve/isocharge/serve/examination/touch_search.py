@@ -3,11 +3,11 @@
 The gain and the rest level of a board are not known yet. A touch is therefore recognised by changes of the charges
 within half a second. Warming, creep and the slow noise of amplifiers cause slower changes.
 
-The median of each block of 0.1 s is computed, in which hum averages out. A single damaged value does not change the
-median of a block.
+The values are replaced by their medians over blocks of 0.1 s, because hum averages out in a block. A single damaged
+value does not change the median of a block.
 
-A press that is held with constant force for the whole time does not change the charges. A press during the whole time
-cannot be distinguished from an amplifier that rests at another level.
+A press that is held with constant force for the whole time does not change the charges. Such a press cannot be
+distinguished from an amplifier that rests at another level.
 """
 
 from typing import NamedTuple
@@ -98,7 +98,7 @@ def _smallest_touch(channel_values: Array, unit_is_pC: bool) -> float:
 
 
 def block_medians(values: Array, times_s: Array) -> Array:
-    """Compute the median of each channel in each whole block of time.
+    """Compute the median of each channel over each complete block.
 
     Args:
         values: Values of the channels, shape (n, channels).

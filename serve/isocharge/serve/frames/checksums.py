@@ -31,7 +31,7 @@ class Crc:
 
     @cached_property
     def table(self) -> tuple[int, ...]:
-        """Register after each of the 256 bytes, starting from a register of zero."""
+        """Value of the register after each of the 256 possible bytes, if the register was zero before."""
         return tuple(map(self._table_entry, range(256)))
 
     @cached_property
@@ -47,7 +47,7 @@ class Crc:
         return int(bits[::-1], 2)
 
     def _table_entry(self, byte: int) -> int:
-        """Return the register after one byte, starting from a register of zero.
+        """Return the value of the register after one byte, if the register was zero before.
 
         The register is shifted by one bit at a time. If the bit that leaves the register is 1, the polynomial is
         subtracted, which is an exclusive or.
@@ -72,7 +72,10 @@ class Crc:
         return register & ((1 << self.width) - 1)
 
     def __call__(self, data: bytes) -> int:
-        """Compute the check value of some bytes, one byte at a time with a table of 256 registers."""
+        """Compute the check value of some bytes.
+
+        The bytes are processed one at a time with a table of 256 registers.
+        """
         table = self.table
         register = self.initial_register
         if self.reflected:  # the lowest bit leaves the register first

@@ -30,8 +30,8 @@ class AutoParser(Parser):
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
 
-        Until the format is recognised, the data are passed to the parsers of all formats piece by piece. The first
-        parser that finds a frame is used from then on.
+        Until the format is recognised, each piece of the data is passed to the parsers of all formats. The first parser
+        that finds a frame is used from then on.
         """
         if len(self._candidates) == 1:
             return self._feed_recognised(self._candidates[0], data)
@@ -82,7 +82,7 @@ class TextFrames(FrameSection, tag="text", frozen=True):
 
     @property
     def meanings(self) -> Mapping[str, str]:
-        """`seq`, `t_us`, `t_ms` or `t_s` by the name that the board uses."""
+        """Meaning of each name that the board uses: `seq`, `t_us`, `t_ms` or `t_s`."""
         meanings = {self.seq: "seq", self.t_us: "t_us", self.t_ms: "t_ms", self.t_s: "t_s"}
         return {name: meaning for name, meaning in meanings.items() if name}
 

@@ -1,7 +1,7 @@
-"""Common parts of all frame formats: the frame, base classes of parsers, counters, and columns of a row of numbers.
+"""Classes that all frame formats use: the frame, base classes of parsers, counters, and columns of a row of numbers.
 
 A parser converts bytes to frames, and is independent of the source of the bytes. The frames and counters do not depend
-on how the bytes are cut into chunks, and the memory is bounded for any input.
+on how the bytes are divided into chunks. The memory of a parser is bounded for any input.
 """
 
 from abc import ABC, abstractmethod
@@ -34,7 +34,7 @@ Raw = TypeVar("Raw")
 
 
 class SequenceGaps:
-    """Detects missing frames, repeated frames and restarts of the board by the frame counters.
+    """Uses the frame counters to detect missing frames, repeated frames and restarts of the board.
 
     Attributes:
         lost: Number of frames that are missing between received frames.
@@ -51,7 +51,7 @@ class SequenceGaps:
         self._last_seq: int | None = None
 
     def reset(self) -> None:
-        """Treat the next frame as the first frame of a new connection, so that no gap is counted before it.
+        """Treat the next frame as the first frame of a new connection. No gap is then counted before this frame.
 
         The counters are kept.
         """
@@ -129,7 +129,9 @@ class CounterWrap:
         return self._modulus
 
     def _modulus_after_decrease(self, step: int) -> int:
-        """Return the smallest usual modulus that explains a negative step, or the present modulus if none does.
+        """Return the smallest usual modulus that explains a negative step.
+
+        If no modulus explains it, the present modulus is returned.
 
         A modulus explains the step if it is larger than all values, and if the step modulo the modulus is at most
         `max_steps` times the previous step.

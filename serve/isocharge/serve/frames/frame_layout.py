@@ -294,7 +294,10 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     @cached_property
     def three_byte_fields(self) -> tuple[tuple[int, bool], ...]:
-        """Position of each field of three bytes, which `struct` cannot read, and whether the field is signed."""
+        """Position of each field of three bytes, and whether the field is signed.
+
+        The module `struct` cannot read such fields.
+        """
         return tuple((position, field.kind == "i24") for position, field in enumerate(self.fields) if field.size == 3)
 
     @cached_property
@@ -381,7 +384,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
 
 def _parser_arguments(layout: FrameLayout) -> tuple[str, int, int]:
-    """Return the arguments of `Parser` for a layout: the description of the format, and the two moduli."""
+    """Return the arguments of `Parser` for a layout, which are the description of the format and the two moduli."""
     names = ", ".join(field.name for field in layout.fields)
     return f"described frames of {layout.length} bytes: {names}", layout.seq_modulus, layout.t_us_modulus
 

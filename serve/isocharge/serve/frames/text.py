@@ -1,19 +1,20 @@
-"""Frames from lines of text, whose layout is recognised from the first good lines.
+"""Parser of frames in lines of text. The layout of the lines is recognised from the first good lines.
 
 A board sends one row of numbers for each frame, or a cycle of several lines with one name each. The layout is
 recognised when the same row or the same cycle has occurred three times in succession. After recognition, lines of
 another layout are dropped and counted.
 
-Reading may start in the middle of a cycle. The first line of a cycle is therefore the line whose name sorts first,
-where the frame counter and the clock sort before the channels. Reading may also start in the middle of a line, so a
-first line of numbers without names is dropped.
+Reading may start in the middle of a cycle. The lines are therefore sorted by name, with the frame counter and the clock
+before the channels, and the first line of this order begins the cycle. Reading may also start in the middle of a line,
+so a first line of numbers without names is dropped.
 
 Text has no checksum, except for sentences in the style of NMEA 0183. A damaged digit in an otherwise intact line is
 therefore not detected. A line without a reading that occurs repeatedly, such as the echo of a request, is dropped and
 does not prevent recognition.
 
-The name `seq` means the frame counter, and `t_us`, `t_ms` or `t_s` means the clock of the device. All other names are
-channels. The values at which the counter and the clock wrap are learned when they wrap for the first time.
+A column with the name `seq` is the frame counter. A column with the name `t_us`, `t_ms` or `t_s` is the clock of the
+device. All other names are channels. The values at which the counter and the clock wrap are learned when they wrap for
+the first time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -54,7 +55,7 @@ MAX_TIME_STEPS = 16
 
 
 class Layout:
-    """Layout of a row, or of a cycle of lines.
+    """Layout of the values in one line, or in a cycle of several lines.
 
     Args:
         notation: Notation of the lines.
@@ -142,8 +143,8 @@ class TextParser(DelimitedParser):
     def _reject_unreadable(self, piece: bytes, size: int) -> list[Frame]:
         """Count a line that cannot be parsed.
 
-        If the line is the same as the previous such line, it is the echo of a request. The other lines are then kept
-        for recognition.
+        If the line is equal to the previous line of this kind, it is the echo of a request. The other lines are then
+        kept for recognition.
 
         Args:
             piece: The line.
@@ -218,7 +219,7 @@ class TextParser(DelimitedParser):
     def _layout_of(self, lines: list[Line]) -> Layout:
         """Return the layout of the lines of one cycle, which is a single line for most boards.
 
-        If a single line has no names, its values get the names of the columns, provided that their number is the same.
+        The values of a single line without names get the names of the columns if there are as many columns as values.
         """
         first_line = lines[0]
         if len(lines) > 1:

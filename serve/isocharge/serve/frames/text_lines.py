@@ -89,7 +89,7 @@ def parse_line(data: bytes) -> Line:
 
 
 def _csv(text: str) -> Line:
-    """Parse numbers between separators, or a header with the names of such columns."""
+    """Parse a line of numbers between separators, or a header with the names of the columns."""
     cells = _SEPARATOR.split(text.rstrip(",; \t"))
     try:
         return Line(Notation.csv, (), tuple(map(parse_number, cells)))

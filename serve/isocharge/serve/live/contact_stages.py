@@ -176,7 +176,10 @@ class TrackingStage(ContactStage):
         self._tracker.mixture = mixture
 
     def step(self, frame: ContactFrame) -> None:
-        """Track the contact. If there is a mixture, its contact replaces the contact of the model."""
+        """Track the contact.
+
+        If a mixture follows the contact, the contact of the mixture replaces the contact of the model.
+        """
         tracker = self._tracker
         reading = frame.reading
         tracked, event = tracker.update(frame.contact, frame.clock_s, frame.flags, reading.charge_pC)
@@ -195,7 +198,7 @@ class TrackingStage(ContactStage):
 
 
 def _add_error(frame: ContactFrame, contact: Contact, shift: tuple[float, float, float]) -> None:
-    """Add an error to the standard deviations of the contact of a frame and of its tracked contact.
+    """Include an error in the standard deviations of two contacts: the contact of a frame, and the tracked contact.
 
     Args:
         frame: The frame, which is changed.
@@ -237,7 +240,7 @@ class ChargeScaleStage(ContactStage):
         self._sensitivity_predictor = self._model.predictor
 
     def _shift(self, frame: ContactFrame, contact: Contact) -> tuple[float, float, float] | None:
-        """Return the changes of x and y, mm, and of the force, N, that one standard deviation of the scale causes.
+        """Return the changes of x and y (mm) and of the force (N) that one standard deviation of the scale causes.
 
         For a contact of the mixture, only the force is assumed to depend on the scale, with the largest exponent.
 
@@ -263,7 +266,9 @@ class ChargeScaleStage(ContactStage):
 
 
 class TouchOffsetRule(Rule, frozen=True, kw_only=True):
-    """Offset that all charges of a touch may have in common, such as a triboelectric or a pyroelectric charge.
+    """Description of an offset that all charges of a touch may have in common.
+
+    Examples are a triboelectric and a pyroelectric charge.
 
     Attributes:
         std_pC: Standard deviation of the offset, pC. The offset is constant within a touch, and its mean is 0.
@@ -273,10 +278,10 @@ class TouchOffsetRule(Rule, frozen=True, kw_only=True):
 
 
 class TouchOffsetStage(ContactStage):
-    """Increases the standard deviations of a contact because its touch may have a common offset.
+    """Increases the standard deviations of a contact, because the charges of its touch may have a common offset.
 
-    An offset shifts light presses more than strong presses. A contact of the mixture keeps its standard deviations,
-    because the sensitivity is computed with the model, which does not predict this contact.
+    An offset shifts light presses more than strong presses. The standard deviations of a contact of the mixture are not
+    changed. The sensitivity is computed with the model, and the model does not predict this contact.
     """
 
     def __init__(self, model: CurrentModel, rule: TouchOffsetRule, warming_ratio: Array | float) -> None:

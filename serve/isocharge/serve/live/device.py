@@ -126,7 +126,7 @@ def _setting_of(setting: float | Mapping[str, float] | None, electrode: str, def
 
 
 class Saturation(Rule, frozen=True, kw_only=True):
-    """Range of the converter, given by the largest charge that the converter can represent, pC."""
+    """Largest charge that the converter can represent, pC."""
 
     limit_pC: Setting
 
@@ -229,7 +229,7 @@ class Device(DeviceSections, frozen=True):
         )
 
     def _warming_ratio(self, electrodes: tuple[str, ...]) -> Array | float:
-        """Return how strongly each electrode responds to a warming of the film, relative to the mean of all electrodes.
+        """Return the response of each electrode to a warming of the film, relative to the mean of all electrodes.
 
         Args:
             electrodes: Names of the electrodes.

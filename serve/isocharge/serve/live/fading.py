@@ -7,9 +7,9 @@ two laws are straight lines:
     creep:  ln Q = a + b ln t
 
 where t is the time since the touch. Both lines are fitted to the charges of a press. A law is only reported if the
-squared residuals of the other law are at least `MIN_RESIDUAL_RATIO` times as large. Creep with a thermoelastic step
-(see `isocharge.serve.signal_chain.memory`) is reported if its squared residuals are smaller by this factor than those
-of both lines.
+squared residuals of the other law are at least `MIN_RESIDUAL_RATIO` times as large. A third law is creep with a
+thermoelastic step (see `isocharge.serve.signal_chain.memory`). It is reported if the squared residuals of both lines
+are at least `MIN_RESIDUAL_RATIO` times as large.
 
 The section [leak] of a device file corrects a leak, and the section [memory] corrects creep. If [leak] is used for
 creep, the error grows with time.
@@ -56,7 +56,10 @@ class Fading(NamedTuple):
 
     @property
     def sections(self) -> dict[str, dict[str, float]]:
-        """Sections of a device file that correct the decrease, with two digits; empty if no section corrects it."""
+        """Sections of a device file that correct the decrease, with values of two digits.
+
+        The result is empty if no section corrects it.
+        """
         if self.tau_s is not None:
             return {"leak": {"tau_s": _two_digits(self.tau_s)}}
         if self.creep is None or not self.creep < MAX_CREEP:
@@ -158,7 +161,7 @@ def _fit_creep_and_step(held_s: Array, size_pC: Array, max_squared_residual: flo
 
 
 def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
-    """Return the possible cause of a decrease of the charges with advice to the user, as the end of a sentence.
+    """Return the end of a sentence that states the possible cause of a decrease and gives advice to the user.
 
     Args:
         sizes: Times since the touch, s, and mean magnitudes of the charges at these times, positive, pC.

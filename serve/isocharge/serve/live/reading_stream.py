@@ -57,8 +57,8 @@ class ChannelPicker:
     def pick(self, frame: Frame) -> Array:
         """Return the values in the order of the electrodes, shape (n_electrode,), in the unit of the device.
 
-        The positions of the channels are looked up again only if the frame has other names, or another number of
-        values, than the previous frame.
+        The positions of the channels are only looked up again if the names or the number of values have changed since
+        the previous frame.
 
         Raises:
             ChargeError: If a frame has no value for an electrode.
@@ -138,7 +138,10 @@ def position_of(name: str, frame: Frame) -> int | None:
 
 
 def electrode_of(name: str) -> str:
-    """Return the electrode that a channel is named after: `A` for `A`, `A_pC`, `charge.A` and `charge_raw_pC.A`."""
+    """Return the name of the electrode in the name of a channel.
+
+    For example, the result is `A` for `A`, `A_pC`, `charge.A` and `charge_raw_pC.A`.
+    """
     return name.rpartition(".")[2].removesuffix("_pC")
 
 
@@ -196,7 +199,7 @@ class ReadingStream:
 
     @property
     def warming_ratio(self) -> Array | float:
-        """Charge that warming adds to each electrode, relative to the mean magnitude of all, shape (n_electrode,)."""
+        """Charge that warming adds to each electrode, relative to the mean magnitude, shape (n_electrode,)."""
         return self._settings.pyro
 
     def _new_chain(self) -> SignalChain:

@@ -85,9 +85,9 @@ class RecordedStream:
     def request_model(self, load: Load) -> None:
         """Request another model, which is loaded in the background.
 
-        The model is used from the next chunk after it is loaded. If the model cannot be loaded, or has other
-        electrodes, an error is logged and the present model is kept. The method may also be called from a signal
-        handler.
+        When the model has been loaded, it is used for the next chunk and all later chunks. If the model cannot be
+        loaded, or has other electrodes, an error is logged and the present model is kept. The method may also be called
+        from a signal handler.
 
         Args:
             load: Function that loads the model.
@@ -207,7 +207,7 @@ class RecordedStream:
             self.recorder.tare()
 
     def _reset_film(self) -> None:
-        """Reset the followed film to its calibration, and record the request."""
+        """Reset the estimate of the film to its calibration, and record the request."""
         self._stream.reset_film()
         if self.recorder is not None:
             self.recorder.back()
@@ -224,7 +224,7 @@ def replay(
 ) -> Iterator[PredictionRecord]:
     """Compute the records of a recording again, and yield them.
 
-    For each chunk, as many records are yielded as were used when the recording was made.
+    For each chunk, the replay yields the same number of records as were used when the recording was made.
 
     Args:
         recording: The recording.

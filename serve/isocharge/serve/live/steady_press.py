@@ -204,7 +204,7 @@ class PressWatch:
         return result._replace(charge_pC=charge_pC, held_s=held_s)
 
     def _process_rest(self, charge_pC: Array, t_s: float) -> WatchResult:
-        """Store a frame in which nothing touches, and refuse a press that has ended before it was steady.
+        """Store a frame in which nothing touches. If a press has ended before it was steady, refuse this press.
 
         Args:
             charge_pC: Charges of the frame, shape (n_electrode,), pC.
@@ -284,8 +284,8 @@ class PressWatch:
     def _steady_press(self, reading: Reading) -> SteadyPress | None:
         """Return the press in the window if it is steady; otherwise store the reason and return None.
 
-        Windows with a much larger scatter than earlier windows contain a jerk. The sizes of such windows are not used
-        to determine the law of a decrease, and their reasons are not stored.
+        A window with a much larger scatter than earlier windows contains a sudden movement. The sizes of such windows
+        are not used to determine the law of a decrease, and their reasons are not stored.
 
         Args:
             reading: The latest frame, which has the noise of the charges at rest.

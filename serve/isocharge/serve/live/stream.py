@@ -365,7 +365,9 @@ def _contact_fields(frame: ContactFrame) -> Mapping[str, Any]:
 
 
 def _with_lasting_flags(reading: Reading, skipped_flags: set[str]) -> Reading:
-    """Add those flags of skipped frames to a reading that describe earlier events, such as lost frames.
+    """Add flags of skipped frames to a reading.
+
+    Only flags that describe earlier events, such as lost frames, are added.
 
     Args:
         reading: The reading.

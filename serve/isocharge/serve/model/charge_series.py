@@ -1,4 +1,5 @@
-"""Charges of a film as a Chebyshev series in position and force, and the file `charges.npz` that stores the series.
+"""Chebyshev series in position and force that describes the charges of a film, and the file `charges.npz` of this
+series.
 
 A network maps charges to a contact. If several contacts give the same charges (a fold of the forward map), a network
 cannot distinguish them. The tracker then compares the measured charges with this series:
@@ -182,7 +183,9 @@ def read_contact_range(arrays: Mapping[str, np.ndarray]) -> tuple[float, tuple[f
 
 
 def _check_charges(charges: ChargeSeries) -> None:
-    """Check the charges of contacts on a circle with half of the radius, at several forces.
+    """Check the charges of some contacts.
+
+    The contacts lie on a circle with half of the radius, and have several forces.
 
     Raises:
         ValueError: If the charges overflow, or do not depend on the position or on the force.

@@ -51,7 +51,7 @@ MAX_CHANGE_WITH_PRETENSION = 1e3
 
 @dataclass(frozen=True)
 class FilmDirections:
-    """Directions in which the film is uncertain at a given pretension.
+    """Linear combinations of the unknowns (directions) in which the film is uncertain at a given pretension.
 
     Attributes:
         coefficients: Coefficients of the series, shape (degree + 1, degree + 1, force_degree + 1, n_direction,
@@ -68,7 +68,7 @@ class FilmDirections:
 
     @classmethod
     def none(cls, n_electrode: int) -> "FilmDirections":
-        """Return an empty set of directions, for a model that was calibrated by an earlier version."""
+        """Return an empty set of directions. It is used for a model that was calibrated by an earlier version."""
         no_coefficients = np.zeros((1, 1, 1, 0, n_electrode))
         return cls(no_coefficients, radius_mm=1.0, force_N=(1.0, 2.0), by_pretension=np.zeros(0))
 
@@ -79,13 +79,13 @@ class FilmDirections:
 
     @cached_property
     def _series(self) -> Series:
-        """Series of all directions and electrodes, which are combined in one axis."""
+        """Chebyshev series of every direction and electrode. Directions and electrodes share one axis."""
         return Series(self.coefficients.reshape(*self.coefficients.shape[:3], -1))
 
     def log_changes(self, contact: Array) -> Array:
-        """Compute the changes of ln Q by one unit of each direction.
+        """Compute the changes of ln Q that one unit of each direction causes.
 
-        A contact outside the radius or the range of forces is replaced by the nearest contact inside.
+        A contact outside the valid range (radius and forces) is replaced by the nearest contact inside this range.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.

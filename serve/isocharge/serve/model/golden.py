@@ -1,4 +1,4 @@
-"""Golden vectors of a model: input charges and the outputs that the model computed at the time of export.
+"""Golden vectors of a model, which are input charges and the outputs that the model computed when it was exported.
 
 The checksum shows whether `model.onnx` is still the released file. The outputs show whether another machine or another
 version of onnxruntime computes the same results. A computed output a and a stored output b are the same if
@@ -214,7 +214,7 @@ def _float32_array(rows: Sequence[Sequence[float]]) -> Singles:
 
 
 def check_outputs(golden: Golden, outputs: dict[str, Singles], where: str) -> None:
-    """Compare outputs that a model computed from the golden charges with the stored outputs.
+    """Compare the outputs that a model has computed from the golden charges with the stored outputs.
 
     Args:
         golden: Golden vectors.

@@ -31,7 +31,7 @@ NoiseLevel = Annotated[
 
 
 class ModelNoise(Struct, frozen=True, kw_only=True):
-    """The noise that was added to the charges in the training of a model.
+    """Noise that was added to the charges when the model was trained.
 
     The variance of a charge q is `white_pC`^2 + (`gain` * q)^2.
 
@@ -50,7 +50,10 @@ class ModelNoise(Struct, frozen=True, kw_only=True):
         return np.broadcast_to(self.white_pC, electrodes), np.broadcast_to(self.gain, electrodes)
 
     def variance(self, charge_pC: Array) -> Array:
-        """Return the variance of the noise of charges, both of shape (..., n_electrode), in pC and pC^2."""
+        """Return the variance of the noise of charges.
+
+        Charges (pC) and variances (pC^2) have the shape (..., n_electrode).
+        """
         white_pC = np.asarray(self.white_pC)
         gain = np.asarray(self.gain)
         return np.asarray(white_pC**2 + (gain * charge_pC) ** 2)
@@ -61,7 +64,9 @@ Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 class UnnoticedPresses(Struct, frozen=True, kw_only=True):
-    """Shares of presses outside the working area whose contact is wrong although the model reports no flag.
+    """Shares of the presses outside the working area that the model does not notice.
+
+    The contact of such a press is wrong, but the model reports no flag.
 
     The film between two circles about the origin is divided into rings of equal width, and each ring into equal
     sectors. The first sector begins at the x axis, and the others follow anticlockwise.
@@ -176,7 +181,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
 
     @property
     def label(self) -> str:
-        """Label of the model, `name/version`, which prediction records contain."""
+        """Label of the model in prediction records: `name/version`."""
         return f"{self.name}/{self.version}"
 
     @property
@@ -220,7 +225,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
 
 
 class _Version(Struct):
-    """The version of the format, which metadata of every version contain."""
+    """Version of the format of the metadata. Every version of the format has this key."""
 
     format_version: Annotated[int, Meta(ge=1)]
 

@@ -70,7 +70,7 @@ def find_model(model: str | Path, models: Path | None = None) -> Path:
 
 
 def find_labelled_model(label: str, models: Path | None = None) -> Path:
-    """Find the version folder of a model by a label, `NAME/VERSION`, that was read from a file.
+    """Find the version folder of a model by its label, `NAME/VERSION`. The label was read from a file.
 
     Unlike `find_model`, this function searches only the repositories. The label is never used as a path, because the
     file that contains it may come from an untrusted source.
@@ -126,7 +126,9 @@ def _released_models() -> Path:
 
 
 def _version_folder(path: Path) -> Path | None:
-    """Return the version folder for a path, which is the folder of the highest version if the path is a model folder.
+    """Return the version folder for a path.
+
+    If the path is a model folder, the folder of its highest version is returned.
 
     Args:
         path: Path of a model folder, of a version folder, or of a `model.onnx`.
@@ -409,7 +411,9 @@ def _check_triton_config(path: Path, name: str, electrodes: tuple[str, ...]) -> 
 
 
 def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
-    """Check a new version in the same way as a reader, and compare its metadata with the expected metadata.
+    """Check a new version in the same way as when it is read.
+
+    Its metadata are also compared with the expected metadata.
 
     Args:
         draft: Folder with the files of the new version.

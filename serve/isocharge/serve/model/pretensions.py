@@ -64,7 +64,7 @@ MIN_LENGTH = 1e-12
 
 @dataclass(frozen=True, kw_only=True)
 class Pretensions:
-    """The network of one film at every pretension of a range.
+    """Network of one film for every pretension within a range.
 
     Attributes:
         node_MPa: Pretensions at which the weights are given, shape (k,), MPa, in ascending order.
@@ -117,7 +117,7 @@ class Pretensions:
 
     @property
     def perceptron(self) -> Perceptron[Singles]:
-        """The perceptrons of all k pretensions, with weights of shape (k, n_input, n_output)."""
+        """Perceptrons of all k pretensions. The weights of a layer have the shape (k, n_input, n_output)."""
         *hidden_arrays, skip, bias, weight = self.weights.values()
         hidden = [
             Layer(hidden_weight, hidden_bias[:, None])
@@ -126,7 +126,7 @@ class Pretensions:
         return Perceptron(tuple(hidden), Layer(weight, bias[:, None]), skip, ACTIVATIONS[self.activation])
 
     def interpolation_weights(self, pretension_MPa: Array) -> Array:
-        """Return the weights with which the values at the k pretensions `node_MPa` are interpolated.
+        """Return the weights of the interpolation between the values at the k pretensions `node_MPa`.
 
         The weights are the Lagrange polynomials. The weight of node i is the product of (p - p_j) / (p_i - p_j) over
         all j other than i.
@@ -144,7 +144,7 @@ class Pretensions:
         return np.asarray(np.prod(factors, axis=2, where=is_other_node))
 
     def at(self, node_MPa: Array) -> "Pretensions":
-        """Return the same network with its weights given at other pretensions.
+        """Return the same network with interpolated weights, which belong to other pretensions.
 
         Args:
             node_MPa: Pretensions within `range_MPa`, shape (k,), MPa, in ascending order.
@@ -172,10 +172,10 @@ class Pretensions:
         return np.asarray(np.linalg.norm(vectors, axis=1))
 
     def vectors(self, charge_pC: Array, pretension_MPa: Array) -> Array:
-        """Compute the vectors whose lengths are the misfits of presses at several pretensions.
+        """Compute the misfit vectors of presses at several pretensions. The length of a misfit vector is the misfit.
 
         The vectors are interpolated linearly between the pretensions of `node_MPa`, which must therefore be close to
-        each other. Use `at` to obtain a network with close pretensions.
+        each other. The method `at` returns a network whose pretensions are close to each other.
 
         Args:
             charge_pC: Charges of m presses, shape (m, n_electrode), pC.

@@ -43,7 +43,7 @@ OUTPUT_MEANINGS = {
 
 
 def output_widths(session: ort.InferenceSession) -> dict[str, int]:
-    """Return the names of the outputs of a model and their numbers of columns, in the order of `OUTPUTS`."""
+    """Return the name and the number of columns of each output of a model, in the order of `OUTPUTS`."""
     names = {tensor.name for tensor in session.get_outputs()}
     return {name: width for name, width in OUTPUTS.items() if name in names}
 
@@ -85,7 +85,7 @@ def _decode_texts(session: ort.InferenceSession) -> None:
 
 
 def _single_thread_options() -> ort.SessionOptions:
-    """Return the options of a session that computes in the calling thread, without threads that wait for work."""
+    """Return the options of a session that computes in the calling thread. The session starts no other threads."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
@@ -122,7 +122,7 @@ def run_error(error: Exception) -> ModelError:
 
 
 def check_output_shapes(outputs: Mapping[str, Singles], count: int, where: str) -> None:
-    """Check the shapes of computed outputs, because a graph may declare shapes that differ from the computed ones.
+    """Check the shapes of computed outputs. The declared shapes of a graph may differ from the computed shapes.
 
     Args:
         outputs: Outputs by name.

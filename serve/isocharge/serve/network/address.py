@@ -179,7 +179,9 @@ class Tls:
         return context
 
     def key_and_certificate(self) -> tuple[bytes, bytes]:
-        """Read the files of the key and of the certificate, in the order in which gRPC takes them.
+        """Read the file of the key and the file of the certificate.
+
+        The results have the order in which gRPC takes them.
 
         Raises:
             InputError: If a file cannot be read, or certificate and key do not belong together.
@@ -256,7 +258,7 @@ class ServerLimits:
     connections: int = 1024
 
     def check_body(self, size: int) -> None:
-        """Check the size of a body, or of the part of a body that has arrived.
+        """Check the size of a complete body, or of the part that has arrived.
 
         Raises:
             TooLarge: If the size is above `body_bytes`.

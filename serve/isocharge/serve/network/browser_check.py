@@ -32,7 +32,7 @@ TRUSTED_FETCH_SITES = (b"same-origin", b"none")
 
 
 class BrowserCheck:
-    """Checks that a request was not sent by a page of another site.
+    """Checks whether a request was sent by a page of another site.
 
     Args:
         host: Name or address on which the server listens.
@@ -122,8 +122,8 @@ class BrowserCheck:
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
         """Return whether a request was sent by a page of this server.
 
-        The page belongs to this server if its origin is the requested host. The page also belongs to this server if its
-        origin is an allowed name and a proxy has replaced the `Host`. A page on another port of the requested host
+        The page belongs to this server if its origin is the requested host. If a proxy has replaced the `Host`, the
+        page also belongs to this server if its origin is an allowed name. A page on another port of the requested host
         belongs to another server.
 
         Args:
@@ -175,5 +175,5 @@ def _name_in(url: str) -> str:
 
 
 def _shown(value: bytes) -> str:
-    """Return the value of a header for a message."""
+    """Return the value of a header as text for an error message."""
     return repr(value[:100].decode("latin-1"))

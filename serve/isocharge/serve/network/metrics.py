@@ -67,7 +67,7 @@ class Metrics(Collector):
 
 
 def _model_families(store: ModelStore) -> Iterable[Metric]:
-    """Return one metric with the checksum of each loaded version, and one with the state of every version."""
+    """Return two metrics: the checksum of each loaded version, and the state of every version."""
     info = InfoMetricFamily("isocharge_model", "Loaded versions of the models.", labels=VERSION_LABELS)
     for loaded in store.loaded_versions():
         properties = {"sensor": loaded.metadata.frame_id, "sha256": loaded.model.golden.sha256}

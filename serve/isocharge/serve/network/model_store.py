@@ -1,7 +1,7 @@
 """Store of the models that a server uses: all versions of all models in its folders.
 
-Each version is checked when it is loaded: checksum, metadata, shapes, and the golden vectors, which are computed again.
-A version that fails a check is refused with the reason, and all other versions stay available.
+When a version is loaded, its checksum, its metadata and its shapes are checked, and its golden vectors are computed
+again. A version that fails a check is refused, and the reason is stored. All other versions stay available.
 
 When a model is loaded again, its files are read into new sessions, and one assignment then replaces the old sessions.
 Requests that have begun are finished with the old sessions. If the new files of a version are refused, the old version

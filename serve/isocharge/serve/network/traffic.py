@@ -55,7 +55,7 @@ class Exchange(NamedTuple):
 
 
 class RequestLog(logging.Handler):
-    """Log with one line of JSON for each request and for each message of a logger of Python.
+    """Log in JSON, with one line for each request and one line for each message of the module `logging`.
 
     Args:
         write: Function that takes a line without a line feed. It is called from any thread and must not block.
@@ -92,7 +92,7 @@ class RequestLog(logging.Handler):
         self._write_line(level, event=event, message=self._clean(message))
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write the message of a logger with its traceback."""
+        """Write a message of the module `logging`, and its traceback if there is one."""
         fields = {"event": "message", "logger": record.name, "message": self._clean(record.getMessage())}
         if record.exc_info and record.exc_info[0] is not None:
             fields["traceback"] = self._clean("".join(traceback.format_exception(*record.exc_info)))
@@ -231,7 +231,7 @@ class Statistics:
         return self.presses - self.unchecked
 
     def snapshot(self) -> "Statistics":
-        """Return a copy of all counters at the same moment."""
+        """Return a copy of all counters, which are read at the same moment."""
         with self._lock:
             return replace(self, latency=[*self.latency], stages_ns=[*self.stages_ns], _lock=threading.Lock())
 

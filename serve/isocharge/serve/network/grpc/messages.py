@@ -1,4 +1,4 @@
-"""Messages of `inference.GRPCInferenceService`, and their translation into requests and answers.
+"""Messages of `inference.GRPCInferenceService`, and functions that convert them to requests and answers.
 
 The message classes are built from the compiled `inference.proto` in a separate descriptor pool. A program may therefore
 also use another implementation of the protocol, although its messages have the same names.

@@ -37,7 +37,7 @@ STREAM = "ModelStreamInfer"
 
 @dataclass
 class _Call:
-    """Properties of a call for counters and log.
+    """Properties of a call that the counters and the log need.
 
     Attributes:
         model: Label `name/version` of the requested model; None if the call names no model.
@@ -248,7 +248,7 @@ class Service:
     def _count_open_call(self) -> Iterator[None]:
         """Count a call as open while the block runs.
 
-        If there are too many calls, the call that has waited longest for a message is ended.
+        If there are too many open calls, the server ends the call that has waited longest for a message.
 
         Raises:
             TooMany: If there are too many calls, and no call waits for a message.

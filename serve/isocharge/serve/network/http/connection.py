@@ -4,7 +4,7 @@ A complete request is answered at once in the event loop, because most answers t
 take longer is answered in another thread. Later requests of the same connection wait until its answer is sent.
 
 A timer for each request would cost as much time as parsing the request. Each connection therefore only stores a
-deadline, until which the client must have taken its next step. The server regularly compares all deadlines with the
+deadline. The client must take its next step before this deadline. The server regularly compares all deadlines with the
 clock (`close_overdue`).
 
 A client may send thousands of requests at once, and all connections share one thread. Long data are therefore parsed in
@@ -40,7 +40,7 @@ LINGER_SECONDS = 2.0
 
 
 class Phase(Enum):
-    """The part of a request for which a connection waits. The values are used in error messages."""
+    """Part of a request that a connection is waiting for. The values are used in error messages."""
 
     IDLE = "a request"
     HEADERS = "the end of the headers"
@@ -104,7 +104,7 @@ class Connection(asyncio.Protocol):
         self._is_blocked = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Accept the connection, or refuse it if there are too many connections."""
+        """Accept the connection. If there are too many connections, refuse it."""
         self._transport = transport
         peer = transport.get_extra_info("peername")
         self._client = (str(peer[0]), int(peer[1])) if isinstance(peer, tuple) else None
@@ -160,7 +160,7 @@ class Connection(asyncio.Protocol):
             self._remember(data)
 
     def eof_received(self) -> bool:
-        """Handle the end of the data of the client.
+        """Handle the end of the stream that the client sends.
 
         Returns:
             Whether the connection stays open for further responses.
@@ -247,7 +247,7 @@ class Connection(asyncio.Protocol):
         return parser
 
     def _parse(self, data: bytes) -> None:
-        """Parse a piece of data, and check the size of a request that is still incomplete.
+        """Parse a piece of data. If a request is still incomplete, check its size.
 
         The parser calls the methods `on_...`, which answer each complete request.
         """
@@ -294,10 +294,10 @@ class Connection(asyncio.Protocol):
         self._parse(b"\r\n".join([request_line, *header_lines, b"", data_after_headers]))
 
     def on_message_begin(self) -> None:
-        """Begin a request, whose request line the parser has not yet read.
+        """Begin a request. The parser has not read its request line yet.
 
         The parser does not report where in the present piece of data the request begins. The bytes of the piece are
-        therefore counted only for the request with which the piece begins.
+        therefore only counted for the first request in the piece.
         """
         self._phase = Phase.HEADERS
         self._unchecked_bytes = self._piece_bytes if self._piece_begins_with_request else 0
@@ -405,8 +405,7 @@ class Connection(asyncio.Protocol):
         """Store the head of a request, so that a request with the same head need not be parsed.
 
         Clients send the same head again and again. If the bytes of the head and the size of the body are equal, the
-        parser would give the same result again. Only the head of a request that arrived alone and in one piece is
-        stored.
+        parser would give the same result again. A head is only stored if its request arrived alone and in one piece.
         """
         head, blank_line, body = data.partition(b"\r\n\r\n")
         if body == self._body and self._phase is Phase.IDLE:
@@ -447,7 +446,7 @@ class Connection(asyncio.Protocol):
         self._refuse(refusal(431, f"the request line and headers are longer than {limit} bytes"))
 
     def _refuse(self, response: Response) -> None:
-        """Send a refusal without calling the handler for an answer, and read no more requests.
+        """Send a refusal, and read no more requests. The handler is not called.
 
         The connection is closed when the client closes it, or after `LINGER_SECONDS`.
         """

@@ -51,6 +51,6 @@ def response_bytes(response: Response, *, is_last: bool, with_body: bool = True)
 
 @lru_cache(64)
 def request_path(url: bytes) -> str:
-    """Return the path in the target of a request line, with percent signs decoded."""
+    """Return the path in the target of a request line, after its percent-encoding is decoded."""
     path = httptools.parse_url(url).path or b"/"
     return urllib.parse.unquote_to_bytes(path).decode("utf-8", "replace")

@@ -28,7 +28,7 @@ def server_metadata() -> dict[str, Any]:
 
 
 def model_metadata(loaded: LoadedVersion, store: ModelStore) -> dict[str, Any]:
-    """Return the tensors of a model and, under `properties`, the metadata of its file as JSON texts."""
+    """Return the tensors of a model. The key `properties` contains the metadata of its file as JSON texts."""
     metadata = loaded.metadata
     return {
         "name": metadata.name,

@@ -1,4 +1,5 @@
-"""One inference of the Open Inference Protocol: reading the request, running the model, writing the response.
+"""One inference of the Open Inference Protocol, which consists of reading the request, running the model and writing
+the response.
 
 A body is JSON, which may be followed by binary tensors. If there are binary tensors, a header contains the length of
 the JSON. The gRPC service converts its messages to the same JSON objects and also uses `parse_request`.
@@ -350,7 +351,9 @@ def binary_tensor(rows: Rows) -> bytes:
 
 
 def _json_tensor(name: str, rows: Rows, binary: bytes | None) -> dict[str, Any]:
-    """Return an output as a JSON object with its values, or with the size of the binary tensor that has the values.
+    """Return an output as a JSON object.
+
+    The object contains the values, or the size of the binary tensor with the values.
 
     Args:
         name: Name of the output.

@@ -44,7 +44,7 @@ def openapi_document(routes: Iterable[Route], store: ModelStore) -> Json:
 
 
 def _path_item(path: str, route: Route) -> Json:
-    """Return the description of a path: its parameters, and its method with the request body and the responses.
+    """Return the description of a path, which contains its parameters, its method, the request body and the responses.
 
     Args:
         path: Template of the path.

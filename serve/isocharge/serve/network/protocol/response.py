@@ -1,4 +1,4 @@
-"""HTTP responses as plain values, statuses of errors for HTTP and gRPC, and compression of bodies."""
+"""HTTP responses, the statuses of errors for HTTP and gRPC, and the compression of bodies."""
 
 import gzip
 import logging
@@ -65,7 +65,7 @@ def response_of(status: int, content_type: bytes, body: bytes, error: str | None
 
 
 def json_response(content: Any) -> Response:
-    """Return a response with a value as JSON."""
+    """Return a response whose body is a value in JSON."""
     return response_of(200, b"application/json", orjson.dumps(content))
 
 
