@@ -1,1 +1,1 @@
-"""Calibration of a film: its parameters from a few presses, which of them the presses identify, and its model."""
+"""Calibration of a film: estimates of its parameters from a few presses, and a model of this film."""

@@ -1,4 +1,4 @@
-"""Calibration: from measured presses to the film they were made on, with its remaining uncertainty."""
+"""Estimation of a film and of its remaining uncertainty from measured presses."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -107,7 +107,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
 def _fit_with_friction(
     problem: CalibrationProblem, data: PressData, posterior: FilmPosterior, at_C: float | None
 ) -> tuple[FilmPosterior, SideForceMap]:
-    """Return the estimate of a film from presses with friction, and the effect of side forces on this film.
+    """Estimate a film from presses with friction, and compute the effect of side forces on this film.
 
     Args:
         problem: The films, and the expected coefficient of friction.
@@ -129,7 +129,7 @@ def _fit_with_friction(
 
 
 def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tuple[MeasuredPresses, list[str]]:
-    """Return the presses at positions and forces for which the films have charges, and a caution about the others.
+    """Return the presses within the positions and forces of the films, and a warning about the other presses.
 
     Raises:
         PressError: If most presses lie outside.
@@ -204,9 +204,9 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
 
 
 def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> FilmPosterior:
-    """Return the estimate with a larger covariance, for wrong presses that cannot be recognised among so few.
+    """Increase the covariance of the estimate, because a wrong press cannot be recognised among only a few presses.
 
-    If there is such a press, the film is only known as before the presses. The covariance is the mean of both cases,
+    If one of the presses is wrong, the estimate is no better than the prior. The covariance is the mean of both cases,
     weighted by their probabilities.
 
     Args:
@@ -273,7 +273,7 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
 
 
 def _parameters_at_bounds(problem: CalibrationProblem, posterior: FilmPosterior) -> list[str]:
-    """Return the names of the parameters that are limited by their bounds.
+    """Return the names of the parameters whose estimates lie on a bound.
 
     A pretension of zero is a physical limit and does not count.
     """

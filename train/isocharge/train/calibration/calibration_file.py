@@ -1,8 +1,9 @@
-"""The estimate of a film in calibration.json: its writer, and the reader that checks every number.
+"""Writer and reader of the estimate of a film in `calibration.json`.
 
-The file gives each parameter with its standard deviation, and the correlations of all of them, rounded to six digits. A
-film with a discrepancy has its coefficients besides, with the standard deviations and correlations of parameters and
-coefficients together. A calibration with temperatures has the change of the pretension with temperature.
+The file contains each parameter with its standard deviation. It also contains the correlations of all parameters,
+rounded to six digits. If the film has a discrepancy, the file also contains its coefficients. The standard deviations
+and correlations then refer to the parameters and the coefficients. If temperatures were measured, the file also
+contains the change of the pretension with temperature.
 
 An unknown whose standard deviation is zero is written with correlations of zero to all others. Older versions wrote
 null there, because zero over zero is not a number; the reader takes null for zero in these places.
@@ -91,7 +92,7 @@ def film_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, Any]:
 
 
 def _parameter_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, dict[str, float]]:
-    """Return value and standard deviation of each parameter by its name, in the units of the file."""
+    """Return the value and the standard deviation of each parameter, in the units of the file."""
     units = prior.file_factors
     values = units * posterior.parameters
     stds = units * prior.std * np.sqrt(np.diag(posterior.covariance))
@@ -104,7 +105,7 @@ def _parameter_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, di
 def _correlation_table(covariance: Array) -> list[list[float]]:
     """Return the correlations of a covariance, shape (n, n), rounded to six digits.
 
-    An unknown without variance has a correlation of one with itself and of zero with all others.
+    If the variance of an unknown is zero, its correlations with all other unknowns are zero.
     """
     std = np.sqrt(np.diag(covariance))
     correlations = _over_std(covariance, np.outer(std, std))
@@ -115,7 +116,7 @@ def _correlation_table(covariance: Array) -> list[list[float]]:
 def _discrepancy_table(posterior: FilmPosterior) -> dict[str, Any] | None:
     """Return coefficients, standard deviations and correlations of parameters and coefficients for the file.
 
-    A film that probably has no discrepancy gives None.
+    The result is None if the film probably has no discrepancy.
     """
     if not posterior.imperfect:
         return None
@@ -129,7 +130,8 @@ def _discrepancy_table(posterior: FilmPosterior) -> dict[str, Any] | None:
 def _temperature_table(posterior: FilmPosterior) -> dict[str, Any] | None:
     """Return the change of the pretension with temperature for the file, in C and Pa/K.
 
-    A calibration without temperatures gives None. The correlations are those with the unknowns that the file has.
+    A calibration without temperatures gives None. The table includes the correlations with the other unknowns in the
+    file.
     """
     warming = posterior.warming
     if warming is None:
@@ -391,7 +393,7 @@ def _numbers(path: Path, key: str, rows: list[list[Correlation]], may_be_null: B
 
 
 def _possible(path: Path, correlations: Array) -> Array:
-    """Return a matrix of correlations without the small negative eigenvalues that are caused by rounding.
+    """Replace small negative eigenvalues of a correlation matrix, which are caused by rounding, by zero.
 
     Args:
         path: The file, for the error message.

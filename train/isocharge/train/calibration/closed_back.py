@@ -1,10 +1,10 @@
-"""Recognition of a closed back: presses of a film behind which air is trapped.
+"""Detection of a closed back, behind which air is trapped, from the presses of a film.
 
 A calibration assumes that air can flow out of the space behind the film (a vented back). If the back is closed, the
 trapped air carries a part of the load, and the charges of the electrodes away from the probe are much smaller. No film
 of the prior has such charges, so a calibration describes them by a large discrepancy or refuses the presses. The
 presses are therefore also compared with a few films with a closed back, which are solved directly. This comparison
-takes a few seconds. It is made only if no film with a vented back agrees with the presses.
+takes a few seconds. This comparison is made only if no film with a vented back agrees with the presses.
 """
 
 from dataclasses import replace
@@ -22,8 +22,10 @@ MIN_VENTED_MISFIT = 0.5
 """Misfit of films with a vented back, as `charge_misfit` returns it, below which the back is not examined."""
 
 CAVITY_DEPTH_mm = 20.0
-"""Depth of the cavity behind the films that are compared. Up to a depth of about 200 mm, the trapped air is so stiff
-that the depth hardly matters."""
+"""Depth of the cavity behind the films that are compared.
+
+Up to a depth of about 200 mm, the trapped air is so stiff that the depth hardly matters.
+"""
 
 INTERPOLATED_COUNT = 25
 """Number of pretensions between those of `PRETENSIONS` for which charges are interpolated."""

@@ -1,4 +1,4 @@
-"""Error of contacts that the remaining uncertainty of a film causes, and the presses that would reduce it most.
+"""Errors of contacts that are caused by the uncertainty of a film, and a choice of presses that reduce these errors.
 
 If an estimator assumes a film whose parameters differ by dp from those of the real film, the estimated contact is wrong
 by the change that compensates the difference of the charges best:
@@ -8,12 +8,12 @@ by the change that compensates the difference of the charges best:
 J and P are the derivatives of the charges with respect to the contact and to the parameters, and W is the inverse of
 the noise variance. If the parameters have the covariance C, the errors of the contacts have the covariance G C G'.
 Noise alone causes errors with the covariance (J' W J)^-1, which is the Cramer-Rao limit. The matrix J' W J also
-contains the prior of a contact, which lies in the working area and in the range of forces. The errors are therefore
-finite where the charge map folds.
+contains the prior of a contact. By the prior, the contact lies in the working area and in the range of forces. The
+errors are therefore finite where the charge map folds.
 
-The information that a press adds about the film depends on its contact and hardly on the charges that are measured.
-The best next press can therefore be chosen before it is made. Presses are chosen one after the other, each as the best
-one given the previous ones (a greedy A-optimal design, Pukelsheim 1993).
+The information that a press adds about the film depends on the contact, but hardly on the measured charges. The best
+next press can therefore be chosen before it is made. Presses are chosen one after the other, each as the best one given
+the previous ones (a greedy A-optimal design, Pukelsheim 1993).
 """
 
 from dataclasses import dataclass
@@ -66,7 +66,7 @@ class ContactError:
 
     @classmethod
     def of(cls, covariance: Array) -> "ContactError":
-        """Return the errors for covariances of (x, y, ln F), shape (n, 3, 3)."""
+        """Compute the errors of contacts from the covariances of (x, y, ln F), shape (n, 3, 3)."""
         x_variance, y_variance, log_force_variance = np.einsum("nii->in", covariance)
         position_variance = x_variance + y_variance
         return cls(
@@ -78,7 +78,7 @@ class ContactError:
 
 @dataclass(frozen=True)
 class ContactSensitivity:
-    """Effect of noise and of a wrong film on estimated contacts, linearised at one film.
+    """Linearised effects of noise and of errors of the film's unknowns on estimated contacts.
 
     The unknowns of the film are its parameters, in units of their prior standard deviations, and the coefficients of
     the discrepancy if there is one.
@@ -135,11 +135,11 @@ class ContactSensitivity:
         )
 
     def contact_error(self, covariance: Array) -> ContactError:
-        """Return the errors for a covariance of the film's unknowns."""
+        """Compute the errors of contacts that a covariance of the film's unknowns causes."""
         return ContactError.of(self.contact_covariance(covariance))
 
     def contact_covariance(self, covariance: Array) -> Array:
-        """Return the covariances of (x, y, ln F), shape (n, 3, 3), for a covariance of the film's unknowns."""
+        """Compute the covariances of (x, y, ln F), shape (n, 3, 3), that a covariance of the film's unknowns causes."""
         return np.asarray(self.contact_jacobian @ covariance @ self.contact_jacobian.swapaxes(1, 2))
 
     @property
@@ -163,7 +163,7 @@ class ContactSensitivity:
 
 
 def spread_contacts(domain: Domain, count: int) -> Array:
-    """Return contacts that are spread evenly over the positions and the logarithms of the forces of a domain.
+    """Return contacts whose positions and logarithms of the force are evenly spread over a domain.
 
     The order of the forces is random, so that the force does not depend on the position.
 
@@ -246,7 +246,7 @@ def _information_roots(
 
 @dataclass(frozen=True)
 class ProposedPress:
-    """A press to make, and the errors that are expected after it.
+    """A proposed press, and the errors that are expected after this press.
 
     Attributes:
         x_mm: Position along x, mm.
@@ -317,7 +317,7 @@ def next_presses(
 
 
 def _candidates(radius: float, force_range: tuple[float, float], avoid_mm: Array) -> Array:
-    """Return the presses that are compared, with rounded positions and forces that a person can set.
+    """Return the candidates for the next press, with positions and forces rounded so that a person can set them.
 
     Args:
         radius: Largest distance of a press from the centre, mm.

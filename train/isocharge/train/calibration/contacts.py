@@ -1,8 +1,8 @@
 """Contacts of the presses of a calibration, adjusted to both the measurements of the rig and the charges.
 
 A rig measures the position and the force of a press with some uncertainty, or does not measure one of them at all. For
-a given film, the adjusted contact is the contact with the smallest sum of squared residuals of the charges and of the
-measurements of the rig. These residuals show how well the film explains the press.
+a given film, the adjusted contact minimises the sum of the squared residuals. The residuals are those of the charges
+and those of the measurements of the rig. These residuals show how well the film explains the press.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,7 +43,7 @@ class AdjustedContacts(NamedTuple):
 
 
 def derivatives_with_adjusted_contacts(by_unknowns: Array, by_contact: Array) -> Array:
-    """Return the derivatives of the residuals of presses whose contacts are adjusted again when the unknowns change.
+    """Compute the derivatives of the residuals if the contacts are adjusted again after each change of the unknowns.
 
     A small change of the unknowns moves the adjusted contact, so that the sum of squared residuals stays minimal. The
     part of the derivatives that this movement compensates is subtracted (Golub and Pereyra 1973).
@@ -140,7 +140,7 @@ def neighbouring_films(charges: FilmCharges, unknowns: Array, data: PressData) -
 
 
 def _interpolated(film_values_and_slopes: list[tuple[Array, Array]], shares: Array) -> tuple[Array, Array]:
-    """Return values and derivatives at presses, interpolated between neighbouring films.
+    """Interpolate the values and derivatives at presses between neighbouring films.
 
     Args:
         film_values_and_slopes: Values and derivatives on each of k films, as `_values_and_slopes` returns them.
@@ -194,12 +194,12 @@ def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tu
 
 
 def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> Array:
-    """Return the contacts at which the search for the adjusted contacts begins.
+    """Return the initial contacts of the search for the adjusted contacts.
 
-    The search begins at the contact that the rig measured. If the position of a press is unknown, the search begins at
-    the one of `CANDIDATE_POSITIONS` positions at which the ratios between the charges of the film are closest to the
-    measured ratios. The ratios hardly depend on the stiffness and on the coefficients of the film, which are not known
-    yet.
+    The search begins at the contact that the rig measured. If the position of a press is unknown, `CANDIDATE_POSITIONS`
+    positions are compared. The search begins at the position where the ratios between the charges of the film are
+    closest to the measured ratios. The ratios hardly depend on the stiffness and on the coefficients of the film, which
+    are not known yet.
 
     Args:
         charges: The films.

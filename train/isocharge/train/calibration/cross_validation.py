@@ -30,7 +30,7 @@ MAX_FITTED_PRESSES = 250
 
 @dataclass(frozen=True)
 class HeldOutAnswers:
-    """Measured presses, and the answers of networks for films that were fitted without these presses.
+    """Measured presses, and the contacts that networks estimate for them after a fit without these presses.
 
     Attributes:
         presses: The measured presses.
@@ -43,7 +43,7 @@ class HeldOutAnswers:
 
     @property
     def errors(self) -> dict[str, float]:
-        """Errors of the position, mm, and of the force, %, by the names of `model_release.evaluate`."""
+        """Errors of the position, mm, and of the force, %. The keys are those of `model_release.evaluate`."""
         contact, std, _ = self.answers
         all_errors = contact_errors(contact, std, self.presses.contact)
         return {name: error for name, error in all_errors.items() if name not in ONLY_SIMULATED}
@@ -57,7 +57,7 @@ def cross_validate(
     network_of: Callable[[FilmPosterior], Fitted],
     at_C: float | None = None,
 ) -> HeldOutAnswers | None:
-    """Answer measured presses with networks of films that were fitted without these presses.
+    """Estimate the contacts of measured presses with networks of films that were fitted without these presses.
 
     Args:
         problem: Films that the sensor may have.

@@ -1,4 +1,4 @@
-"""Search for the mistake because of which no film explains the presses of a calibration.
+"""Search for a mistake in the presses of a calibration that no film explains.
 
 The mistakes that are considered are swapped columns, rotated or mirrored axes, and other units. The presses are
 corrected for each mistake in turn and compared with a few films. An error message names the mistakes whose correction
@@ -33,7 +33,7 @@ MIN_POSITION_RANGE_MM = 0.05
 
 
 class OtherUnit(NamedTuple):
-    """Unit in which values may have been written by mistake.
+    """Unit that may have been used by mistake.
 
     Attributes:
         values: Name of the values.
@@ -160,7 +160,7 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
 
 def _charge_ratios(charge: Array) -> Array:
-    """Return the ratio of the median charge of each channel to that of the other channels.
+    """Return the median charge of each channel divided by the median charge of the other channels.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC; NaN where none was measured.
@@ -256,7 +256,7 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
 
 
 class Correction(NamedTuple):
-    """Presses without a mistake that they may have.
+    """Presses after the correction of a possible mistake.
 
     Attributes:
         sentence: Description of the mistake.
@@ -270,7 +270,7 @@ class Correction(NamedTuple):
 
 
 def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[Correction]:
-    """Yield the presses without each of the mistakes that are considered.
+    """Yield the presses after the correction of each mistake that is considered.
 
     Args:
         presses: The measured presses, with place and force.
@@ -300,8 +300,8 @@ def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterat
 def _fitting_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
     """Find the orders of the electrodes with which the charge columns agree best with films.
 
-    For each film with one of `PRETENSIONS`, the columns are assigned to the electrodes such that the squared
-    differences of the logarithms of the charges are smallest.
+    For each of `PRETENSIONS`, the columns are assigned to the electrodes of a film with this pretension. The assignment
+    minimises the squared differences between the logarithms of measured and expected charges.
 
     Args:
         presses: The measured presses, with place and force.

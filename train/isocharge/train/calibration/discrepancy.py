@@ -6,10 +6,10 @@ the logarithm l of the force:
 
     ln Q_e = ln Q_e(map) + sum c_eijm T_i(x / r) T_j(y / r) T_m(l),    i + j + m <= degree, m <= 2.
 
-The coefficients have the mean zero and the standard deviation s FADING^(i + j + m). A further part is the same for all
-electrodes, because all charges are smaller where a film is stiffer than its parameters imply. The standard deviation of
-this part is COMMON times as large. The size s is unknown. The module `hypotheses` computes the probabilities of several
-sizes from the presses.
+The coefficients have the mean zero and the standard deviation s FADING^(i + j + m). Another part of the discrepancy is
+the same for all electrodes. It is needed because all charges are smaller where a film is stiffer than its parameters
+imply. The standard deviation of this part is COMMON times as large. The size s is unknown. The module `hypotheses`
+computes the probabilities of several sizes from the presses.
 """
 
 from functools import cache
@@ -42,7 +42,7 @@ area, the error of this approximation is below the noise."""
 
 
 def terms(contact: Array, domain: Domain) -> Array:
-    """Compute the polynomials of the discrepancy, times the standard deviations of their coefficients for s = 1.
+    """Compute the polynomials of the discrepancy, each times the standard deviation of its coefficient for s=1.
 
     For a contact outside the domain, the values at the nearest contact of the domain are returned.
 

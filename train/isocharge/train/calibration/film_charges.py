@@ -66,7 +66,7 @@ class FilmCharges:
 
     @cached_property
     def modes(self) -> tuple[str, ...]:
-        """Names of the modes that these films have; none in a family without solved modes."""
+        """Names of the modes of these films. There are none if no modes of the family were solved."""
         return tuple(MODES) if self.family.imperfections else ()
 
     @cached_property
@@ -81,7 +81,10 @@ class FilmCharges:
 
     @cached_property
     def _is_uneven_tension(self) -> Booleans:
-        """Which modes are an uneven tension, shape (n_mode,). To second order, they act like a lower mean tension."""
+        """Which modes are an uneven tension, shape (n_mode,).
+
+        To second order, these modes act like a lower mean tension.
+        """
         return np.array([MODES[name].is_uneven_tension for name in self.modes], dtype=bool)
 
     @property
@@ -265,11 +268,11 @@ class FilmCharges:
         return np.column_stack([position, force])
 
     def by_parameter(self, unknowns: Array, contact: Array, by_contact: Array) -> Array:
-        """Compute the derivatives of the charges with respect to the parameters and, if given, the coefficients.
+        """Compute the derivatives of the charges with respect to the unknowns of the film.
 
-        The charges are E q(F / (E h a), T / E, h / a) with the pretension T, and linear in d31 and d32. The derivatives
-        with respect to the scales are therefore exact, and the others are finite differences. Small changes of
-        electrodes, coefficients and probe are assumed not to change the factor of the modes.
+        With the pretension T, the charges have the form E q(F / (E h a), T / E, h / a). They are linear in d31 and d32.
+        The derivatives with respect to the scales are therefore exact, and the others are finite differences. Small
+        changes of electrodes, coefficients and probe are assumed not to change the factor of the modes.
 
         Args:
             unknowns: Parameters of the film, shape (n_parameter,), or parameters and coefficients, shape
@@ -375,10 +378,10 @@ class FilmCharges:
         return {name: derivative / np.maximum(factor, MIN_FACTOR) for name, derivative in derivatives.items()}
 
     def _trace_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
-        """Compute the derivatives of ln(factor of traces) with respect to the parameters that are not in the load.
+        """Compute the derivatives of ln(factor of traces) with respect to the parameters that do not change the load.
 
         These are the piezoelectric coefficients, the place of the electrodes and the radius of the probe. A trace and
-        its electrode lie at different places, so that their charges change by different shares.
+        its electrode lie at different places, so the relative changes of their charges are different.
 
         Args:
             unknowns: Parameters and coefficients of the film.

@@ -35,7 +35,7 @@ LEAST_VARIANCE = 1e-12
 
 
 def film_directions(result: CalibrationResult) -> FilmDirections:
-    """Compute the directions of the uncertainty that a calibrated film has when it is used."""
+    """Compute the directions in which a calibrated film is uncertain when it is used."""
     problem = result.problem
     estimate = result.posterior.drifted(problem.prior)
     pretension = problem.prior.index("pretension")

@@ -1,8 +1,8 @@
-"""The film that explains measured presses, robust to bad presses.
+"""Robust estimation of the film that explains measured presses.
 
 `FitProblem` solves the least-squares problem. A press whose residual is larger than noise can explain gets a lower
-weight (Student's t distribution, Lange et al. 1989), so that a single bad press does not change the film. Presses that
-are then still too far off are left out and named.
+weight (Student's t distribution, Lange et al. 1989), so that a single bad press does not change the film. Presses whose
+residuals are still too large are then left out and reported.
 """
 
 from dataclasses import dataclass, field, replace
@@ -34,8 +34,10 @@ SUSPICIOUS_PROBABILITY = 0.01
 """Probability of the residuals, if all presses are good, below which bad presses are searched for."""
 
 MAX_BAD_SHARE = 0.34
-"""Largest fraction of the presses that is left out. If more presses disagree, all presses are kept, because it is then
-uncertain which of them are wrong."""
+"""Largest fraction of the presses that is left out.
+
+If more presses disagree, all presses are kept, because it is then uncertain which of them are wrong.
+"""
 
 MIN_PRESSES_TO_JUDGE = 4
 """Smallest number of presses from which it can be determined which of them are bad."""
@@ -44,8 +46,10 @@ MISTAKE_PROBABILITY = 0.01
 """Probability that a press is recorded wrongly."""
 
 LOG_DENSITY_OF_MISTAKE = -3.0
-"""Logarithm of the probability density of each charge of a press that is recorded wrongly, in units of the noise. The
-charge may then be wrong by up to twenty standard deviations."""
+"""Logarithm of the probability density of each charge of a press that is recorded wrongly, in units of the noise.
+
+The charge may then be wrong by up to twenty standard deviations.
+"""
 
 PROBABLE = 0.5
 """Probability above which an effect is reported."""
@@ -127,7 +131,7 @@ def fit_film(
     *,
     friction: float = 0.0,
 ) -> FilmPosterior:
-    """Estimate the film from presses, of which some may be bad.
+    """Estimate the film from presses, some of which may be bad.
 
     Args:
         charges: The films.
@@ -168,7 +172,7 @@ def refit_film(
     *,
     friction: float = 0.0,
 ) -> FilmPosterior:
-    """Estimate the film from presses again, starting from a previous estimate from similar presses.
+    """Estimate the film again, starting from a previous estimate that was made from similar presses.
 
     The search begins at the previous estimate with its most probable hypothesis, so it takes less time than
     `fit_film`.
@@ -254,7 +258,7 @@ def _agreeing_presses(
 
 
 def _log_density_of_mistakes(data: PressData, is_mistake: Booleans) -> float:
-    """Return the logarithm of the probability density of presses that were recorded wrongly.
+    """Return the logarithm of the probability density of a press that was recorded incorrectly.
 
     Args:
         data: The presses.
@@ -267,7 +271,7 @@ def _log_density_of_mistakes(data: PressData, is_mistake: Booleans) -> float:
 def _posterior(
     problem: FitProblem, data: PressData, degrees_of_freedom: Array, settled: SettledFit, at_C: float | None
 ) -> FilmPosterior:
-    """Return the estimate of the film from a settled fit.
+    """Compute the estimate of the film from a fit that has settled.
 
     Args:
         problem: The least-squares problem.
@@ -307,7 +311,7 @@ def _posterior(
 
 
 def _nuisance_estimates(layout: UnknownLayout, unknowns: Array, covariance: Array) -> dict[str, NuisanceEstimate]:
-    """Return value and standard deviation of each nuisance, by its name."""
+    """Return the value and the standard deviation of each nuisance by its name."""
     values = unknowns[layout.nuisances].tolist()
     stds = np.sqrt(np.diag(covariance)[layout.nuisances]).tolist()
     return {

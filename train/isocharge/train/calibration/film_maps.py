@@ -66,7 +66,7 @@ class FilmMaps:
     def forward_map(self, parameters: Array) -> ForwardMap:
         """Return the forward map of one film.
 
-        Films that differ only in piezoelectric coefficients, gains and electrodes have the same stresses. The last few
+        If films differ only in piezoelectric coefficients, gains and electrodes, their stresses are equal. The last few
         stresses are cached.
 
         Args:

@@ -1,4 +1,4 @@
-"""Least-squares problem of a calibration: the unknowns of a film that explain presses, with the prior of the films.
+"""Least-squares problem of a calibration, whose solution is the film that explains presses best.
 
 The unknowns minimise
 
@@ -91,7 +91,7 @@ class SolvedFilm(NamedTuple):
 
 
 class SettledFit(NamedTuple):
-    """A fit in which neither the film nor the selection of presses changes any more.
+    """A fit after which neither the film nor the selection of presses changes any more.
 
     Attributes:
         is_kept: Which presses are kept, shape (n,).
@@ -189,7 +189,11 @@ class FitProblem:
         latest: list[tuple[Array, SolvedFilm]] = []
 
         def film_at(active_unknowns: Array) -> SolvedFilm:
-            """Adjust the contacts to a film. The latest film is stored, because SciPy asks for each film twice."""
+            """Adjust the contacts to a film.
+
+            The latest film is stored, because SciPy evaluates the residuals and the derivatives of each film
+            separately.
+            """
             if latest and np.array_equal(latest[0][0], active_unknowns):
                 return latest[0][1]
             unknowns = self.mean.copy()
@@ -232,10 +236,10 @@ class FitProblem:
         solved: SolvedFilm,
         hypothesis: Hypothesis,
     ) -> SettledFit:
-        """Repeat the fit until the film and the selection of presses no longer change, for `MAX_ROUNDS` at most.
+        """Repeat the fit until the film and the selection of presses no longer change, at most `MAX_ROUNDS` times.
 
-        Each round fits the film with the most probable hypothesis of the previous round. It readmits presses that were
-        left out before and agree with the film now.
+        Each round fits the film with the most probable hypothesis of the previous round. Presses that were left out
+        before are used again if they now agree with the film.
 
         Args:
             data: All presses.
@@ -281,7 +285,7 @@ class FitProblem:
         return np.asarray(chi2 <= limit)
 
     def mixture(self, data: PressData, solved: SolvedFilm) -> Mixture:
-        """Return the estimate of the unknowns from presses over all hypotheses, within the bounds.
+        """Estimate the unknowns from presses, averaged over all hypotheses and within the bounds.
 
         The residuals are linearised about a film that explains the presses.
 
@@ -312,7 +316,7 @@ class FitProblem:
         return mixture._replace(mean=bounded - self.mean)
 
     def adjusted_contacts(self, unknowns: Array, data: PressData, start: Array | None = None) -> AdjustedContacts:
-        """Return the contacts of the presses that fit a film best.
+        """Return the contact of each press that agrees best with a film.
 
         Args:
             unknowns: Unknowns of the film, shape (n_unknown,).
@@ -406,7 +410,7 @@ class FitProblem:
 
 
 def _most_probable_within(bounds: tuple[Array, Array], mean: Array, covariance: Array) -> Array:
-    """Return the most probable unknowns within bounds for a normal distribution, shape (n_unknown,).
+    """Return the most probable unknowns of a normal distribution within bounds, shape (n_unknown,).
 
     The unknown that is farthest beyond its bound is moved onto the bound, and the others change by their correlation
     with it. This is repeated until no unknown is beyond its bound.

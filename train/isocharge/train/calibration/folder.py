@@ -1,4 +1,4 @@
-"""Folder of a calibrated film: its writer, and the reader of an earlier calibration.
+"""Writer and reader of the folder of a calibrated film.
 
     FOLDER/config.pbtxt            configuration for Triton
     FOLDER/<version>/model.onnx    the model of this film, with golden.json and card.md as in every model
@@ -80,7 +80,7 @@ def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
 
 @contextmanager
 def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[None]:
-    """Lock a folder for a calibration in the block.
+    """Lock a folder for a calibration as long as the `with` block runs.
 
     Before the block, unfinished files of a process that was killed are removed, and the copies of the last version are
     written again.
@@ -123,7 +123,7 @@ def _publish(folder: Path) -> None:
 
 
 def _calibrated_versions(folder: Path) -> list[Path]:
-    """Return the version folders that contain a calibration, the last version at the end."""
+    """Return the version folders that contain a calibration, in ascending order."""
     return [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
 
 
@@ -173,7 +173,7 @@ def _release(result: CalibrationResult, folder: Path, command: str) -> Path:
 
 
 def result_table(result: CalibrationResult) -> dict[str, Any]:
-    """Return a calibration as a table for JSON: estimates, quantities, errors, and the presses that were left out."""
+    """Return a calibration as a table for JSON."""
     film = film_table(result.problem.prior, result.posterior)
     return {
         "format_version": film.pop("format_version"),
@@ -253,7 +253,8 @@ def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> Calibr
 def _read(folder: Path, problem: CalibrationProblem) -> tuple[Path, FilmEstimate]:
     """Return the path of the file of an earlier calibration, and the film in this file.
 
-    The file is that of the last version in the folder, or that in the folder itself if it is a version folder.
+    If the folder is a version folder, its own file is used. Otherwise, the file of the last version in the folder is
+    used.
     """
     versions = _calibrated_versions(folder)
     version_folder = versions[-1] if versions else folder
@@ -303,7 +304,7 @@ combinations above are known; `calibration.json` has their correlations.
 
 
 def _errors_section(result: CalibrationResult, about: ModelMetadata) -> str:
-    """Return the table of errors, and the sentences about the presses on which they were measured."""
+    """Return a table of errors, and sentences about the presses on which these errors were measured."""
     introduction = "On new simulated presses on the film as calibrated, with noise:"
     conclusion = (
         "What not knowing the film leaves is added to these errors; `contact_std` contains it, as a common factor."

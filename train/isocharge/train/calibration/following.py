@@ -77,7 +77,7 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
 
 
 def _networks_at(pretensions_MPa: Array, result: CalibrationResult, network: FoldedNetwork) -> list[FoldedNetwork]:
-    """Return networks for the calibrated film with other pretensions.
+    """Return one network for each pretension, with the other parameters of the calibrated film.
 
     Args:
         pretensions_MPa: The pretensions, shape (n,), MPa.
@@ -134,7 +134,7 @@ def _nodes(calibrated: float, lower: float, upper: float) -> Array:
 
 
 def _with_correlations_of(network: FoldedNetwork, other: FoldedNetwork) -> FoldedNetwork:
-    """Return another network with the correlations of the model, which hardly change with the pretension.
+    """Replace the correlations of a network by those of the model, because they hardly change with the pretension.
 
     Args:
         network: Network of the model.
@@ -170,11 +170,10 @@ def _constants(network: FoldedNetwork) -> list[str]:
 
 
 def _floor(result: CalibrationResult) -> float:
-    """Compute the standard deviation of the followed pretension that remains after very many touches, MPa.
+    """Compute the standard deviation that the estimated pretension still has after very many touches, MPa.
 
-    The followed pretension is the pretension that explains the touches best together with the other calibrated
-    parameters. These parameters have errors, which cause an error of the followed pretension even if the film has not
-    changed.
+    The service estimates the pretension that explains the touches best together with the other calibrated parameters.
+    Errors of these parameters cause an error of the estimated pretension even if the film has not changed.
 
     Args:
         result: The calibration.

@@ -1,4 +1,4 @@
-"""Hypotheses about effects on the presses of a session besides the parameters of the film, and their probabilities.
+"""Hypotheses about further effects on the presses of a session, and the probabilities of these hypotheses.
 
 The film may have imperfections (modes), a discrepancy of some size, and traces that are missing in the sensor file. The
 session may have nuisances, and the stated forces may scatter. Each combination of these effects is a hypothesis. Traces
@@ -61,7 +61,7 @@ class Hypothesis:
     traces: float = 0.0
 
     def covariance(self, layout: UnknownLayout) -> Array:
-        """Return the covariance of the unknowns that describe the effects of the hypothesis, before the presses.
+        """Return the prior covariance of the unknowns that describe the effects of the hypothesis.
 
         Args:
             layout: Layout of the unknowns.
@@ -130,7 +130,7 @@ def hypotheses() -> Iterator[Hypothesis]:
 
 
 class LinearModel(NamedTuple):
-    """Linear dependence of the residuals of presses on the unknowns, in the form of normal equations.
+    """Normal equations of a linear model of the residuals of presses.
 
     If u is the deviation of the unknowns from their mean before the presses, the sum of squared residuals is
     `square` + 2 `moment` u + u `normal` u.
@@ -147,7 +147,7 @@ class LinearModel(NamedTuple):
 
     @classmethod
     def of(cls, jacobian: Array, residual: Array, deviation: Array) -> "LinearModel":
-        """Return the model of residuals whose values and derivatives are known at one point.
+        """Create the linear model of residuals from their values and derivatives at one point.
 
         Args:
             jacobian: Derivatives of the residuals with respect to the unknowns, shape (n, n_unknown).
@@ -164,7 +164,7 @@ class LinearModel(NamedTuple):
     def with_added_noise(
         self, jacobian: Array, residual: Array, deviation: Array, noise_variance: Array
     ) -> "LinearModel":
-        """Return the model of the same residuals with additional noise along some orthogonal directions.
+        """Add noise along some orthogonal directions to the residuals of the model.
 
         Noise of the variance v reduces the weight of the squared residual along its direction from 1 to 1 / (1 + v).
 
@@ -184,7 +184,7 @@ class LinearModel(NamedTuple):
         )
 
     def log_evidence(self, prior_covariance: Array) -> float:
-        """Return the logarithm of the evidence of the presses, except for a constant.
+        """Return the logarithm of the evidence of the presses, up to a constant.
 
         Args:
             prior_covariance: Covariance of the unknowns before the presses, shape (n_unknown, n_unknown).
@@ -227,7 +227,7 @@ class LinearModel(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """Solved normal equations, for unknowns in units in which their covariance before the presses is 1.
+    """Solution of normal equations for unknowns whose covariance before the presses is the identity matrix.
 
     Attributes:
         active: Which unknowns have a variance before the presses, shape (n_unknown,).

@@ -21,8 +21,10 @@ TRACE_STD_MM = 0.5
 """Prior standard deviation of the width of a trace that is not described, mm."""
 
 TRACE_END = 0.93
-"""Distance from the centre at which such traces end, relative to the film's radius. The last millimetres before the rim
-contribute little charge."""
+"""Distance from the centre at which such traces end, relative to the film's radius.
+
+The last millimetres before the rim contribute little charge.
+"""
 
 LARGEST_SQUARED_RATIO = 0.9
 """Largest squared ratio of the uneven part of the tension to the mean tension."""
@@ -79,7 +81,7 @@ def trace_lines(sensor: Sensor) -> Array:
 
 
 def trace_charges(forward_map: ForwardMap, lines: Array, contact: Array) -> Array:
-    """Compute the charges that traces of the width `TRACE_STD_MM` collect, for each line.
+    """Compute the charge that a trace of the width `TRACE_STD_MM` collects along each line.
 
     Args:
         forward_map: Forward map of the film.

@@ -1,4 +1,4 @@
-"""Nuisances of a session: unknowns of the fit that are not properties of the film, such as an offset of the charges.
+"""Nuisances of a session, which are unknowns of the fit that are not properties of the film.
 
 `NUISANCES` declares each nuisance once: its name and unit, its standard deviation before the presses, and its effect on
 the charges or on the pretension. All effects are proportional to the value of the nuisance, so that the derivatives
@@ -27,7 +27,7 @@ class NuisanceEstimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Nuisance:
-    """Declaration of a nuisance. A subclass for each kind defines its effect.
+    """Declaration of a nuisance. Each kind of nuisance is a subclass that defines the effect of the nuisance.
 
     Attributes:
         name: Name of the nuisance.
@@ -64,23 +64,26 @@ class Nuisance:
 
 
 class PretensionPerKelvin(Nuisance):
-    """Change of the pretension with temperature, because film and ring expand differently."""
+    """Change of the pretension with temperature, which occurs because film and ring expand differently."""
 
     def tension_change(self, data: PressData, value: float) -> Array:
-        """Return the change relative to the mean temperature of the presses."""
+        """Return the change of the pretension relative to that at the mean temperature of the presses."""
         return value * data.warming_K
 
 
 class PretensionPerFilmExcess(Nuisance):
-    """Change of the pretension per kelvin that the film is warmer than its ring, because a warm film slackens."""
+    """Change of the pretension for each kelvin by which the film is warmer than its ring.
+
+    A film that is warmer than its ring slackens.
+    """
 
     def tension_change(self, data: PressData, value: float) -> Array:
-        """Return the change relative to the mean difference between the temperatures of film and ring."""
+        """Return the change of the pretension relative to that at the mean temperature difference."""
         return value * data.film_excess_K
 
 
 class ChargeOffset(Nuisance):
-    """Common offset of all charges, as from a wrong tare."""
+    """Common offset of all charges, for example because of a wrong tare."""
 
     def charge_error(self, data: PressData, value: float) -> Array:
         """Return the offset for every charge."""
@@ -98,7 +101,7 @@ class ChargeDrift(Nuisance):
     """Proportional drift of all charges from the first press to the last."""
 
     def charge_error(self, data: PressData, value: float) -> Array:
-        """Return a share of each charge, from minus half the drift at the first press to plus half at the last."""
+        """Return the drift of each charge, from minus half the drift at the first press to plus half at the last."""
         return value * data.session_time[:, None] * data.charge
 
     def gain_std(self, estimate: NuisanceEstimate) -> float:
@@ -122,16 +125,23 @@ class Friction(Nuisance):
 
 
 PRETENSION_PER_KELVIN = PretensionPerKelvin("pretension_per_K", "MPa/K", std_with_temperatures=0.4)
-"""Change of the pretension with temperature. Its standard deviation before the presses is E da / (1 - nu), which is
-0.3 to 0.44 MPa/K on aluminium."""
+"""Change of the pretension with temperature.
+
+Its standard deviation before the presses is E da / (1 - nu), which is 0.3 to 0.44 MPa/K on aluminium.
+"""
 
 PRETENSION_PER_FILM_EXCESS = PretensionPerFilmExcess("pretension_per_film_K", "MPa/K", std_with_temperatures=0.6)
-"""Change of the pretension per kelvin of the film above its ring. Its standard deviation before the presses exceeds
-E a / (1 - nu), which is 0.4 to 0.55 MPa/K."""
+"""Change of the pretension per kelvin of the film above its ring.
+
+Its standard deviation before the presses exceeds E a / (1 - nu), which is 0.4 to 0.55 MPa/K.
+"""
 
 FRICTION = Friction("friction", "1")
-"""Coefficient of friction of the tip. It is zero unless the calibration states an expected coefficient
-(`CalibrationProblem.friction`), which is then also its standard deviation before the presses."""
+"""Coefficient of friction of the tip.
+
+It is zero unless the calibration states an expected coefficient (`CalibrationProblem.friction`), which is then also its
+standard deviation before the presses.
+"""
 
 NUISANCES: tuple[Nuisance, ...] = (
     PRETENSION_PER_KELVIN,
@@ -158,7 +168,7 @@ def film_warming_sentences(estimates: Mapping[str, NuisanceEstimate]) -> Iterato
 
 
 def without_nuisances(data: PressData, values: Sequence[float] | Array) -> PressData:
-    """Return the presses without the charges of the nuisances, and with the pretension during each press.
+    """Subtract the charges of the nuisances from presses, and set the pretension during each press.
 
     Args:
         data: The presses as they were measured.

@@ -1,4 +1,4 @@
-"""Picture of a calibration: maps of the remaining error before and after, quantities with intervals, and residuals."""
+"""Picture of a calibration with maps of the contact error, intervals of the quantities, and residuals."""
 
 from typing import Any
 
@@ -52,7 +52,7 @@ def calibration_picture(result: CalibrationResult) -> Figure:
 
 
 def _draw_error(axes: Any, result: CalibrationResult, error: ContactError, title: str) -> Any:
-    """Draw a map of the position error that the uncertainty of the film causes, and the electrodes.
+    """Draw the electrodes, and a map of the position error that the uncertainty of the film causes.
 
     Args:
         axes: Axes of matplotlib.

@@ -97,7 +97,7 @@ class PressData:
         return np.asarray(position.all(axis=1))
 
     def with_force_scatter(self, share: float) -> "PressData":
-        """Return the presses with an additional uncertainty of their forces.
+        """Return the presses with a larger uncertainty of their forces.
 
         Args:
             share: Relative standard deviation that is added to that of the rig.
@@ -120,7 +120,7 @@ class PressData:
         return derivative
 
     def pretension_nodes(self, pretension: float, bounds: tuple[float, float]) -> tuple[Array, Array]:
-        """Return pretensions at which charges are computed, and with which weights they are interpolated.
+        """Return the pretensions at which charges are computed, and the weights for the interpolation between them.
 
         Args:
             pretension: Pretension of the film, MPa.

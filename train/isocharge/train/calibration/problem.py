@@ -1,4 +1,4 @@
-"""Problem of a calibration: the described film, and the network that was trained for all films of its layout."""
+"""Problem of a calibration, which contains the prior of the films and the network for all of these films."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -79,7 +79,7 @@ class Warming(NamedTuple):
         return self.std <= MAX_IDENTIFIED_STD_RATIO * PRETENSION_PER_KELVIN.std_with_temperatures
 
     def with_unknowns(self, count: int) -> "Warming":
-        """Return the change with the covariances of another number of unknowns.
+        """Return the change of the pretension with covariances for another number of unknowns.
 
         Args:
             count: Number of unknowns. The last unknowns are removed, or unknowns without a covariance are added.
@@ -119,7 +119,7 @@ class FilmEstimate:
         return self.joint if self.coefficients.size else self.covariance
 
     def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> "FilmEstimate":
-        """Return the estimate for a later time. Its covariance includes the drift that the film may have had.
+        """Return the estimate for a later time. The covariance includes the drift that the film may have had.
 
         Args:
             prior: Distribution of the films.
@@ -269,7 +269,7 @@ class CalibrationProblem:
         network_map = self.films.forward_map(parameters)
 
         def charge_factor(contact: Array) -> Array:
-            """Return the charges of the film over those for which the network was trained, shape (n, n_electrode)."""
+            """Return the ratio of the film's charges to those of the training, shape (n, n_electrode)."""
             if self.prior is self.films.prior:
                 return factor(contact)
             electrode_factor = sensor_map.charges(contact) / network_map.charges(contact)
@@ -285,7 +285,7 @@ class CalibrationProblem:
 
     @cached_property
     def proposed_forces(self) -> tuple[float, float]:
-        """Smallest and largest force of a proposed press, N: the forces of the domain within the stress limit.
+        """Smallest and largest force of a proposed press, N, which are within the domain and the stress limit.
 
         Raises:
             SceneError: If the smallest force already exceeds the limit.
@@ -366,7 +366,7 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
 
 
 def _with_electrodes(prior: FilmPrior, sensor: Sensor) -> FilmPrior:
-    """Return the prior with the electrodes of a sensor, if their pads are equal to those of the prior.
+    """Replace the electrodes of the prior by those of a sensor, if the pads of both are equal.
 
     The electrodes of the sensor may have traces and patterned backs.
     """
@@ -381,7 +381,9 @@ def _pads(sensor: Sensor) -> dict[str, list[list[float]]]:
 
 
 def _folders(models: Path | None, name: str) -> list[Path]:
-    """Return the version folders that contain a network for films. Folders of models named after the sensor are first.
+    """Return the version folders that contain a network for all films.
+
+    The folders of models that have the name of the sensor come first.
 
     Args:
         models: Folder of models that is searched first.

@@ -1,8 +1,8 @@
-"""Quantities of a film that presses can identify: products and ratios of parameters besides single parameters.
+"""Quantities of a film that presses can identify, such as products and ratios of parameters.
 
 The charges depend on Young's modulus E, the piezoelectric coefficients and the gains almost only through their product,
-and on E and the thickness h almost only through E h. A single parameter may therefore be as uncertain after the
-calibration as before, although the product is known to 0.1 %. For this reason, such products and ratios are reported
+and on E and the thickness h almost only through E h. After the calibration, a single parameter may therefore be as
+uncertain as before, although the product is accurate to 0.1 %. For this reason, such products and ratios are reported
 with their standard deviations. A quantity counts as not identified if the presses hardly reduced its standard
 deviation.
 """
@@ -148,7 +148,7 @@ def _definitions(prior: FilmPrior) -> dict[str, _Definition]:
 
 
 def _relative(meaning: str, log_weights: Array) -> _Definition:
-    """Return the definition of a quantity in percent of its described value.
+    """Return the definition of a quantity whose unit is percent of the value in the description.
 
     Args:
         meaning: Description in words.

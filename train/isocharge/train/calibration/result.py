@@ -31,7 +31,7 @@ VISIBLE_TRACE = 2.0
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """Calibration of a film: its estimate, and what follows from it.
+    """Calibration of a film, with its estimate and the results that are derived from it.
 
     Attributes:
         problem: The films that were considered.
@@ -57,22 +57,22 @@ class CalibrationResult:
 
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
-        """Quantities of the film by name, beside what its description alone gives."""
+        """Quantities of the film by name, each with its standard deviations before and after the presses."""
         return quantities(self.problem.prior, self.posterior)
 
     @cached_property
     def sensitivity(self) -> ContactSensitivity:
-        """How contacts respond to noise and to a wrong film, at the calibrated film."""
+        """Effects of noise and of errors of the film on estimated contacts, linearised at the calibrated film."""
         return ContactSensitivity.at(self.problem, self.posterior.unknowns)
 
     @cached_property
     def error_left(self) -> ContactError:
-        """Error of contacts that the remaining uncertainty of the film causes."""
+        """Errors of contacts that are caused by the remaining uncertainty of the film."""
         return self.sensitivity.contact_error(self.posterior.joint)
 
     @cached_property
     def error_left_before(self) -> ContactError:
-        """The same error before the presses, or before the film was moved to another temperature."""
+        """Errors of contacts before the presses, or before the estimate was moved to another temperature."""
         before = self.problem.before
         count = len(self.posterior.joint)
         estimated = slice(0, len(before.unknowns))
@@ -88,8 +88,8 @@ class CalibrationResult:
     def fitted(self) -> Fitted:
         """The network of this film, for `evaluate` and `release`.
 
-        Its standard deviations include the uncertainty of the film. If there are enough presses, its errors are those
-        of calibrations on presses that they did not use; see `held_out`.
+        Its standard deviations include the uncertainty of the film. If there are enough presses, its errors are
+        measured by cross-validation; see `held_out`.
         """
         fitted = self.fitted_film(self.posterior.parameters, release=True)
         if self.held_out is None:
@@ -98,9 +98,9 @@ class CalibrationResult:
 
     @cached_property
     def held_out(self) -> HeldOutAnswers | None:
-        """Answers to presses from calibrations that did not use them; None if there are too few presses.
+        """Contacts estimated by cross-validation; None if there are too few presses.
 
-        See `cross_validate`. The answers are computed when they are first used, which takes about as long as the
+        See `cross_validate`. The contacts are computed when they are first used, which takes about as long as the
         calibration.
         """
         if self.moved:
@@ -145,7 +145,7 @@ class CalibrationResult:
         return factor * self.side_forces.charge_factor(contact)
 
     def fitted_film(self, parameters: Array, *, release: bool = False) -> Fitted:
-        """Return the network of a film near this one, with the same coefficients and the same uncertainty.
+        """Return the network of a similar film, with the coefficients and the uncertainty of this film.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -155,7 +155,7 @@ class CalibrationResult:
         return self._network_of(unknowns, self.posterior.joint, release=release)
 
     def _network_of(self, unknowns: Array, covariance: Array, *, release: bool = False) -> Fitted:
-        """Return the network of a film with the variances of contacts by a covariance of its unknowns.
+        """Return the network of a film, with the variances of contacts that a covariance of the film's unknowns causes.
 
         The variances are linearised at the calibrated film.
         """
@@ -182,7 +182,10 @@ class CalibrationResult:
 
     @cached_property
     def summary(self) -> tuple[str, ...]:
-        """The result in sentences. They are computed once, because they contain a plan of further presses."""
+        """The result in sentences.
+
+        The sentences are computed only once, because the plan of further presses takes time.
+        """
         after = self.error_left
         before = self.error_left_before
         noise = self.sensitivity.noise_error

@@ -104,7 +104,7 @@ def _cell_value(cell: str) -> float:
 
 
 class PressSession:
-    """Presses of one film in the order in which they are made, and the film that they determine so far.
+    """Presses of one film in the order in which they are made, and the present estimate of this film.
 
     Attributes:
         problem: Films that the sensor may be, and the estimate before the presses.
@@ -243,7 +243,7 @@ class PressSession:
         return removed_number
 
     def skip(self) -> None:
-        """Propose another position from now on, and never the present one again."""
+        """Reject the proposed position, and propose another one. A rejected position is never proposed again."""
         self._skipped_places.append((self.proposed.x_mm, self.proposed.y_mm))
         self._proposed = None
 

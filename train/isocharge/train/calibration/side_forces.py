@@ -1,4 +1,4 @@
-"""Side forces of the presses of a calibration, and of the contacts that its model answers.
+"""Side forces of the presses of a calibration, and of the contacts that its model estimates.
 
 A tip on a vertical stage pulls the film inwards by friction while it presses beside the centre
 (`simulate.solver.friction`). The coefficient of friction is a nuisance of the session. It changes the charges of the
@@ -9,9 +9,10 @@ presses by about
 where `friction_charge` is computed on the film that the presses determine (`simulate.forward.side_force`). The fit is
 repeated, because this film and the coefficient depend on each other.
 
-The contacts on the calibrated film may have the same friction, such as those of a robot that moves vertically, or none,
-such as those of a probe that moves freely. The model answers for half of the friction. Its standard deviations contain
-the difference to both cases, and the side forces of any direction that the user declares.
+The contacts on the calibrated film may have the same friction as the presses, for example if a robot moves vertically.
+They may also have no friction, for example if a probe moves freely. The model assumes half of the friction of the
+presses. Its standard deviations include the differences from both cases. They also include the side forces of any
+direction that the user declares.
 """
 
 from dataclasses import dataclass, replace
@@ -34,8 +35,10 @@ MAX_SIDE_FORCE = 0.5
 """Largest side force that can be declared, over the force of the contact. The charges are computed to first order."""
 
 MIN_REFERENCE = 0.02
-"""Smallest coefficient of friction at which the effect of friction is computed. Friction is proportional to the
-coefficient except where the film sticks to the tip."""
+"""Smallest coefficient of friction at which the effect of friction is computed.
+
+Friction is proportional to the coefficient except where the film sticks to the tip.
+"""
 
 CONTACTS = 400
 """Number of contacts to which the effect of friction on the charges is fitted."""
@@ -104,7 +107,7 @@ class SideForces:
 
     @property
     def _coefficient(self) -> float:
-        """Coefficient of friction without the part of its estimate that is not possible."""
+        """Coefficient of friction, limited to possible values."""
         return float(np.clip(self.friction.value, 0.0, MAX_FRICTION))
 
     def charge_factor(self, contact: Array) -> Array:
@@ -128,10 +131,10 @@ class SideForces:
         return Series(fit_series(unit_contact, log_factor, DEGREE, FORCE_DEGREE))
 
     def contact_covariance(self, sensitivity: ContactSensitivity) -> Array:
-        """Return the covariances of (x, y, ln F) by the side forces of contacts, shape (n, 3, 3).
+        """Compute the covariances of (x, y, ln F), shape (n, 3, 3), that the side forces of contacts cause.
 
-        The contacts have the friction of the presses or none, with equal probability. A declared side force has the
-        declared size and an unknown direction.
+        Contacts with the friction of the presses and contacts without friction are equally probable. A declared side
+        force has the declared size and an unknown direction.
 
         Args:
             sensitivity: The contacts, and their dependence on charges.
@@ -151,7 +154,7 @@ class SideForces:
 
 
 def _outer(charge_gain: Array, charge_error: Array) -> Array:
-    """Return the covariances of contacts by an error of their charges.
+    """Compute the covariances of contacts that an error of their charges causes.
 
     Args:
         charge_gain: Derivatives of (x, y, ln F) with respect to the charges, shape (n, 3, n_electrode), 1/pC.

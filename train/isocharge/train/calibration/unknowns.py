@@ -1,7 +1,7 @@
 """Layout of the vector of unknowns of a calibration: a named slice for each kind of unknown.
 
-The unknowns are, in this order: the parameters of the film (`film_prior.PARAMETERS` and the gains), the coefficients of
-effects that the parameters do not describe (modes of imperfections, traces, terms of the discrepancy), and the
+The first unknowns are the parameters of the film (`film_prior.PARAMETERS` and the gains). The next unknowns are
+coefficients of modes of imperfections, of traces, and of the terms of the discrepancy. The last unknowns are the
 nuisances of the session (`nuisances.NUISANCES`). In a fit, parameters are in units of their prior standard deviations.
 """
 
@@ -43,7 +43,10 @@ class UnknownLayout:
 
     @cached_property
     def terms(self) -> slice:
-        """Coefficients of the discrepancy: one for each term and each electrode, with the electrodes in turn."""
+        """Coefficients of the discrepancy, one for each pair of a term and an electrode.
+
+        The index of the electrode changes fastest.
+        """
         return _after(self.traces, term_count() * len(self.electrode_names))
 
     @cached_property
@@ -102,5 +105,5 @@ def _count(unknowns: slice) -> int:
 
 
 def _after(previous: slice, count: int) -> slice:
-    """Return the slice of the next `count` unknowns after a slice."""
+    """Return the slice of `count` unknowns that begins where another slice ends."""
     return slice(previous.stop, previous.stop + count)
