@@ -63,7 +63,7 @@ class Regressor(Protocol):
 
 @dataclass(frozen=True)
 class FittingTask:
-    """Presses and conditions to which methods are fitted.
+    """Training presses, validation presses and conditions for the fits of all methods.
 
     Attributes:
         train: Presses for training, measured or without noise.
@@ -259,7 +259,7 @@ def polynomial_ridge(task: FittingTask) -> ComparedMethod:
 
 
 def _triangulations(charge_map: ChargeMap | None) -> list[ComparedMethod]:
-    """Return triangulation without and with the true force; nothing without a charge map."""
+    """Return triangulation without and with the true force. The result is empty if there is no charge map."""
     if charge_map is None:
         return []
     choice = "contours of the simulated charges"

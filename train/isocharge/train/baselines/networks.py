@@ -35,7 +35,7 @@ SMALL_MISFIT_WIDTH = 8
 
 
 class OnnxContact(GivenMethod):
-    """ONNX graph with the input `charge_pC` and the output `contact`, run by ONNX Runtime as `Predictor` runs it.
+    """ONNX graph from `charge_pC` to `contact`, which ONNX Runtime runs with the same options as for `Predictor`.
 
     Args:
         graph: The ONNX file.
@@ -50,7 +50,7 @@ class OnnxContact(GivenMethod):
         return np.asarray(contact, dtype=float)
 
     def single(self, charge: Array) -> Callable[[], object]:
-        """Return a function that computes one press with memory bound once, as `Predictor` does.
+        """Return a function that computes one press. Its memory is bound only once, as in `Predictor`.
 
         Args:
             charge: Charges of the press, shape (n_electrode,), pC.
@@ -74,7 +74,7 @@ class OnnxContact(GivenMethod):
 
 
 class TrainedNetwork(OnnxContact):
-    """Contact perceptron of one size, trained as usual.
+    """Perceptron of one size that is trained to estimate the contact only.
 
     Args:
         data: Sensor and domain; its presses are replaced by those of `fit`.

@@ -22,7 +22,9 @@ from isocharge.simulate import ChargeMap, Triangulation
 
 
 class Triangulate(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """Regressor that intersects the charge contours; the answer is NaN if they do not meet at exactly one point.
+    """Regressor that intersects the charge contours.
+
+    The result is NaN if the contours do not meet at exactly one point.
 
     Args:
         charge_map: Map from which the contours are computed.
@@ -76,7 +78,7 @@ MIN_DIVISOR = 1e-9
 
 
 class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """Regressor that assumes charges in proportion to the force.
+    """Regressor that assumes that the charges are proportional to the force.
 
     Args:
         radius: Radius of the working area, mm.
@@ -132,8 +134,8 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
     def predict(self, charge: Array) -> Array:
         """Estimate contacts from charges.
 
-        The grid point is that whose charges have the most similar ratios. The linear map of this grid point then
-        estimates the force and the shift from the grid point.
+        The ratios of the charges are compared with those at all grid points, and the most similar grid point is chosen.
+        The linear map of this grid point then estimates the force and the shift from the grid point.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
@@ -216,7 +218,7 @@ class AffineTable(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         return self
 
     def predict(self, values: Array) -> Array:
-        """Estimate contacts by the affine map of the nearest entry.
+        """Estimate each contact by the affine map of the entry with the most similar features.
 
         Args:
             values: Features, shape (n, n_feature).

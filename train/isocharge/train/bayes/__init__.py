@@ -1,1 +1,1 @@
-"""The Bayes limit, by integrating the posterior of a contact."""
+"""Computation of the Bayes limit by integration of the posterior of a contact."""

@@ -1,4 +1,4 @@
-"""The Bayes limit: the errors of the posterior mean, which has the smallest mean squared errors of all estimators.
+"""The Bayes limit, which is the error of the posterior mean. No estimator has a smaller mean squared error.
 
     problem = BayesProblem(load_sensor("three-25um-biaxial"), Circle(1.0), radius=8.0, force_range=(0.05, 2.0))
     print(bayes_limit(problem).position_rms_mm)
@@ -19,8 +19,11 @@ from isocharge.simulate import ChargeSpline, ForwardMap, NoiseModel, Probe, Sens
 from isocharge.train.bayes.posterior import Posterior
 
 N_PRESSES = 4000
-"""Number of presses of `bayes_limit`. The rms error then has a statistical error of 3 %. The ratio of the rms errors of
-two estimators on the same presses has a smaller statistical error."""
+"""Number of presses of `bayes_limit`.
+
+The rms error then has a statistical error of 3 %. The ratio of the rms errors of two estimators on the same presses has
+a smaller statistical error.
+"""
 
 
 @dataclass(frozen=True)

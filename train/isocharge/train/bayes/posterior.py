@@ -7,11 +7,11 @@ the likelihood includes its normalisation:
     p(Q | x, y, ln F) = prod_e exp(-(Q_e - q_e)^2 / (2 sigma_e^2)) / sigma_e,   q = Q(x, y, F),   sigma_e = sigma(q_e).
 
 The integral over the positions is a sum over square cells. A cell is dropped only if no contact in it can explain the
-charges, so that posteriors of any shape are covered, also those with several maxima. The other cells are divided into
-four until they are small compared with the width of the posterior. In each cell, the logarithm of the force is
-integrated by Gauss-Legendre quadrature over an interval around its best value. With cells of 1.25 standard deviations,
-the midpoint rule has a relative error of 1e-5 on a Gaussian (Trefethen and Weideman 2014). Only cells at the edge of
-the disk must be smaller.
+charges. The method therefore works for posteriors of any shape, including those with several maxima. The other cells
+are divided into four until they are small compared with the width of the posterior. In each cell, the logarithm of the
+force is integrated by Gauss-Legendre quadrature over an interval around its best value. With cells of 1.25 standard
+deviations, the midpoint rule has a relative error of 1e-5 on a Gaussian (Trefethen and Weideman 2014). Only cells at
+the edge of the disk must be smaller.
 """
 
 from collections.abc import Iterator
@@ -48,8 +48,10 @@ MAX_SIDE_STD = 1.25
 """Largest side of a cell, in standard deviations of the position along its most certain direction."""
 
 NEGLIGIBLE_CHI2 = 36.0
-"""Excess of a cell's chi-squared over the smallest one of its press above which the cell is dropped. The density of
-such a cell is smaller by a factor of exp(-18)."""
+"""Excess of a cell's chi-squared over the smallest one of its press above which the cell is dropped.
+
+The density of such a cell is smaller by a factor of exp(-18).
+"""
 
 EDGE_CHI2 = 9.0
 """Excess of chi-squared below which a cell at the edge of the disk matters, so that the cells of this press are refined
@@ -64,7 +66,7 @@ N_FORCE_NODES = 12
 
 @dataclass(frozen=True)
 class Cells:
-    """Square cells of positions, each for one press.
+    """Square cells of the plane of positions, each of which belongs to one press.
 
     Attributes:
         press: Number of the press, ascending, shape (n,).
@@ -152,7 +154,7 @@ class Cells:
 
 
 def _grid(count: int, step: float) -> Array:
-    """Return count x count points about the origin with a distance of `step`, shape (count^2, 2)."""
+    """Return a square grid of count x count points about the origin with the spacing `step`, shape (count^2, 2)."""
     line = step * (np.arange(count) - 0.5 * (count - 1))
     return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
 
@@ -407,7 +409,7 @@ def _moments(press: Integers, position: Array, log_force: Array, log_weight: Arr
     total_weight = np.add.reduceat(position_weight, first_row)
 
     def expectation(weighted: Array) -> Array:
-        """Return the sum over the positions of each press, relative to the sum of the weights."""
+        """Return the weighted mean over the positions of each press."""
         return np.asarray(np.add.reduceat(weighted, first_row, axis=0) / total_weight)
 
     x, y = (expectation(position_weight * coordinate) for coordinate in position.T)

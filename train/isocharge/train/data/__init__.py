@@ -1,1 +1,1 @@
-"""What a network learns from: presses, the series fitted to their charges, examples of misfit."""
+"""Training data of a network: presses, the series fitted to their charges, and examples of misfit."""

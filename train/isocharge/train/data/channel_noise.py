@@ -1,8 +1,8 @@
 """Estimation of the noise of measured presses from the presses themselves.
 
 For each press, a plane is fitted to the charges of the presses with the most similar positions and forces. The plane
-predicts the charges of the press. The residuals are the noise of the channels, including the effect of errors of the
-rig in position and force. The variance of each channel is modelled as s^2 = white^2 + (gain * Q)^2.
+predicts the charges of the press. The residuals are the noise of the channels. They include the effect of the rig's
+errors in position and force. The variance of each channel is modelled as s^2 = white^2 + (gain * Q)^2.
 """
 
 from dataclasses import dataclass
@@ -42,8 +42,10 @@ LARGEST_EXPONENT = 50.0
 """Largest exponent in the conversion of levels to charges. It limits charges to 1e21 times white noise over gain."""
 
 LEAST_GAIN = 1e-4
-"""Smallest noise of the gain, which is that of a good amplifier. With a smaller value, the level
-asinh(gain Q / white) / gain would practically be Q / white."""
+"""Smallest noise of the gain, which is that of a good amplifier.
+
+With a smaller value, the level asinh(gain Q / white) / gain would practically be Q / white.
+"""
 
 CANDIDATES = 8
 """Number of planes among which the nearest one is searched."""
@@ -115,7 +117,7 @@ class ChannelNoise:
         return np.asarray(np.sinh(exponent) * self.white / self.gain)
 
     def bend(self, charge: Array) -> Array:
-        """Return the charges from which on features are logarithmic, shape (n_electrode,), pC.
+        """Return the charges above which the features are logarithmic, shape (n_electrode,), pC.
 
         Args:
             charge: Charges of presses, shape (n, n_electrode), pC.
@@ -139,7 +141,7 @@ class ChannelNoise:
 
 @dataclass(frozen=True)
 class LocalPlanes:
-    """Planes that are fitted to the neighbours of each press, without the press itself.
+    """Planes that are fitted to the neighbours of each press, but not to the press itself.
 
     Attributes:
         value: Value of the plane at the press, shape (n, k).
@@ -203,7 +205,7 @@ class LocalPlanes:
 
 
 def usual_size(charge: Array) -> Array:
-    """Return the median magnitude of the charges of each channel that are not 0, shape (n_electrode,), pC.
+    """Return the median magnitude of the nonzero charges of each channel, shape (n_electrode,), pC.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC. Every channel has at least one charge that is not 0.

@@ -288,7 +288,7 @@ def invertible_domain(
 ) -> tuple[Domain, tuple[str, ...]]:
     """Return the largest disk without a certain fold, and sentences about folds and ambiguous pairs.
 
-    A fit to few presses or to measured charges with noise is too poor for a certain fold. The domain is then not
+    A fit to few presses, or to measured charges with noise, is too inaccurate to prove a fold. The domain is then not
     reduced, and a sentence states where the map seems to fold. Ambiguous pairs are searched only if the error of the
     fit is small.
 
@@ -333,7 +333,7 @@ def invertible_domain(
 
 
 def _uncertain_fold_caution(fold_radius: float, requested_radius: float) -> str:
-    """Return the sentence about a fold that a poor fit shows inside the domain, which is not reduced.
+    """Return a sentence about a fold inside the domain that the fit shows but cannot prove.
 
     Args:
         fold_radius: Distance of the fold from the centre, mm.
@@ -348,7 +348,7 @@ def _uncertain_fold_caution(fold_radius: float, requested_radius: float) -> str:
 
 
 def _fold_caution(field: ChargeField, presses: LabelledPresses, fold_radius: float) -> str:
-    """Return the sentence about a certain fold, to which the domain is reduced.
+    """Return a sentence about a fold that is certain, because of which the domain is reduced.
 
     Args:
         field: Charge field with the domain before the reduction.

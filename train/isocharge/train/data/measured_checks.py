@@ -1,7 +1,7 @@
-"""Checks of measured presses before a network is trained on them: the message names the cause of each fault.
+"""Checks of measured presses before a network is trained on these presses.
 
-Without these checks the faults would end the training with a loss that is not finite, or give a model whose errors and
-misfits mean nothing.
+Without these checks, the loss could become infinite or NaN during the training, or the reported errors and misfits of
+the model could be meaningless.
 """
 
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ LEAST_PARTICIPATION = 1e-2
 
 
 def check_measured_presses(presses: MeasuredPresses) -> None:
-    """Check that a network can be trained on measured presses of which everything is known.
+    """Check that a network can be trained on measured presses without unknown values.
 
     Raises:
         PressError: If the charges of a channel hardly vary or are too small or too large, if a value is far from all
@@ -127,7 +127,7 @@ def _check_size(name: str, charge: Array) -> None:
 
 
 def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compared: Array) -> None:
-    """Refuse a value that is far from all others.
+    """Raise an error if a value is far from all others.
 
     Args:
         presses: The presses, for the number of the line.

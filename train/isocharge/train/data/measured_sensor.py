@@ -1,4 +1,4 @@
-"""A sensor that is only known by measured presses: the names of its channels, and the area that was pressed."""
+"""Sensor without a sensor file, described by the names of its channels and the area that was pressed."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -183,7 +183,9 @@ def _circumradii(corners: Array) -> Array:
 
 
 def _single_boundary(triangles: Integers, n_place: int) -> list[int] | None:
-    """Return the boundary of an area of triangles, if it is a single closed line and the area contains all places.
+    """Return the boundary of an area of triangles.
+
+    The result is None unless the boundary is a single closed line and the area contains all places.
 
     Args:
         triangles: Indices of the places at the corners of each triangle, shape (n, 3).

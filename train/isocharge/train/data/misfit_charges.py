@@ -1,4 +1,4 @@
-"""Training charges of the misfit network: charges of good presses, of faulty presses, and of no press at all.
+"""Training charges of the misfit network: charges of good presses, charges of faulty presses, and random charges.
 
 The misfit network has to answer any charges, so it is trained on all kinds of charges: presses with noise; charges at
 any distance from the charges that contacts can have; wrong gains; failing electrodes; forces far outside of the range;
@@ -33,12 +33,16 @@ and two presses at the same place have p = 3/2. Presses solved with both loads a
 """
 
 MIN_CHANGE = 1e-4
-"""Change of |residual|^2 below which the search for the nearest contact ends, relative to 1 + |residual|^2. The misfits
-of 99 % of the examples then differ by less than 0.001 from those of a converged search."""
+"""Change of |residual|^2 below which the search for the nearest contact ends, relative to 1 + |residual|^2.
+
+The misfits of 99 % of the examples then differ by less than 0.001 from those of a converged search.
+"""
 
 OUTSIDE_SCATTER = 0.02
 """Standard deviation of the logarithm of a factor of all charges of a press outside the working area, dimensionless.
-It fills the gaps between the presses that are given."""
+
+It fills the gaps between the presses that are given.
+"""
 
 LARGEST_FACTOR = 2.0
 """Largest factor by which the charge map is scaled at a press. A quotient of charges near zero is meaningless."""
@@ -48,7 +52,10 @@ FAR = 6.0
 
 
 def misfit_noise(noise: NoiseModel) -> NoiseModel:
-    """Return the noise that is the unit of the misfit: the noise of the training, or `reference` if that is zero."""
+    """Return the noise that is the unit of the misfit.
+
+    It is the noise of the training, or `reference` if the noise of the training is zero.
+    """
     return noise if noise.white > 0.0 else noise_model("reference")
 
 
@@ -133,9 +140,9 @@ def _residuals(
 ) -> Array:
     """Compute the residuals of charges at the nearest contact.
 
-    Charges that are similar to those of the press from which they were made are compared with contacts near this press.
-    The charge map is scaled so that it is exact at this press. For all other charges, the nearest contact is searched
-    for among many candidates.
+    Some charges are similar to those of the press from which they were made. They are compared with contacts near this
+    press. The charge map is scaled so that it is exact at this press. For all other charges, the nearest contact is
+    searched for among many candidates.
 
     Args:
         charge_map: Map from contacts to charges.
@@ -168,7 +175,7 @@ def _residuals(
 
 
 def draw_charges(rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> tuple[NDArray[Any], Array]:
-    """Draw a kind for each press and make charges of this kind.
+    """Draw a kind of charges for each press, and create charges of this kind.
 
     Args:
         rng: Random number generator.
@@ -221,8 +228,9 @@ def _draw(kind: str, rng: np.random.Generator, charge: Array, others: Array, noi
 def _moved_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Array:
     """Move charges in random directions by random distances.
 
-    Charges of any sign are moved by up to 10^FARTHEST standard deviations of their noise. Positive charges are changed
-    by factors of which the logarithms are normally distributed, from a thousandth up to a factor of about seven.
+    Charges of any sign are moved by up to 10^FARTHEST standard deviations of their noise. Positive charges are
+    multiplied by factors whose logarithms are normally distributed. The standard deviation of the logarithms is between
+    0.001 and 2.
 
     Args:
         rng: Random number generator.

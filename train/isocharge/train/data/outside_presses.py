@@ -1,8 +1,8 @@
-"""Presses outside the working area, for training the misfit network and for measuring what it does not notice.
+"""Presses outside the working area, for training the misfit network and for measuring its detection rate.
 
-The charges come from the coarse map of the whole film. An error of a few percent near the clamp does not matter: the
-misfit network is trained with the exact misfit of the charges that it sees, and the measured shares of presses hardly
-depend on it.
+The charges come from the coarse map of the whole film. The error of this map is a few percent near the clamp and does
+not matter. The misfit network is trained with the exact misfit of these charges, and the measured fractions of presses
+hardly depend on the error.
 """
 
 import logging
@@ -85,7 +85,7 @@ class OutsidePresses:
         return self.charge_map.domain.radius
 
     def draw(self, count: int, seed: int) -> LabelledPresses:
-        """Draw presses uniform over the ring, with log-uniform forces.
+        """Draw presses whose positions are uniformly distributed over the ring, with log-uniform forces.
 
         Args:
             count: Number of presses.

@@ -1,8 +1,8 @@
 """Presses for training and presses for measuring errors, split by position.
 
-All presses at one position belong to the same part, because presses with other forces at the same position would make
-the errors too small. Measured presses are always split in the same way: the coordinates determine which fifth of the
-positions is held out. Every command therefore measures errors on the same presses of a file.
+All presses at one position belong to the same part. Otherwise, the test would contain positions of the training, and
+the measured errors would be too small. Measured presses are always split in the same way: the coordinates determine
+which fifth of the positions is held out. Every command therefore measures errors on the same presses of a file.
 """
 
 from collections.abc import Sequence
@@ -101,7 +101,7 @@ def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array
 def domain_of(dataset: Dataset) -> Domain:
     """Return the working area and the range of forces of a dataset.
 
-    The manifest states them. If it does not, they are those of the samples.
+    The manifest states them. If the manifest does not state them, they are computed from the samples.
 
     Raises:
         DatasetError: If the ranges of the manifest are not numbers or do not contain the samples.
@@ -199,8 +199,8 @@ FEWEST_MEASURED = 50
 def held_out(contact: Array) -> Booleans:
     """Choose the measured presses that are held out.
 
-    Presses at one position are held out together. The order in which positions are chosen follows from their
-    coordinates alone, so that it is the same in every part of the presses.
+    Presses at one position are held out together. The order in which positions are chosen depends only on their
+    coordinates. The order is therefore the same in every subset of the presses.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -229,7 +229,7 @@ def folds_by_place(contact: Array, count: int) -> Integers:
 def _count_before(contact: Array) -> Integers:
     """Return, for each press, the number of presses at positions that are chosen before its own position.
 
-    Positions are chosen in the order of their checksums, which is random but the same for every run.
+    Positions are chosen in the order of their checksums. This order is random but the same in every run.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.

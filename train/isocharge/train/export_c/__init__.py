@@ -1,4 +1,4 @@
-"""A model as C99: the network as arrays and loops, and beside it the signal chain of a board.
+"""Export of a model and of the signal chain of a board as C99.
 
     isocharge_model.h/.c     isocharge_predict: charges in, the seven numbers of a Contact out
     isocharge_chain.h/.c     the signal chain, with the numbers of the device file in isocharge_device.h

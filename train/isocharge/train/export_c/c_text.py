@@ -14,7 +14,7 @@ LINE_WIDTH = 109
 
 
 def source_text(name: str, **values: object) -> str:
-    """Return the text of a file in `sources/` with values in the place of its `$names`."""
+    """Return the text of a file in `sources/` in which each `$name` is replaced by its value."""
     return Template((resources.files(__package__) / "sources" / name).read_text("utf-8")).substitute(values)
 
 

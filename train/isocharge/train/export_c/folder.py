@@ -1,4 +1,4 @@
-"""The folder of a C export: the model, the signal chain of a board, examples and a README.
+"""Writer of the folder of a C export, with the model, the signal chain of a board, examples and a README.
 
 The folder is written completely or not at all.
 """
@@ -113,7 +113,7 @@ SINGLE_PRECISION = "/* This board computes the chain in single precision. */\n#d
 
 
 def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: str = "") -> Path:
-    """Write a model and the signal chain beside it as C99.
+    """Write a model, and the signal chain that belongs to this model, as C99.
 
     Args:
         model: Version folder of the model, as `find_model` returns it.
@@ -140,7 +140,7 @@ def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: 
 
 
 def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[str, str]:
-    """Return the texts of an export by their paths in its folder.
+    """Return the text of each file of an export by its path in the folder of the export.
 
     Args:
         model: Version folder of the model.

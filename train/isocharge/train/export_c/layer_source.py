@@ -1,4 +1,4 @@
-"""A layer of a network as a C function with constant arrays.
+"""C source of a layer of a network: a function with constant arrays.
 
 A layer computes y = f(x W + c). Its weights have the shape (inputs, outputs), and a few rows at a time are added to all
 outputs. The inner loop runs over neighbouring outputs with a constant count, so compilers vectorise it from -O2 on

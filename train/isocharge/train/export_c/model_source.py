@@ -109,12 +109,12 @@ def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSour
 
 
 def _contact_size(network: FoldedNetwork) -> int:
-    """Return how many numbers of a `Contact` a network gives."""
+    """Return the number of fields of a `Contact` that a network computes."""
     return len(Contact._fields) if network.n_angle else N_WITHOUT_CORRELATION
 
 
 def _correlations_source(network: FoldedNetwork) -> str:
-    """Return the function that also gives the correlations."""
+    """Return the C function that computes the correlations as well."""
     text = source_text(
         "isocharge_all.c",
         table=c_array("COSINES", COSINES_TO_CORRELATIONS.astype(np.float32)),
@@ -126,7 +126,7 @@ def _correlations_source(network: FoldedNetwork) -> str:
 
 
 def self_test(golden: Golden) -> str:
-    """Return the text of `self_test.c`: golden vectors and their tolerances."""
+    """Return the text of `self_test.c`, which contains golden vectors and their tolerances."""
     names = sorted(golden.outputs, key=CORRELATION.__eq__)  # a Contact ends with the correlations
     answers = np.concatenate([golden.outputs[name] for name in names], axis=1)
     floors = np.array([floor for name in names for floor in golden.floors[name]], np.float32)

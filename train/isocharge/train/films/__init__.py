@@ -1,1 +1,1 @@
-"""One network for all films: its data, its training, its file, and the plain model of one film that folds out of it."""
+"""One network for all films: its data, its training, its file, and the model of one film that is computed from it."""

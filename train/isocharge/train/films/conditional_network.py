@@ -99,7 +99,7 @@ class FilmInputs:
 
 
 class ConditionalPerceptron(nn.Module):
-    """A perceptron with a skip layer whose weights depend on the film. It is evaluated for many films at once.
+    """A perceptron with a skip layer, in which all weights depend on the film. It is evaluated for many films at once.
 
     Args:
         n_input: Number of electrodes.

@@ -1,4 +1,4 @@
-"""Exact scales of the charges of films, and the context that describes the rest of a film to a network.
+"""Exact scales of the charges of films, and the context, which describes the other properties of a film.
 
 With the stretching stiffness E h, the geometric mean d of d31 and d32, and the gain g of an electrode,
 
@@ -6,8 +6,8 @@ With the stretching stiffness E h, the geometric mean d of d31 and d32, and the 
 
 The context contains the softened pretension over E, ln(d31 / d32), h, the position of the film's centre in the frame of
 the electrodes, the rotation of the film, and the radius of the probe. The noise and the limits of the domain do not
-scale with the film. The context therefore also contains the scales that are divided out: that of all charges, that of
-the force, and the gain of each electrode relative to the mean.
+scale with the film. The context therefore also contains the scales by which charges and forces are divided. These are
+the scale of all charges, the scale of the force, and the gain of each electrode relative to the mean gain.
 """
 
 from dataclasses import dataclass
@@ -152,7 +152,7 @@ class FilmScaling:
 
 
 def _shared(parameters: Array, name: str) -> Array:
-    """Return one of the parameters that do not belong to an electrode, shape (...)."""
+    """Return a parameter that does not belong to a single electrode, shape (...)."""
     return np.asarray(parameters[..., SHARED.index(name)])
 
 

@@ -28,12 +28,16 @@ CHUNK = 16
 """Number of films that one task computes."""
 
 MAX_NEGATIVE_FRACTION = 0.2
-"""Largest fraction of presses with a charge that is not positive, as light presses on taut uniaxial films have. Charges
-below 1 pC are clipped to 1 pC, and only the other electrodes then carry information."""
+"""Largest fraction of presses with a charge that is not positive, as light presses on taut uniaxial films have.
+
+Charges below 1 pC are clipped to 1 pC, and only the other electrodes then carry information.
+"""
 
 N_CANDIDATES = 512
-"""Number of contacts among which the search for the nearest contact starts. A candidate costs more here than for a
-single film, so there are fewer."""
+"""Number of contacts among which the search for the nearest contact starts.
+
+A candidate costs more here than for a single film, so there are fewer.
+"""
 
 D31 = SHARED.index("d31")
 """Position of ln d31 among the parameters."""
@@ -87,7 +91,9 @@ def draw_film_presses(
     seed: int,
     executor: Executor | None = None,
 ) -> FilmPresses:
-    """Draw films from the prior and presses on each film, uniform over the disk and log-uniform in force.
+    """Draw films from the prior, and draw presses on each film.
+
+    Positions are uniformly distributed over the disk, and forces are log-uniform.
 
     Args:
         prior: Distribution of the films.
@@ -138,7 +144,7 @@ def _press_films(
 
 
 def _response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: Array) -> Array:
-    """Compute the charges of one film in parts, for the described coefficients and gains.
+    """Compute the parts of the charges of one film for the described coefficients and gains.
 
     Args:
         prior: Distribution of the films.
@@ -271,7 +277,7 @@ def _charges_of_every_kind(source: FilmsSource, charges: int, seed: int, job: tu
 def draw_near_films(
     source: FilmsSource, films: int, presses: int, seed: int, executor: Executor | None = None
 ) -> DrawnFilms:
-    """Draw films and good presses on each film, for which the nearest contact follows without a search.
+    """Draw films and good presses on each film. The nearest contact of a good press is found without a search.
 
     Args:
         source: Films and contacts.

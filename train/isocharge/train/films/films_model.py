@@ -157,7 +157,7 @@ class FilmsModel:
         correlation: bool = True,
         n_test: int = N_TEST_PRESSES,
     ) -> Fitted:
-        """Compute the network of one film, with everything that a release needs.
+        """Compute the network of one film in the form that a release needs.
 
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).

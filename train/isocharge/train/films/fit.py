@@ -45,8 +45,10 @@ from isocharge.train.training.losses import (
 from isocharge.train.training.network import TrainablePerceptron, as_tensor, compress_length
 
 RADIUS_MARGIN = 1.5
-"""Distance by which the forward maps reach beyond the domain, mm. A calibration moves presses whose position is
-uncertain."""
+"""Distance by which the forward maps reach beyond the domain, mm.
+
+A calibration moves presses whose position is uncertain.
+"""
 
 FORCE_MARGINS = (0.8, 1.2)
 """Factors of the smallest and the largest force of the domain up to which the forward maps reach."""
@@ -64,8 +66,10 @@ MAX_NOISE_FACTOR = 8.0
 """Largest factor on the noise of good presses in the training of the misfit network."""
 
 GOOD_PRESS_WEIGHT = 10.0
-"""Weight of good presses in the loss of the misfit network. They determine the rate of false alarms, and their misfits
-are small."""
+"""Weight of good presses in the loss of the misfit network.
+
+They determine the rate of false alarms, and their misfits are small.
+"""
 
 MISFIT_VALIDATION_FRACTION = 0.06
 """Fraction of the films that are used for validation in the training of the misfit network."""
@@ -185,7 +189,7 @@ def fit_films(
 
 
 def films_identity(prior: FilmPrior, config: FilmsConfig) -> dict[str, Any]:
-    """Return everything that determines the weights, as the identity of a resumable run."""
+    """Return all settings that determine the weights. They identify a run that can be resumed."""
     return {
         "sensor": sensor_to_dict(prior.sensor),
         "probe": prior.probe.notation,
@@ -249,7 +253,7 @@ def muon_and_adam(stage: TrainingStage) -> list[torch.optim.Optimizer]:
 
 
 class _Batch(NamedTuple):
-    """Estimated and true contacts of a batch in unit coordinates, shape (n, 3) each."""
+    """Estimated and true contacts of a batch in unit coordinates, each of shape (n, 3)."""
 
     mean: Tensor
     log_std: Tensor
@@ -398,8 +402,8 @@ def misfit_stage(
 class _MisfitTraining:
     """Loss and validation of the misfit network.
 
-    The loss consists of the loss of examples, whose residuals were found by a search, and of the loss of good presses,
-    whose residuals follow from their noise.
+    The loss is the weighted sum of two parts. The residuals of the first part, the examples, were found by a search.
+    The residuals of the second part, the good presses, are computed from their noise.
     """
 
     def __init__(

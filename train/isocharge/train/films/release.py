@@ -1,4 +1,4 @@
-"""Release of a network for all films as a model: its measured errors, its card and its folder."""
+"""Release of a network for all films as a model, with measured errors, a card and a folder."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -57,10 +57,11 @@ class FilmsErrors:
 
 
 def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PRESSES, seed: int = SEED) -> FilmsErrors:
-    """Measure the errors on films drawn from the prior and presses that were not in the training.
+    """Measure the errors on new films from the prior, with presses that were not in the training.
 
-    The errors are position errors in mm and relative force errors in percent over all presses, the rms of the median
-    film and of the worst film, and the coverage of the 68 and 95 % intervals (fraction of the coordinates, 0 to 1).
+    The result contains position errors in mm and relative force errors in percent. They are computed over all presses,
+    for the median film and for the worst film. The result also contains the coverage of the 68 and 95 % intervals, as a
+    fraction of the coordinates from 0 to 1.
 
     Args:
         films: The network.

@@ -1,1 +1,1 @@
-"""From a fitted network to a model folder: measured errors, ONNX graph, card, golden vectors."""
+"""Release of a fitted network as a model folder with measured errors, an ONNX graph, a card and golden vectors."""

@@ -1,4 +1,4 @@
-"""Measured errors of a network on presses on which it was not trained: the figures of cards, reports and the demo."""
+"""Measurement of the errors of a network on presses that were not in its training."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -123,7 +123,7 @@ def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]
 
 
 def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int) -> dict[str, float]:
-    """Compute the misfits that few good presses exceed, and the fraction of faults that exceed the alarm's threshold.
+    """Compute the misfits that only a few good presses exceed, and the fraction of faults that cause an alarm.
 
     Args:
         predict: The network.
@@ -150,7 +150,7 @@ def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel,
 
 
 def alarm_threshold(good_misfits: Array) -> float:
-    """Compute the misfit that the fraction `FALSE_ALARM_RATE` of good presses exceeds, from their misfits."""
+    """Compute the misfit that is exceeded by the fraction `FALSE_ALARM_RATE` of good presses."""
     return float(np.percentile(good_misfits, 100.0 * (1.0 - FALSE_ALARM_RATE)))
 
 
@@ -186,7 +186,7 @@ def _detected_faults(
     n_electrode = charge.shape[1]
 
     def detected_fraction(gain: float) -> float:
-        """Return the fraction of detected presses if the gain of one electrode is wrong, over all electrodes."""
+        """Return the fraction of presses with one wrong gain that are detected, averaged over the electrodes."""
         faulty_charges = []
         for electrode in range(n_electrode):
             gains = np.ones(n_electrode)

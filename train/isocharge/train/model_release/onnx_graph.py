@@ -1,7 +1,7 @@
-"""ONNX graphs of a network's definition: the writer, and the reader that recovers the definition from a graph.
+"""Writer of the ONNX graph of a network, and reader that recovers the network from such a graph.
 
 The reader takes the constants out of a graph, writes the graph of that definition again and compares the two node by
-node. The writer is thus the only description of the graph, and a graph of any other program is refused.
+node. The writer is therefore the only description of the graph. Graphs that another program wrote are refused.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,7 +43,7 @@ class GraphBuilder:
     constants: list[onnx.TensorProto] = field(default_factory=list)
 
     def add(self, operator: str, *inputs: str, to: str = "", **attributes: Any) -> str:
-        """Add a node with one result and return the name of the result, which is `to` if that is given."""
+        """Add a node with one result, and return the name of the result. The name is `to` if `to` is given."""
         (result,) = self.add_many(operator, *inputs, to=(to or f"t{len(self.nodes)}",), **attributes)
         return result
 
@@ -243,7 +243,7 @@ def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
 
 
 def _activation_of(operators: Sequence[str], where: str) -> Activation:
-    """Return the activation of the hidden layers, which follows the first linear layer.
+    """Return the activation of the hidden layers, read from the node after the first linear layer.
 
     Args:
         operators: Operators of the nodes, in order.
@@ -364,5 +364,5 @@ def _plain_constant(values: NDArray[Any]) -> tuple[object, ...]:
 
 
 def _refuse(where: str, reason: str) -> NoReturn:
-    """Raise the error of a graph that `write_graph` did not write."""
+    """Raise the error for a graph that was not written by `write_graph`."""
     raise ModelError(f"{where}: {reason}; only models of isocharge can be read")

@@ -1,4 +1,4 @@
-"""Release of a trained network as a model folder: ONNX graph, measured errors, golden vectors and model card.
+"""Release of a trained network as a model folder with an ONNX graph, measured errors, golden vectors and a model card.
 
 The card states what the model is for, how large its errors are, what its limits are, and how to make it again.
 """
@@ -37,7 +37,9 @@ N_CORNERS = 64
 """Number of corners of the polygon that represents a round working area."""
 
 CORNER_TOLERANCE_mm = 2e-3
-"""Largest distance of the corners of such a polygon from their ideal places, mm. The metadata round them to 0.0001 mm.
+"""Largest distance of the corners of such a polygon from their ideal places, mm.
+
+The metadata round them to 0.0001 mm.
 """
 
 CardWriter = Callable[[ModelMetadata, Fitted], str]
@@ -91,7 +93,9 @@ HUB_METRICS = {
 
 
 def hub_block(metadata: ModelMetadata) -> str:
-    """Return the block of YAML above a card that model hubs read: the kind of the model and its measured errors.
+    """Return the block of YAML at the beginning of a card, which model hubs read.
+
+    The block states the kind of the model and its measured errors.
 
     Source: https://huggingface.co/docs/hub/model-cards. The block names no licence, because the publisher of a model
     chooses it.
@@ -151,7 +155,10 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
 
 
 def yield_text(metadata: ModelMetadata) -> str:
-    """Return the text about yielding for the row of the forces; empty if the film does not yield within the range."""
+    """Return the text about yielding for the row of the forces.
+
+    It is empty if the film does not yield within the range.
+    """
     if metadata.yield_force_N is None:
         return ""
     return (
@@ -309,7 +316,7 @@ def release(
 
 
 def _sensor_table(fitted: Fitted) -> dict[str, Any]:
-    """Return the sensor as the metadata hold it."""
+    """Return the description of the sensor for the metadata."""
     if isinstance(fitted.sensor, MeasuredSensor):
         return fitted.sensor.to_dict()
     return sensor_to_dict(fitted.sensor)
@@ -353,10 +360,11 @@ def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
 
 
 def model_domain(about: ModelMetadata) -> Domain:
-    """Return the contacts for which a model was trained, from its metadata.
+    """Read the contacts for which a model was trained from the metadata of the model.
 
     If the working area is the polygon of a disk about the origin, as in models of simulated presses, the domain is the
-    largest disk in it, rounded to 0.001 mm. Every other working area gives a `PressedArea` with its corners.
+    largest disk in it, rounded to 0.001 mm. For every other working area, the domain is a `PressedArea` with the same
+    corners.
     """
     corners = np.array(about.working_area_mm)
     edges = np.roll(corners, -1, axis=0) - corners

@@ -1,8 +1,8 @@
 """Training data and settings of a student: a small network that learns the answers of a model.
 
 A student has the inputs and outputs of the model and about 5,000 weights and biases, so it fits into the flash memory
-of a microcontroller. It learns the contacts and standard deviations of the model. It learns the misfit, like the model,
-from distances that were computed exactly.
+of a microcontroller. It learns the contacts and standard deviations of the model. The misfit of the student, like that
+of the model, is trained with distances that were computed exactly.
 """
 
 from dataclasses import dataclass, replace
@@ -37,7 +37,9 @@ def student_config(weights: Literal["float32", "int8"] = "float32") -> FitConfig
 
 @dataclass(frozen=True)
 class StudentCase:
-    """Sensor, probes and contacts of a model, from which presses like those of its training can be simulated.
+    """Sensor, probes and contacts of a model.
+
+    They define a simulation of presses that are distributed as in the training of the model.
 
     Attributes:
         sensor: Sensor of the model.
@@ -66,7 +68,7 @@ class StudentCase:
 
 
 def student_data(model: Path, dataset: Dataset) -> TrainingData:
-    """Return the training data of a student: presses, and the answers of a model to their charges.
+    """Return the training data of a student, which are presses and the contacts that a model estimates for them.
 
     Args:
         model: Version folder of the model.
@@ -84,7 +86,7 @@ def student_data(model: Path, dataset: Dataset) -> TrainingData:
         )
 
     def answer(charge: Array) -> tuple[Array, Array]:
-        """Return contacts (x, y, F) and standard deviations, each of shape (n, 3), mm and N, for charges in pC."""
+        """Estimate the contacts (x, y, F) and their standard deviations, each of shape (n, 3), mm and N."""
         contact = predictor.predict_batch(charge)
         position_and_force = np.stack([contact.x_mm, contact.y_mm, contact.force_N], axis=1)
         std = np.stack([contact.x_std_mm, contact.y_std_mm, contact.force_std_N], axis=1)

@@ -1,4 +1,4 @@
-"""Measured share of the presses outside the working area that a model answers wrongly without a flag."""
+"""Measured fraction of presses outside the working area for which a model gives a wrong answer without a flag."""
 
 from textwrap import fill
 
@@ -46,7 +46,7 @@ def unnoticed_presses(fitted: Fitted, about: ModelMetadata) -> UnnoticedPresses 
 
 
 def is_flagged(about: ModelMetadata, contact: Array, std: Array, misfit: Array) -> Booleans:
-    """Return which answers carry a flag other than `stress`, which does not say that an answer is wrong.
+    """Return which answers carry a flag other than `stress`. The flag `stress` does not mean that an answer is wrong.
 
     Args:
         about: Metadata of the model.

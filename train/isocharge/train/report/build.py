@@ -1,4 +1,4 @@
-"""Writing of a report: the evaluation of each dataset, the JSON record, the pictures and the page.
+"""Writer of a report, which evaluates each dataset and writes the JSON record, the pictures and the page.
 
 The folder of the report appears when the report is complete. A stopped report keeps its completed solves and limits, so
 that the same call continues it.
@@ -97,5 +97,5 @@ def _file_stems(sensor_names: Sequence[str]) -> list[str]:
 
 
 def _json_section(section: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a section as `report.json` contains it, with the records of the methods as dictionaries."""
+    """Return a section in the form of `report.json`, in which the record of each method is a dictionary."""
     return {**section, "methods": [method.to_dict() for method in section["methods"]]}

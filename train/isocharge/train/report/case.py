@@ -173,7 +173,7 @@ class EvaluationCase:
 
 
 def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
-    """Return the probes of a dataset, and whether they are rotated by random angles.
+    """Return the probes of a dataset, and whether the probes are rotated by random angles.
 
     A probe that pressed at a single angle is returned with this rotation.
     """

@@ -146,7 +146,7 @@ class DatasetEvaluation:
         return cls(fitting_dataset, ReleasedModel(model_folder), own_students, task, case, settings, held_out_presses)
 
     def identity(self) -> dict[str, Any]:
-        """Return what identifies the inputs: the checksum of the dataset and the folders of the models."""
+        """Return the checksum of the dataset and the folders of the models, which identify the inputs."""
         folders = [self.released.folder, *self.students]
         return {"dataset_sha256": self.dataset.sha256, "models": [str(folder) for folder in folders]}
 
@@ -200,7 +200,7 @@ class DatasetEvaluation:
     def _test_maps(self, forward_maps: tuple[ForwardMap, ...], executor: Executor) -> tuple[ForwardMap, ...]:
         """Return the forward maps for the test presses.
 
-        They are solved separately, except in a quick report, which uses the maps that are passed to this method.
+        A quick report uses the maps that are passed to this method. Otherwise, the maps are solved separately.
         """
         if self.settings.quick:
             return forward_maps
@@ -233,7 +233,7 @@ class DatasetEvaluation:
         threshold: float,
         executor: Executor,
     ) -> list[dict[str, Any]]:
-        """Return the results of the released model and the studied methods for all mismatches."""
+        """Measure the errors of the released model and of the studied methods for all mismatches."""
         methods = [fitted_by_name[name].method for name in STUDIED_METHODS]
         return [
             studies.measure_mismatch(mismatch, RELEASED, self.released, methods, threshold)
@@ -241,7 +241,7 @@ class DatasetEvaluation:
         ]
 
     def _measure_on_measured_presses(self, test: LabelledPresses) -> Section:
-        """Return the section of a measured dataset, without the parts that need a simulation of the film."""
+        """Return the section of a measured dataset, which contains no results that need a simulation of the film."""
         methods = [*self._released_models(), *compared_methods(self.task), *self._new_networks()]
         fitted_methods, failure_reasons = fit_all(methods, self.task, test)
         records = measure_methods(fitted_methods, test, self.settings)
@@ -255,7 +255,7 @@ class DatasetEvaluation:
         return Section(content, {})
 
     def _released_models(self) -> list[ComparedMethod]:
-        """Return the models that are not fitted again: the released model first, then its students.
+        """Return the released model and then its students, which are not fitted again.
 
         Each model is listed twice: with all outputs, and reduced to the contact.
         """

@@ -114,7 +114,7 @@ class MethodRecord:
 
     @property
     def label(self) -> str:
-        """The name of the method with the library that computes it."""
+        """The name of the method, and the name of the library that computes the method."""
         return f"{self.method.name} ({self.method.computed_by})"
 
     @property

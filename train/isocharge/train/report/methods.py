@@ -1,4 +1,4 @@
-"""Fitting of the compared methods, and the measurement of their errors and durations on the same presses."""
+"""Fits of the compared methods, and measurements of their errors and durations on the same presses."""
 
 import pickle
 import time
@@ -88,8 +88,8 @@ def measure_methods(
 ) -> list[MethodRecord]:
     """Measure the errors, durations and sizes of all methods.
 
-    The durations are measured in turns after all methods are fitted, so that a change of the machine's speed affects
-    all methods alike.
+    After all methods are fitted, their durations are measured alternately. A change of the machine's speed therefore
+    affects all methods in the same way.
 
     Args:
         fitted_methods: The fitted methods with their estimates.
@@ -123,7 +123,7 @@ def _test_inputs(method: ComparedMethod, test: LabelledPresses) -> Array:
 def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callable[[], object]:
     """Return a function that predicts one press, and the next press at each call.
 
-    ONNX networks are called as `Predictor` calls them, with arrays that are bound once.
+    ONNX networks are called in the same way as by `Predictor`, with arrays that are bound only once.
 
     Args:
         method: Fitted method.

@@ -1,6 +1,6 @@
-"""The page of the report in Markdown: a summary, a table of all methods, and pictures with captions.
+"""The page of the report in Markdown, with a summary, a table of all methods, and pictures.
 
-The page is written from the content of `report.json` alone, in which each method is a `MethodRecord` here.
+The page is written only from the content of `report.json`. Each method in this content is a `MethodRecord` here.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -34,7 +34,7 @@ def report_page(record: Mapping[str, Any]) -> str:
 
 
 def _summary_lines(section: Section) -> Iterator[str]:
-    """Yield the lines of the summary of a section: the errors of the released model and the comparison."""
+    """Yield the summary of a section, which contains the errors of the released model and the comparison."""
     released: MethodRecord = section["methods"][0]
     errors = released.errors
     yield f"**{section['sensor']}**, released model `{section['model']['label']}`:\n"
@@ -134,7 +134,7 @@ def _method_comparison(section: Section) -> Iterator[str]:
 
 
 def _error_and_latency(record: MethodRecord) -> tuple[float, float]:
-    """Return the key by which methods are sorted: the error, then the latency; methods without an error come last."""
+    """Return the key that sorts methods by the error and then by the latency. Methods without an error come last."""
     error_mm = record.errors.position_rms_mm or float("inf")
     return error_mm, record.single_timing.p50_us
 
@@ -160,7 +160,10 @@ def _limit_rows(limits: Mapping[str, Any]) -> Iterator[list[str]]:
 
 
 def _method_row(record: MethodRecord) -> list[str]:
-    """Return the row of a method for the table of methods, in bold if the method is on the front of the latency."""
+    """Return the row of a method in the table of methods.
+
+    The row is in bold if the method is on the Pareto front of the latency.
+    """
     errors = record.errors
     name = record.method.name
     if errors.answered < 1.0:

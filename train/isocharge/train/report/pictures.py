@@ -35,8 +35,10 @@ LINE_STYLES: dict[str, dict[str, Any]] = {
     BAYES: {"color": INK, "marker": "", "ls": "-", "lw": 2.0},
     CRAMER_RAO: {"color": INK, "marker": "", "ls": ":", "lw": 2.0},
 }
-"""Matplotlib styles of the released model and of the limits, by name. Other methods have the style
-`DEFAULT_LINE_STYLE`."""
+"""Matplotlib styles of the released model and of the limits, by name.
+
+Other methods have the style `DEFAULT_LINE_STYLE`.
+"""
 
 DEFAULT_LINE_STYLE: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 1.3}
 """Matplotlib style of a method that is not in `LINE_STYLES`; its colour is the next of Matplotlib's colour cycle."""
@@ -108,8 +110,8 @@ def _draw_methods(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> No
 def _draw_pareto_front(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> None:
     """Draw the Pareto front as steps.
 
-    Between two methods of the front, the error is that of the method with the lower cost. A higher throughput is a
-    lower cost, so the steps of the throughput go the other way.
+    The error between two methods of the front is the error of the method with the lower cost. For the throughput, a
+    higher value is a lower cost, so the direction of the steps is reversed.
     """
     front = sorted((record.cost(cost), record.error_mm) for record in records if cost in record.pareto_costs)
     costs, errors_mm = zip(*front, strict=True)

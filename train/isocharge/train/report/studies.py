@@ -1,7 +1,8 @@
 """Studies of the released model beyond its mean error.
 
-The studies cover the errors over the film and the force, the coverage of the reported standard deviations, and the
-errors if the noise, the probe, the pretension, the gains or an electrode differ from what the model was trained for.
+The studies compute the errors over the film and the force, and the coverage of the reported standard deviations. They
+also compute the errors if the noise, the probe, the pretension, the gains or an electrode differ from those of the
+training.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -149,8 +150,10 @@ SINGLE_GAIN_ERROR = 0.2
 """Relative error of the gain if only one of them is wrong."""
 
 MISMATCH_ACCURACY = 2e-3
-"""Relative accuracy of the simulated charges for other probes and pretensions. It is small compared with the changes
-of the charges that these cause."""
+"""Relative accuracy of the simulated charges for other probes and pretensions.
+
+It is small compared with the changes of the charges that these cause.
+"""
 
 CLIP_LIMIT = 50.0
 """Magnitude, mm or N, to which estimates are clipped, because polynomials diverge outside their training range."""
@@ -161,7 +164,7 @@ MISMATCH_NOISE_SEED = 515
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Presses under conditions that differ from what the models assume.
+    """Presses under conditions that differ from the assumptions of the models.
 
     Attributes:
         group: Kind of the difference: "noise", "probe", "pretension", "gain" or "dead electrode".

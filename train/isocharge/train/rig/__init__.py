@@ -1,1 +1,1 @@
-"""Training data from presses on a sensor whose film cannot be calibrated: the sensor as described, corrected."""
+"""Training data from a described sensor that is corrected by measured presses, for films that cannot be calibrated."""

@@ -47,7 +47,7 @@ class CorrectedFilm:
     is_scattered: bool
 
     def charges(self, contact: Array) -> Array:
-        """Return the charges of contacts (x, y, F), shape (n, 3), mm and N: shape (n, n_electrode), pC."""
+        """Return the charges, shape (n, n_electrode), pC, of contacts (x, y, F), shape (n, 3), mm and N."""
         return np.asarray(self.forward_map.charges(contact) * np.exp(self.correction.log_factor(contact)))
 
     def correction_percent(self, contact: Array) -> float:

@@ -1,9 +1,10 @@
 """Smooth correction of the charges of a forward map, fitted to measured presses by generalised least squares.
 
-The correction is a factor on the charge of each electrode, with the polynomials of `calibration.discrepancy` in place
-and logarithm of the force. The covariance of the residuals contains the noise of the charges, and the errors of the
-measured places and forces, which act through the derivatives of the map. The probability of
-several sizes of the correction is computed. If the size zero is the most probable, the charges are not corrected.
+The correction is a factor on the charge of each electrode. Its logarithm is a sum of the polynomials of
+`calibration.discrepancy` in the place and the logarithm of the force. The covariance of the residuals contains the
+noise of the charges, and the errors of the measured places and forces, which act through the derivatives of the map.
+The probability of several sizes of the correction is computed. If the size zero is the most probable, the charges are
+not corrected.
 """
 
 from dataclasses import dataclass
@@ -88,7 +89,9 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Correction:
-    """Smooth factors on the charges of a forward map. A contact beyond the presses has those of the nearest press.
+    """Smooth factors on the charges of a forward map.
+
+    A contact outside the range of the presses has the factors of the nearest press.
 
     Attributes:
         domain: Places and forces of the presses.
@@ -106,7 +109,7 @@ class Correction:
         return not self.coefficients.any()
 
     def log_factor(self, contact: Array) -> Array:
-        """Return what is added to ln Q at contacts (x, y, F), shape (n, 3), mm and N: shape (n, n_electrode)."""
+        """Return the change of ln Q, shape (n, n_electrode), at contacts (x, y, F), shape (n, 3), mm and N."""
         return np.asarray(terms(contact, self.domain) @ self.coefficients)
 
 
@@ -166,7 +169,10 @@ def _linearised(residuals: Residuals, domain: Domain) -> LinearModel:
 
 
 def _log_ratio(ratio: Array) -> Array:
-    """Return the logarithms of ratios of any sign. Below `MIN_RATIO`, charges are mostly noise, the tangent is used."""
+    """Return the logarithms of ratios of any sign.
+
+    Below `MIN_RATIO`, where the charges are mostly noise, the tangent of the logarithm is used.
+    """
     logarithm = np.log(np.maximum(ratio, MIN_RATIO))
     tangent = np.minimum(ratio / MIN_RATIO - 1.0, 0.0)
     return np.asarray(logarithm + tangent)

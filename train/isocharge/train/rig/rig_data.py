@@ -157,7 +157,7 @@ def _draw_dataset(film: CorrectedFilm, count: int, seed: int) -> Dataset:
 
 
 def _provenance(film: CorrectedFilm, presses: MeasuredPresses, is_held_out: Booleans) -> Provenance:
-    """Return card section, metadata and files of a model of the corrected film."""
+    """Return the card section, the metadata and the files of a model of the corrected film."""
     measured = {
         "presses_sha256": presses_sha256(presses),
         "trained_on": int((~is_held_out).sum()),
