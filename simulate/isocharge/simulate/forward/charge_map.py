@@ -1,4 +1,4 @@
-"""Protocol of charge maps, which compute charges from contacts; their domains; checks of contacts and charges."""
+"""Charge maps, which compute charges from contacts, and checks of contacts and charges."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -57,7 +57,7 @@ class Domain:
         return np.asarray((np.hypot(x, y) > self.radius) | (force < low) | (force > high))
 
     def to_unit(self, contact: Array) -> Array:
-        """Scale contacts to [-1, 1]^3, with the logarithm of the force.
+        """Convert contacts into (x, y, ln F), scaled to the cube [-1, 1]^3.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -69,15 +69,17 @@ class Domain:
         return np.asarray((logs - self.centre) / self.scale)
 
     def to_contact(self, unit: Array) -> Array:
-        """Convert scaled contacts, shape (..., 3), into contacts (x, y, F), same shape. This is the inverse of
-        `to_unit`."""
+        """Convert scaled contacts, shape (..., 3), into contacts (x, y, F), same shape.
+
+        This is the inverse of `to_unit`.
+        """
         contact: Array = unit * self.scale + self.centre
         contact[..., 2] = np.exp(contact[..., 2])
         return contact
 
     @property
     def places(self) -> str:
-        """Description of the positions in the domain, for messages."""
+        """Description of the positions in the domain, which error messages contain."""
         return f"at most {self.radius:g} mm from the centre"
 
     def within(self, radius: float) -> "Domain":
@@ -85,7 +87,9 @@ class Domain:
         return Domain(radius, self.force_range)
 
     def contains(self, contact: Array) -> Booleans:
-        """Return which contacts lie in the domain, up to rounding. A contact with NaN lies outside.
+        """Return which contacts lie in the domain.
+
+        The comparison allows for rounding errors. A contact with NaN lies outside.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -175,7 +179,9 @@ class LinearisedMap(ChargeMap, Protocol):
 
 
 def linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
-    """Return the results of `ChargeMap.charges` and `ChargeMap.derivatives`, computed together if the map supports it.
+    """Return the results of `ChargeMap.charges` and `ChargeMap.derivatives`.
+
+    If the map supports it, both are computed together.
 
     Args:
         charge_map: The map.
@@ -284,7 +290,7 @@ def check_forces(force: Array | float, force_range: tuple[float, float], source:
 
 
 def _are_within(force: Array, force_range: tuple[float, float]) -> Booleans:
-    """Return which forces (N) lie in a range (N), up to rounding. NaN lies outside."""
+    """Return which forces (N) lie in a range (N). The comparison allows for rounding errors. NaN lies outside."""
     low, high = force_range
     return np.asarray((force >= low / LIMIT_TOLERANCE) & (force <= high * LIMIT_TOLERANCE))
 

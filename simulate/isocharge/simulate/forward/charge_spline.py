@@ -34,8 +34,10 @@ MAX_KNOT_SPACING = 0.3
 """Largest distance between the knots near an electrode, mm."""
 
 RELATIVE_KNOT_SPACING = 1.0 / 6.0
-"""Largest distance between the knots near an electrode, in units of the reach of the probe, dimensionless. The charge
-of an electrode changes over the length of this reach."""
+"""Largest distance between the knots near an electrode, in units of the reach of the probe, dimensionless.
+
+The charge of an electrode changes over the length of this reach.
+"""
 
 MIN_CELLS = 8
 """Smallest number of cells of the spline across the disk."""
@@ -191,7 +193,9 @@ class ChargeSpline:
         return charge, np.concatenate([position_derivative, log_force_derivative[..., None]], axis=2)
 
     def first_order(self, position: Array, force: Array | float) -> tuple[Array, Array, Array]:
-        """Compute charges and their derivatives, also for positions outside the disk that a solver may try.
+        """Compute charges and their derivatives.
+
+        The positions may lie outside the disk, because a solver may try such positions.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm. Positions outside the disk are moved to its edge.
@@ -216,7 +220,9 @@ class ChargeSpline:
         return charge, position_derivative, log_force_derivative
 
     def force_weights(self, log_force: Array) -> Array:
-        """Compute the weights whose products with the scaled charges at the forces of the splines sum to the charges.
+        """Compute the weights of the scaled charges at the forces of the splines.
+
+        The weighted sum of these scaled charges is the charge.
 
         Args:
             log_force: Logarithms of the forces (N), shape (...).
@@ -273,7 +279,7 @@ def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
 def _force_nodes(forward_map: ForwardMap) -> Array:
     """Return the forces of the splines, shape (n_force,), N.
 
-    These are the forces of the forward map, or more forces if d33 is not zero; see `EXTRA_FORCE_NODES`.
+    If d33 is zero, these are the forces of the forward map. Otherwise there are more forces; see `EXTRA_FORCE_NODES`.
     """
     low, high = np.log(forward_map.domain.force_range)
     if forward_map.sensor.piezo.d33 == 0.0 or low == high:
@@ -281,7 +287,7 @@ def _force_nodes(forward_map: ForwardMap) -> Array:
     return np.asarray(np.exp(chebyshev_nodes(forward_map.family.force.size + EXTRA_FORCE_NODES, low, high)))
 
 
-def _samples(cells: int) -> Array:
+def _fit_positions(cells: int) -> Array:
     """Return the positions of the fitted presses on the unit disk: a lattice, and points on the edge.
 
     Args:
@@ -343,21 +349,23 @@ def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.
     """Fit splines of all charges over the disk.
 
     Args:
-        samples: Scaled charges.
+        samples: Scaled charges to which the splines are fitted.
         radius: Radius of the disk, mm.
         spacing: Largest distance between the knots, mm.
     """
     cells = int(np.clip(np.ceil(2.0 * radius / spacing), MIN_CELLS, MAX_CELLS))
     knots = _knots(-radius, radius, cells)
-    position = radius * _samples(cells)
-    is_needed = np.ones(len(samples.forward_map.electrodes), dtype=bool)
-    return _least_squares(position, samples.at(position, is_needed), (knots, knots), fixed=0)
+    position = radius * _fit_positions(cells)
+    all_electrodes = np.ones(len(samples.forward_map.electrodes), dtype=bool)
+    charge = samples.at(position, all_electrodes)
+    # No coefficients are fixed, because the splines cover the whole disk and need not vanish at its edge.
+    return _least_squares(position, charge, (knots, knots), fixed=0)
 
 
 def _fit_patch(
     samples: _ScaledCharges, electrode: int, radius: float, spacing: float, coarse: "scipy.interpolate.NdBSpline"
 ) -> list[Patch]:
-    """Fit the correction near one electrode. The result is empty if no press of the disk is near the electrode.
+    """Fit the correction near one electrode. If no press of the disk is near the electrode, the result is empty.
 
     Args:
         samples: Scaled charges.

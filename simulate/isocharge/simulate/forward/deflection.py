@@ -1,4 +1,4 @@
-"""Computation of the deflection field that the live page shows: the film under a circular probe."""
+"""Computation of the deflection of the film under a circular probe, which the live page shows."""
 
 import numpy as np
 
@@ -27,8 +27,10 @@ DISTANCES = 5
 """Number of distances in the table."""
 
 INNER_RADIUS = 0.999999
-"""Largest radius of the points at which the deflection is computed, in film radii. Points on the rim may lie outside
-the film because of rounding."""
+"""Largest radius of the points at which the deflection is computed, in film radii.
+
+Points on the rim may lie outside the film because of rounding.
+"""
 
 
 def deflection_field(

@@ -1,4 +1,4 @@
-"""Solves of the derivatives of the stress field, such as those with respect to a side force or the pretension.
+"""Solver of the derivatives of the stress field, for example with respect to a side force or the pretension.
 
 Derivatives are small corrections and need less accuracy than the stress itself. They are therefore solved at fewer
 presses than the stress of a forward map.
@@ -16,7 +16,7 @@ NODE_COUNTS = (6, 6)
 
 
 def solve_derivatives(film: ForwardMap, read: Reading, executor: Executor | None) -> ForwardMap:
-    """Solve `NODE_COUNTS` presses in the domain of a forward map, which takes about ten seconds.
+    """Solve presses in the domain of a forward map. The solves of all `NODE_COUNTS` presses take about ten seconds.
 
     Args:
         film: Forward map of the film, whose probe is a circle. Its mesh and its readout are used.

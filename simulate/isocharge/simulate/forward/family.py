@@ -1,4 +1,4 @@
-"""Families of presses with one probe. The presses at the nodes are solved, and all others are interpolated."""
+"""Families of presses with one probe. The presses at the nodes are solved, and all other presses are interpolated."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -27,8 +27,11 @@ from isocharge.simulate.solver.load_case import SolveSettings, check_press
 from isocharge.simulate.solver.press import press
 
 ROTATIONS = 7
-"""Smallest number of orientations of the probe. A few orientations suffice, because the rim of the film is far from the
-probe, so that the stress depends on the orientation through a few harmonics only."""
+"""Smallest number of orientations of the probe.
+
+A few orientations suffice, because the rim of the film is far from the probe, so that the stress depends on the
+orientation through a few harmonics only.
+"""
 
 
 class NodeCount(NamedTuple):
@@ -51,8 +54,11 @@ NODE_COUNTS = (
     NodeCount(10, 7, 3 * ROTATIONS),
     NodeCount(13, 12, 3 * ROTATIONS),
 )
-"""Numbers of nodes that are tried one after the other. The last entry is for films with a large pretension, whose
-charges change from one power of the force to another and pass through zero."""
+"""Numbers of nodes that are tried one after the other.
+
+The last entry is for films with a large pretension, whose charges change from one power of the force to another and
+pass through zero.
+"""
 
 
 @dataclass(frozen=True)
@@ -180,10 +186,10 @@ class Family:
         return solved.reshape(self.distance.size, self.solved_rotations.size, self.force.size, -1)
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
-        """Compute the stress of all orientations from the solved orientations, by the symmetry of the probe.
+        """Compute the stress of all orientations from that of the solved orientations, by the symmetry of the probe.
 
         Rotating a probe by one of its periods gives the same press in a rotated mesh. The stress of a further period is
-        therefore the stress of the solved period at rotated elements, with rotated components.
+        therefore the stress of the solved period. Its elements and its components are rotated.
 
         Args:
             solved: Scaled stress in a frame that rotates with the probe, shape

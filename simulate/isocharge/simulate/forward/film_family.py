@@ -6,9 +6,9 @@ press depends on five numbers (`mechanics.scaling`):
     distance / a,   F / (E h a),   pretension / E,   h / a,   R / a,
 
 and on Poisson's ratio, which is the same for all films of a family. In a frame that moves with the probe, the stress at
-the nodes of the mesh is a smooth function of the five numbers. The stress is solved at the nodes of a Chebyshev grid
-and interpolated between them. The stresses on the grid are stored as a proper orthogonal decomposition with about fifty
-modes (Sirovich 1987). The forward map of one film is interpolated over the last three numbers, which takes a
+the nodes of the mesh is a smooth function of these five parameters. The stress is solved at the nodes of a Chebyshev
+grid and interpolated between them. The stresses on the grid are stored as a proper orthogonal decomposition with about
+fifty modes (Sirovich 1987). The forward map of one film is interpolated over the last three parameters, which takes a
 millisecond.
 
 Files contain the coefficients and modes as integers. Modes with small contributions have fewer bits. The rounding
@@ -331,7 +331,9 @@ def _check_shapes(arrays: Mapping[str, Any]) -> None:
 
 
 def _check_back(film: Film) -> None:
-    """Raise an error if a film has a closed back or a static pressure, which the axes of a family do not include.
+    """Raise an error if a film has a closed back or a static pressure.
+
+    The axes of a family do not include these properties.
 
     Raises:
         SceneError: If the film has a closed back or a static pressure.

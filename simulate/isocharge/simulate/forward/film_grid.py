@@ -29,7 +29,7 @@ FilmLimits = dict[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class FilmGrid:
-    """Nodes of a family, with one ascending array for each of `AXES`.
+    """Nodes of a family of films: one ascending array for each of `AXES`.
 
     E is Young's modulus, h the thickness and a the radius of the film.
 
@@ -86,8 +86,9 @@ class FilmGrid:
 def _interpolation_coordinate(axis: str, value: Array | float) -> Any:
     """Return the coordinate in which the stress is interpolated along an axis.
 
-    The coordinate of the load and the reach is their logarithm, that of the tension is the logarithm of its sum with
-    `SOFTENING`, and that of the distance is `distance_coordinate`. The thickness is its own coordinate.
+    For the load and the reach, the coordinate is the logarithm of the value. For the tension, it is the logarithm of
+    the sum of the tension and `SOFTENING`. For the distance, it is `distance_coordinate`. The thickness is its own
+    coordinate.
 
     Args:
         axis: One of `AXES`.

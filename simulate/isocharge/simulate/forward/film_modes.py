@@ -1,7 +1,7 @@
 """Change of the charges by the imperfections of a film, to first order, for every film of a family and any contact.
 
-The tension or the stiffness of a film may depend on the direction, the clamp may be oval, the piezoelectric axes may be
-rotated, Poisson's ratio may differ from the assumed value, and the wires may have crosstalk. Each of these
+The tension or the stiffness of a film may depend on the direction. The clamp may be oval, and the piezoelectric axes
+may be rotated. Poisson's ratio may differ from the assumed value, and the wires may have crosstalk. Each of these
 imperfections is a mode: a first-order change of the charges about those of an isotropic round film.
 
 `MODES` declares each mode once, and `ModeMap` computes the charges of all modes. Some modes need the change of the
@@ -62,7 +62,7 @@ class PressedFilm:
         return np.asarray(film.young * amplitude_squared(film, self.contact[:, 2]) + film.pretension)[:, None]
 
     def even_and_odd(self, kind: str) -> tuple[Array, Array]:
-        """Return the charges of the even and the odd field of an imperfection, per unit of its modes.
+        """Return the charges of the even field and of the odd field of an imperfection, for one unit of its modes.
 
         Args:
             kind: Name of an imperfection with two axes, from `FIELDS`.
@@ -245,8 +245,10 @@ class ModeMap:
 
 
 KINDS = [kind for kind, fields in FIELDS.items() for _ in fields]
-"""Kind of imperfection of each field, in the order of the field numbers. The even field of a kind precedes its odd
-field."""
+"""Kind of imperfection of each field, in the order of the field numbers.
+
+The even field of a kind precedes its odd field.
+"""
 
 
 class SolvedFilms(Protocol):

@@ -1,12 +1,12 @@
 """The forward map: the charges of many presses, computed from a few solves.
 
-The presses of one probe form a family with three coordinates: the distance from the centre, the force and, unless the
-probe is axisymmetric, the orientation. Presses in other directions from the centre follow by a rotation of the film. In
-a frame that moves with the probe, the stress at the nodes of the mesh is a smooth function of the coordinates. The
-press is solved at Chebyshev nodes in the distance and in the logarithm of the force, and at evenly spaced orientations.
-For every other press, the stress field is interpolated, and the charges are integrated from the interpolated field. The
-electrodes therefore do not affect the interpolation, even if the probe lies on an electrode. When a map is built, its
-charges are compared with those of direct solves.
+The presses of one probe form a family. Its coordinates are the distance from the centre and the force. If the probe is
+not axisymmetric, the orientation is a third coordinate. Presses in other directions from the centre are obtained by a
+rotation of the film. In a frame that moves with the probe, the stress at the nodes of the mesh is a smooth function of
+the coordinates. The press is solved at Chebyshev nodes in the distance and in the logarithm of the force, and at evenly
+spaced orientations. For every other press, the stress field is interpolated, and the charges are integrated from the
+interpolated field. The electrodes therefore do not affect the interpolation, even if the probe lies on an electrode.
+When a map is built, its charges are compared with those of direct solves.
 """
 
 from concurrent.futures import Executor
@@ -171,7 +171,7 @@ class ForwardMap:
 
     @property
     def settings(self) -> SolveSettings:
-        """Theory and mesh of the solves, for the solve of a single press or of another map.
+        """Theory and mesh of the solves. With these settings, a single press or another map can be solved.
 
         The width of the thin rings remains "auto".
         """
@@ -229,7 +229,7 @@ class ForwardMap:
         return differences(lambda moved: self._unchecked_charges(moved, np.zeros(len(moved))), contact)
 
     def relative_error(self, check: CheckPress, direct: Array) -> float:
-        """Compute the largest relative error of the charges of one press with respect to a direct solve.
+        """Compute the largest relative difference between the charges of one press and those of a direct solve.
 
         The error of a charge is divided by the charge, or by `CHARGE_FLOOR` times the largest charge of the press if
         this product is larger.
@@ -245,7 +245,7 @@ class ForwardMap:
         return float((np.abs(interpolated - direct) / scale).max())
 
     def field_charges(self, contact: Array, is_odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
-        """Compute the charges of several stress fields that the table contains, under a circular probe.
+        """Compute the charges of several stress fields that the table contains, for a circular probe.
 
         The fields are small corrections, so the coarse integration rule is used for all electrodes, and the pressure on
         the electrodes and the crosstalk are omitted.
@@ -254,21 +254,22 @@ class ForwardMap:
             contact: Presses (x, y, F) in the domain, shape (n, 3), mm and N.
             is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
                 (n_field,). The table contains the values of all fields at one node, then those at the next node.
-            readout: Integration points of the charges; None for those of the electrodes.
+            readout: Integration points of the charges; None for the coarse rule of the electrodes.
 
         Returns:
             Shape (n, n_electrode, n_field), pC.
         """
         x, y, force = contact.T
         position = x + 1j * y
-        readout = readout or self._coarse_readout
-        all_pairs = np.ones((position.size, len(readout.count)), dtype=bool)
+        orientation = np.zeros(1)  # the same for all presses, because a circular probe has no orientation
+        rule = readout or self._coarse_readout
+        all_pairs = np.ones((position.size, len(rule.count)), dtype=bool)
         charges = []
         with single_threaded_blas():
             for start in range(0, position.size, CHUNK_SIZE):
                 chunk = slice(start, start + CHUNK_SIZE)
-                rules = ((readout, all_pairs[chunk]),)
-                charges.append(self._integrate_fields(position[chunk], force[chunk], np.zeros(1), is_odd, rules))
+                rules = ((rule, all_pairs[chunk]),)  # a single rule for all pairs of a press and an electrode
+                charges.append(self._integrate_fields(position[chunk], force[chunk], orientation, is_odd, rules))
         return np.concatenate(charges)
 
     def stress_charges_by_force(self, position: Array, is_needed: Booleans) -> Array:
@@ -287,6 +288,7 @@ class ForwardMap:
         stacked_map = self._stacked_forces  # has one even field for each force
         first_force = stacked_map.family.force[0]
         is_odd = np.zeros(self.family.force.size, dtype=bool)
+        orientation = np.zeros(1)  # the probe keeps its orientation for all presses
         chunk_size = max(1, CHUNK_SIZE // self.family.force.size)
         charges = []
         with single_threaded_blas():
@@ -294,7 +296,7 @@ class ForwardMap:
                 chunk = complex_position[start : start + chunk_size]
                 rules = tuple((readout, pairs & is_needed) for readout, pairs in self._rules(chunk))
                 force = np.full(chunk.size, first_force)
-                charges.append(stacked_map._integrate_fields(chunk, force, np.zeros(1), is_odd, rules))
+                charges.append(stacked_map._integrate_fields(chunk, force, orientation, is_odd, rules))
 
         # All fields were multiplied by the stress unit of the first force. Replace it by the unit of each force.
         film = self.sensor.film
@@ -302,7 +304,7 @@ class ForwardMap:
         return np.asarray(np.concatenate(charges).swapaxes(1, 2) * unit_ratio[:, None])
 
     def pressure_charges(self, position: Array) -> Array:
-        """Compute the charges of the pressure on the electrodes per force, without crosstalk.
+        """Compute the charges that the contact pressure causes, divided by the force. Crosstalk is omitted.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
@@ -314,10 +316,7 @@ class ForwardMap:
 
     @cached_property
     def _stacked_forces(self) -> "ForwardMap":
-        """Map for a single force, whose table contains the stress of every force as a separate field.
-
-        The table has single precision.
-        """
+        """Map for one force, whose table contains the stress of every force as a field in single precision."""
         n_distance = self.family.distance.size
         n_force = self.family.force.size
         n_rotation = self.family.rotation.size
@@ -362,7 +361,7 @@ class ForwardMap:
         return self.sensor.calibration.read(charge)
 
     def _pressure_charges(self, position: Complexes, orientation: Array) -> Array:
-        """Compute the charges of the pressure on the electrodes per force, without crosstalk.
+        """Compute the charges that the contact pressure causes, divided by the force. Crosstalk is omitted.
 
         Args:
             position: Positions x + iy, shape (n,), mm.
@@ -441,7 +440,7 @@ class ForwardMap:
         return ReadoutPoints.of(self.sensor, FAR)
 
     def _rules(self, position: Complexes) -> tuple[tuple[ReadoutPoints, Booleans], ...]:
-        """Return the integration rules for presses, each with the pairs of press and electrode that use the rule.
+        """Return the integration rules for presses, and the pairs of press and electrode that use each rule.
 
         Args:
             position: Positions x + iy, shape (n,), mm.

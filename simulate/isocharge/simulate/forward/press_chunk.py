@@ -1,4 +1,4 @@
-"""Integration of the interpolated stress fields of several presses over the electrodes, which gives the charges."""
+"""Charges of several presses, computed by integration of the interpolated stress fields over the electrodes."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from isocharge.simulate.numerics.interpolation import tensor_values
 
 @dataclass(frozen=True)
 class PressChunk:
-    """Interpolated stress fields of some presses, ready for the integration of charges.
+    """Interpolated stress fields of some presses, from which charges are integrated.
 
     Attributes:
         mesh: Template of the mesh.

@@ -44,8 +44,10 @@ LINE_POINTS = 8
 """Number of Gauss points on a line."""
 
 NEAR = 1.0
-"""Distance between the footprint and an electrode below which the fine rule is used, mm. At larger distances the
-relative error of the coarse rule is at most 1e-4 for squares of 1 to 6 mm."""
+"""Distance between the footprint and an electrode below which the fine rule is used, mm.
+
+At larger distances the relative error of the coarse rule is at most 1e-4 for squares of 1 to 6 mm.
+"""
 
 FAR_DISTANCE = 8.0
 """Distance between the press and the parts of an electrode above which `FAR` points are used, in radii of the parts,
@@ -81,7 +83,7 @@ class ReadoutPoints:
 
     @classmethod
     def along(cls, sensor: Sensor, lines: Array) -> "ReadoutPoints":
-        """Return integration points on straight lines of metal that belong to the electrodes.
+        """Return the integration points for straight lines of metal that belong to the electrodes, such as traces.
 
         Args:
             sensor: Sensor whose coefficients and calibration are used.
@@ -92,17 +94,19 @@ class ReadoutPoints:
             pC/(MPa mm).
         """
         position, line_weights = gauss_line(LINE_POINTS)
-        start = lines[:, :, :1]
+        start = lines[:, :, :1]  # shape (n_electrode, n_line, 1, 2)
         direction = lines[:, :, 1:] - start
-        points = start + position[:, None] * direction
+        points = start + position[:, None] * direction  # shape (n_electrode, n_line, LINE_POINTS, 2)
         placed_points = sensor.calibration.place(points.reshape(-1, LINE_POINTS, 2))
 
-        # Weight of a point: gain * share of the length * charge per area and stress (s11, s22, s12)
-        length = np.linalg.norm(direction, axis=3)
-        weighted_length = (sensor.gains[:, None, None] * length * line_weights).reshape(-1, LINE_POINTS, 1)
+        # Weight of a point: gain * length that the point represents * charge per area and stress (s11, s22, s12)
+        length = np.linalg.norm(direction, axis=3)  # shape (n_electrode, n_line, 1)
+        point_length = length * line_weights  # shape (n_electrode, n_line, LINE_POINTS)
+        amplified_length = sensor.gains[:, None, None] * point_length
         charge_per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
+        weights = amplified_length.reshape(-1, LINE_POINTS, 1) * charge_per_stress
         point_counts = np.full(len(placed_points), LINE_POINTS)
-        return cls(placed_points, weighted_length * charge_per_stress, point_counts)
+        return cls(placed_points, weights, point_counts)
 
     def charge(self, stress: Array) -> Array:
         """Compute charges from the stress at the points.
@@ -119,7 +123,7 @@ class ReadoutPoints:
 
 @lru_cache(maxsize=32)
 def _layout_points(electrodes: tuple[Electrode, ...], readout: Readout, per_side: int) -> ReadoutPoints:
-    """Return the integration points at the nominal positions of the electrodes, with areas (mm^2) as weights.
+    """Return the integration points at the nominal positions of the electrodes. The weights are areas (mm^2).
 
     The result is cached, because many films have the same layout.
 
@@ -173,7 +177,7 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
 
 
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
-    """Compute the charge that the contact pressure induces on the electrodes, d33 * mean(s33) per area.
+    """Compute the charge that the contact pressure induces on the electrodes. The charge per area is d33 * mean(s33).
 
     The back of the film is free. Through the thickness, s33 changes from minus the contact pressure at the probe to
     zero at the back, so the mean of s33 is minus half of the pressure. Only the part of an electrode under the
@@ -237,7 +241,7 @@ def electrode_rule(electrode: Electrode, readout: Readout, per_side: int) -> tup
 
 
 def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
-    """Return the integration points of a mean over the area of an electrode.
+    """Return the integration points for the mean of the stress over the area of an electrode.
 
     Args:
         electrode: The electrode.

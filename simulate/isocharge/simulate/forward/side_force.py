@@ -5,8 +5,8 @@ A side force (Fx, Fy) of the probe on the film changes the charges to first orde
     dQ = jacobian @ (Fx, Fy).
 
 The stress fields of a side force along and across the direction of the press are solved with the tangent of the
-equilibrium (`solver.sensitivity`) at a few distances and forces, and interpolated as in a forward map. For side forces
-up to 0.2 of the force, the terms of second order are smaller than 1 % of dQ.
+equilibrium (`solver.sensitivity`). They are solved at a few distances and forces, and interpolated as in a forward map.
+For side forces up to 0.2 of the force, the terms of second order are smaller than 1 % of dQ.
 
 Example:
 

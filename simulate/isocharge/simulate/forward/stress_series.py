@@ -108,7 +108,7 @@ def _automorphism(distance: float, probe_radius: float) -> tuple[float, float]:
 
 
 def _stress_sum(forward_map: ForwardMap, distance_mm: float, force_N: float, points_mm: Complexes) -> Array:
-    """Compute the sum s11 + s22 of the stresses under a press on the x axis.
+    """Compute the sum s11 + s22 of the stress components for a press on the x axis.
 
     Args:
         forward_map: Forward map of the film.
@@ -130,7 +130,7 @@ def _stress_sum(forward_map: ForwardMap, distance_mm: float, force_N: float, poi
 
 
 def _coefficients(values: Array) -> Array:
-    """Compute the Chebyshev coefficients of the polynomial that interpolates values at the Chebyshev nodes of all axes.
+    """Compute the Chebyshev coefficients of the polynomial that has given values at the Chebyshev nodes of all axes.
 
     Args:
         values: Values at the nodes. The number of nodes of each axis is its length.

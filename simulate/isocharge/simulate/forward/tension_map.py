@@ -4,9 +4,9 @@ A change of the pretension by (T11, T22, T12) changes the charges to first order
 
     dQ = tension_jacobian @ (T11, T22, T12).
 
-The stress fields are solved with the tangent of the equilibrium (`solver.sensitivity`) at a few distances and forces,
-and interpolated as in a forward map. If the film becomes warmer than its ring, its pretension changes. The module
-`mechanics.film_temperature` computes this change.
+The stress fields are solved with the tangent of the equilibrium (`solver.sensitivity`) at a few distances and forces.
+Between these distances and forces they are interpolated, as in a forward map. If the film becomes warmer than its ring,
+its pretension changes. The module `mechanics.film_temperature` computes this change.
 
 Example:
 
@@ -92,7 +92,8 @@ class TensionMap:
         return np.stack([calibration.read(derivative) for derivative in components], axis=2)
 
     def temperature_jacobian(self, contact: Array) -> Array:
-        """Compute the change of the touch charges per kelvin by which the film is warmer than its ring.
+        """Compute the change of the touch charges per kelvin of the temperature difference between the film and its
+        ring. The difference is positive if the film is warmer.
 
         The change does not include the pyroelectric charge.
 

@@ -21,15 +21,19 @@ from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 
 COARSE_ERROR = 0.05
-"""Largest relative error of a charge of the coarse map, dimensionless. The error is below 0.5 % up to two thirds of the
-film radius."""
+"""Largest relative error of a charge of the coarse map, dimensionless.
+
+The error is below 0.5 % up to two thirds of the film radius.
+"""
 
 COARSE_RESOLUTION = Resolution(order=5, around=8, rings=6, rim=2)
 """Mesh of the solves."""
 
 RIM_GAP = 1.2
-"""Smallest gap between the probe and the clamp, in units of the reach of the probe, dimensionless. The mesh does not
-resolve narrower gaps."""
+"""Smallest gap between the probe and the clamp, in units of the reach of the probe, dimensionless.
+
+The mesh does not resolve narrower gaps.
+"""
 
 DISTANCES = 12
 """Number of distances from the centre at which presses are solved."""
@@ -39,7 +43,7 @@ FORCES = 4
 
 
 def outermost_distance(film: Film, probe: Probe) -> float:
-    """Return the largest distance of a press from the centre that the coarse map covers, mm; see `RIM_GAP`."""
+    """Return the largest distance (mm) from the centre at which the coarse map covers presses; see `RIM_GAP`."""
     return film.radius - (1.0 + RIM_GAP) * probe.reach
 
 

@@ -1,13 +1,10 @@
 """Pressure on the whole film: a static pressure, and the pressure of the air that is trapped behind the film.
 
-If the film displaces the volume V of a closed cavity with the volume V0, the pressure of the trapped air rises by
-
-    p0 V0 / (V0 - V) - p0,
-
-where p0 is the pressure of the atmosphere (Boyle's law, at constant temperature). The energy of the air is
--p0 V0 (ln(1 - V / V0) + V / V0). The static pressure and the pressure of the air act along the direction of the push on
-the area of the undeformed film, as in the theory of plates. In the units of `mechanics.scaling`, V / V0 is the product
-of `compression` and the integral of W over the film.
+Let V0 be the volume of a closed cavity, and p0 the pressure of the atmosphere. If the film displaces the volume V, the
+pressure of the trapped air rises by p0 V0 / (V0 - V) - p0 (Boyle's law, at constant temperature). The energy of the air
+is -p0 V0 (ln(1 - V / V0) + V / V0). The static pressure and the pressure of the air act along the direction of the push
+on the area of the undeformed film, as in the theory of plates. In the units of `mechanics.scaling`, V / V0 is the
+product of `compression` and the integral of W over the film.
 """
 
 from functools import cached_property
@@ -42,7 +39,7 @@ class BackPressure:
         return self.geometry.gather(self.geometry.mass)
 
     def energy(self, deflection: Array) -> float:
-        """Compute the energy of the meshed part of the film for a deflection W, shape (n_node,).
+        """Compute the energy of the pressures on the meshed part of the film for a deflection W, shape (n_node,).
 
         The energy is infinite if the film displaces the whole volume of the air.
         """
@@ -86,7 +83,9 @@ class BackPressure:
         return self._copies * float(self.weights @ deflection)
 
     def _air_energy(self, deflection: Array) -> float:
-        """Compute the energy of the air over p0 V0, which is -ln(1 - x) - x for the relative compression x = V / V0.
+        """Compute the ratio of the energy of the air to p0 V0.
+
+        The ratio is -ln(1 - x) - x for the relative compression x = V / V0.
 
         Args:
             deflection: W at the nodes, shape (n_node,).

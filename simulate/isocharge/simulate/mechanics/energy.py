@@ -34,8 +34,10 @@ COMPONENT_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Pairs of displacement components whose blocks of the tangent are computed. The other blocks follow by symmetry."""
 
 SHIFT = 5.0
-"""Shift s of the linear solves with bending; see `Bending`. It must lie between 0 and 11.56, which is twice the lowest
-eigenvalue of the film."""
+"""Shift s of the linear solves with bending; see `Bending`.
+
+It must lie between 0 and 11.56, which is twice the lowest eigenvalue of the film.
+"""
 
 
 class ElasticFilm:
@@ -183,7 +185,7 @@ class Membrane:
         return elastic_stress
 
     def _slope(self, field: Array) -> Array:
-        """Compute d(U1, U2, W)/d(X1, X2) at the quadrature points.
+        """Compute the derivatives of (U1, U2, W) with respect to (X1, X2) at the quadrature points.
 
         Args:
             field: Scaled displacements, shape (n_node, 3).

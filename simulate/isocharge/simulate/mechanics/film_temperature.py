@@ -42,7 +42,7 @@ def tension_change(film: Film, film_K: float, ring_K: float) -> Array:
 
 
 def warmed(sensor: Sensor, film_K: float, ring_K: float = 0.0) -> Sensor:
-    """Return the sensor with the pretension that it has at other temperatures of the film and of its ring.
+    """Return a copy of the sensor with the pretension at other temperatures of the film and of its ring.
 
     Args:
         sensor: The sensor at the temperatures for which it is described.

@@ -7,9 +7,9 @@ Under a central force F, the deflection of the centre is w = a A. The force F / 
     16 pi b A               for a plate, with b = (h / a)^2 / (12 (1 - poisson^2))
 
 (Schwerin 1929; Timoshenko and Woinowsky-Krieger 1959, art. 19). The amplitude A is the solution of the cubic equation
-in which the sum of the three terms is equal to F / (E h a). This is a good approximation also between the limiting
-cases. The in-plane displacement is proportional to A^2. After this scaling, only the ratios of the terms remain as
-parameters of the press.
+in which the sum of the three terms is equal to F / (E h a). Between the limiting cases, this amplitude is also a good
+approximation. The in-plane displacement is proportional to A^2. After this scaling, only the ratios of the terms remain
+as parameters of the press.
 """
 
 from dataclasses import dataclass, replace
@@ -152,7 +152,7 @@ class DimensionlessGroups:
     def height(self) -> float:
         """Approximate deflection of the centre in units of a A.
 
-        It is one for the groups that `of` computes with bending for a film with a vented back.
+        If the back of the film is vented and `of` computes the groups with bending, the approximate deflection is one.
         """
         linear = MEMBRANE_STIFFNESS * max(self.tension, 0.0) + PLATE_STIFFNESS * self.bending
         air = AIR_SHAPE * self.ambient_pressure * self.compression
@@ -217,7 +217,7 @@ def _anisotropy(film: Film, amplitude2: float, angle: float) -> Anisotropy:
 
 
 def orthotropic_moduli(film: Film) -> Array:
-    """Compute the difference between the elasticity matrix C over E of a film and that of an isotropic film.
+    """Compute the matrix C / E of a film minus the matrix C / E of an isotropic film, where C is the elasticity matrix.
 
     The axes are those of the film. The moduli along the axes are E1 = E r and E2 = E / r, with r^2 = E1 / E2.
 

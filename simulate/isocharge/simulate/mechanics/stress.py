@@ -6,7 +6,7 @@ from isocharge.common.arrays import Array
 
 
 def principal_stresses(stresses: Array) -> tuple[float, float]:
-    """Compute the smallest and the largest of the principal stresses of many stresses.
+    """Compute the smallest and the largest principal stress that occur in an array of stresses.
 
     Args:
         stresses: Stresses (S11, S22, S12), shape (..., 3).

@@ -1,11 +1,11 @@
-"""The choice between the theories of the film, and the error of the terms that a theory omits.
+"""The choice between the theories of the film, and estimates of the error that an omitted term causes.
 
-All theories are special cases of one formulation with two optional terms. The first term is *bending*. It matters
-within the bending length l = sqrt(D / N) of the rim and of the probe, where D is the bending stiffness and N is the
-tension force per length, and for the stress at the surface of the film. If the pretension and the induced tension are
-small, bending carries the load. The second term is *stretching*, the effect of the induced stress on the deflection.
-Without stretching the film is linear, and the charges are computed from the linear deflection in a second step. The
-pretension is always included.
+All theories are special cases of one formulation with two optional terms. The first term is *bending*. It matters near
+the rim and near the probe, and for the stress at the surface of the film. The distance up to which it matters is the
+bending length l = sqrt(D / N), with the bending stiffness D and the tension force N per length. If the pretension and
+the induced tension are small, bending carries the load. The second term is *stretching*, the effect of the induced
+stress on the deflection. Without stretching the film is linear, and the charges are computed from the linear deflection
+in a second step. The pretension is always included.
 
     stretching  bending   theory
     no          yes       linear plate, pre-tensioned linear plate
@@ -32,19 +32,26 @@ LINEAR_WEIGHT = 4.0
 carries."""
 
 LOCAL_WEIGHT = 0.4
-"""Factor of the relative error of a charge by a linear theory of a film with a large pretension. It multiplies the
-ratio of the strain that the footprint induces to the strain of the pretension."""
+"""Factor of the relative error of a charge by a linear theory of a film with a large pretension.
+
+It multiplies the ratio of the strain that the footprint induces to the strain of the pretension.
+"""
 
 BENDING_WEIGHT = 1.5
-"""Factor of the largest relative error of a charge without bending. It multiplies the ratio of the bending length to
-the film radius. The largest factor in the reference cases of tests/data is 1.41."""
+"""Factor of the largest relative error of a charge without bending.
+
+It multiplies the ratio of the bending length to the film radius. The largest factor in the reference cases of
+tests/data is 1.41.
+"""
 
 MAX_MEMBRANE_BENDING_LENGTH = 0.3
 """Bending length, in film radii, above which a membrane does not describe the film. The error is then infinite."""
 
 PROBE_WEIGHT = 4.0
-"""Factor of the relative error of a charge without bending, for a film with a large pretension. It multiplies the
-squared ratio of the bending length at the probe to the reach of the probe."""
+"""Factor of the relative error of a charge without bending, for a film with a large pretension.
+
+It multiplies the squared ratio of the bending length at the probe to the reach of the probe.
+"""
 
 INDUCED_STRAIN = 0.44
 """Radial strain at the rim of a membrane without pretension, in units of the squared amplitude A^2."""
@@ -111,10 +118,10 @@ def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
 
 
 def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
-    """Estimate the ratio of the strain that the footprint induces in a film to the strain of the pretension T.
+    """Estimate the strain that the footprint induces in a film, divided by the strain of the pretension T.
 
-    The slope of a film with a large pretension at the footprint is F / (2 pi R h T). If the bending length exceeds the
-    footprint, bending reduces the slope.
+    If the pretension is large, the slope of the film at the footprint is F / (2 pi R h T). If the bending length
+    exceeds the footprint, bending reduces the slope.
 
     Args:
         film: The film.
@@ -134,7 +141,7 @@ def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
 
 
 def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
-    """Estimate the relative error of a charge by the terms that a theory omits.
+    """Estimate the relative error of a charge that is caused by the terms that a theory omits.
 
     Args:
         film: The film.

@@ -1,4 +1,4 @@
-"""The elements of the mesh and their adjacency, which depend neither on the position of the probe nor on the film.
+"""The elements of the mesh and their adjacency, which are the same for every position of the probe and every film.
 
 The innermost circle of the mesh encloses the footprint. The mesh consists of three parts:
 
@@ -46,7 +46,7 @@ class Resolution:
 
     @property
     def description(self) -> str:
-        """The four numbers as a text, such as "order 4, around 8, rings 5, rim 0"."""
+        """Text with the four numbers of the resolution, such as "order 4, around 8, rings 5, rim 0"."""
         return ", ".join(f"{name} {value}" for name, value in asdict(self).items())
 
     def __post_init__(self) -> None:
@@ -135,10 +135,11 @@ class Blocks:
 
     @cached_property
     def boundary(self) -> Array:
-        """Points along the edges of the core polygon as weights of its corners and its centroid.
+        """Points along the edges of the core polygon.
 
-        The shape is (n_sector + 1, n_corner + 1). The points follow anticlockwise from the middle of the edge before
-        the first corner.
+        Each point is described by weights of the corners and the centroid of the polygon. The shape is
+        (n_sector + 1, n_corner + 1). The points follow anticlockwise from the middle of the edge before the
+        first corner.
         """
         corners = np.eye(self.n_corner + 1)[:-1]  # the weights of a corner are zero except for its own
         middles = 0.5 * (corners + np.roll(corners, -1, axis=0))  # of the edges after the corners

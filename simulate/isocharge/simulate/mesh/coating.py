@@ -42,7 +42,7 @@ class Coating:
     added: Array
 
     def near(self, points: Complexes) -> Booleans:
-        """Return which points may lie on the coat or near the coat. The result is only a fast estimate.
+        """Return for each point whether it may lie on the coat or near the coat. The result is only a fast estimate.
 
         It is true for all points on the coat and in the band, for some points near the coat, and false for distant
         points.
@@ -67,7 +67,7 @@ class Coating:
         return np.asarray(mixture - self.bare)
 
     def film_strain(self, points: Complexes, mean_strain: Array) -> Array:
-        """Compute the strain of the phase in which each point lies, from the mean strain of the laminate.
+        """Compute the strain at points from the mean strain of the laminate. Each point lies in one of the phases.
 
         Args:
             points: Film points x + iy, shape (n,), in film radii.
@@ -87,7 +87,7 @@ class Coating:
         return np.asarray(np.abs(points - middle) < np.abs(part - middle).max() + self.band_width)
 
     def _shares(self, points: Complexes) -> Array:
-        """Compute the share of a small disk about each point that each layer covers.
+        """For a small disk about each point, compute the share of its area that each layer covers.
 
         The diameter of the disk is the width of the band along the edges.
 
@@ -166,7 +166,7 @@ class Coating:
 
 
 class _Laminate(NamedTuple):
-    """Laminates of the bare film and the film with one, two, ... layers of the coat.
+    """Laminates of the bare film and of the film with one, two, ... layers of the coat.
 
     Attributes:
         shares: Volume shares of the phases, shape (..., n_phase).

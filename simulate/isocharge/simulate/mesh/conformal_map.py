@@ -33,7 +33,7 @@ BISECTION_STEPS = 40
 
 
 def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
-    """Compute the parameters of the conformal map that maps a circle |z| = rho onto a given circle; see `placement`.
+    """Compute the parameters of the conformal map that maps the circle |z| = rho onto a given circle; see `placement`.
 
     Args:
         centre: Centre of the circle on the x axis, any shape, in film radii.
@@ -201,7 +201,9 @@ def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
 
 
 def stretch_angles(angle: Array, factor: Array) -> Array:
-    """Multiply the tangent of half of each angle by a factor, which is the effect of the conformal map on a circle.
+    """Multiply the tangent of half of each angle by a factor.
+
+    The conformal map changes the angles on a circle in this way.
 
     The conformal map changes the angles on the circle |z| = rho with the factor (1 - c rho) / (1 + c rho). For the rim,
     rho is 1.
@@ -258,8 +260,8 @@ def widest_layer(resolution: Resolution, c: Array, rho: Array) -> Array:
 
 
 def _max_thin_depth(resolution: Resolution) -> float:
-    """Return the largest depth of all thin rings together.
+    """Return the largest total depth of the thin rings.
 
-    It is the depth that each ring would have if the thin rings together counted as one ring, and all had equal depths.
+    If the thin rings counted as a single ring and all rings had equal depths, each ring would have this depth.
     """
     return 1.0 / (resolution.rings + 1)

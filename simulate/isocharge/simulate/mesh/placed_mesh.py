@@ -98,7 +98,7 @@ class Geometry:
 
     @property
     def stacked(self) -> Array:
-        """The gradient with a common axis for points and derivatives, shape (n_element, n_point * 2, n_local)."""
+        """Gradient with a common axis for the points and both derivatives, shape (n_element, n_point * 2, n_local)."""
         return self.gradient.reshape(len(self.gradient), -1, self.gradient.shape[-1])
 
     def gather(self, local: Array) -> Array:
@@ -144,12 +144,12 @@ class PlacedMesh:
 
     @cached_property
     def points(self) -> Complexes:
-        """Film points of the nodes of every element, shape (n_element, n_local), in film radii."""
+        """Positions of the nodes of every element on the film, x + iy, shape (n_element, n_local), in film radii."""
         return self.template.from_base(to_oval(self.placement.element_points(self.template), self.oval))
 
     @property
     def node_points(self) -> Complexes:
-        """Film points of the nodes, shape (n_node,), in film radii."""
+        """Positions of the nodes on the film, x + iy, shape (n_node,), in film radii."""
         return np.asarray(self.points.ravel()[self.template.first_seen])
 
     @cached_property
@@ -298,7 +298,10 @@ def from_oval(points: Complexes, oval: complex) -> Complexes:
 
 
 def _relative_displacement(radius: Array) -> Array:
-    """Return the ratio of the displacement at a radius to that of the rim: 0 at `UNDEFORMED_RADIUS`, 1 at the rim."""
+    """Return the ratio of the displacement at a radius to the displacement of the rim.
+
+    The ratio is 0 at `UNDEFORMED_RADIUS` and 1 at the rim.
+    """
     return np.asarray(((radius - UNDEFORMED_RADIUS) / (1.0 - UNDEFORMED_RADIUS)) ** 3)
 
 

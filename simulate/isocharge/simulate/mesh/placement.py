@@ -124,7 +124,7 @@ class Placement:
         return self._with_arrays(lambda values: values[indices])
 
     def batch(self) -> "Placement":
-        """Return a single placement as a batch of one placement."""
+        """Return a single placement with an additional axis of length one, as for several presses."""
         return self._with_arrays(lambda values: np.asarray(values)[None])
 
     def _with_arrays(self, function: Callable[[Any], Any]) -> "Placement":
@@ -166,8 +166,8 @@ class Placement:
     def _inner_element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes of the elements inside the innermost circle.
 
-        A point is a linear blend between the inner and the outer side of its element. The straight sides follow from
-        `Blocks.straight`, and the curved sides are added here.
+        A point is a linear blend between the inner and the outer side of its element. `Blocks.straight` describes the
+        straight sides. This method adds the curved sides.
 
         Returns:
             Shape (n_inner, (order + 1)^2), in film radii.
@@ -218,7 +218,7 @@ class Placement:
 
 
 def _unit_coordinates(blocks: Blocks) -> tuple[Array, Array]:
-    """Return the radial and angular coordinates from 0 to 1 of the nodes of an element, each of shape (n_local,)."""
+    """Return the radial and angular coordinates (0 to 1) of the nodes of an element, each of shape (n_local,)."""
     return 0.5 * (blocks.xi + 1.0), 0.5 * (blocks.eta + 1.0)
 
 

@@ -58,7 +58,9 @@ class QuadCorners(NamedTuple):
     d: Complexes
 
     def of_elements(self, element: Integers) -> "QuadCorners":
-        """Select one element for each point from corners of shape (n_point, n_element).
+        """Select the corners of one element for each point.
+
+        The corners of all elements have the shape (n_point, n_element).
 
         Args:
             element: Index of the element of each point, shape (n_point,).
@@ -71,7 +73,7 @@ class QuadCorners(NamedTuple):
 
 
 def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
-    """Find the elements that contain film points, n points for each of k placements.
+    """Find the elements that contain film points. There are n points for each of k placements.
 
     Args:
         placement: One placement for each row of points.
@@ -149,7 +151,7 @@ def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
 
 
 def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
-    """Locate points inside the innermost circle, one point for each placement.
+    """Locate points inside the innermost circle. There is one point for each placement.
 
     The signed distance of a point from a side of an element is positive if the point lies on the side of the element.
     Each point is assigned to the element for which the smallest of its distances from the four sides is largest. Curved
@@ -241,7 +243,7 @@ def _correct_sectors(
 def _inner_corners(placement: Placement, blocks: Blocks) -> QuadCorners:
     """Return the corners of all elements inside the innermost circle.
 
-    Corners on straight lines are weighted sums of the corners of the core polygon. The other corners lie on the
+    Corners on straight sides are weighted sums of the corners of the core polygon. The other corners lie on the
     innermost circle or on the boundary of the footprint.
 
     Args:
@@ -385,7 +387,10 @@ def _boundary_in_sector(
 
 
 def _overshoot(radial: Array, angular: Array) -> Array:
-    """Return how far local coordinates lie outside of the range from 0 to 1, shape (n,). Inside, it is negative."""
+    """Return the signed distance of local coordinates from the range from 0 to 1, shape (n,).
+
+    The distance is negative within the range.
+    """
     distance_from_middle = np.maximum(np.abs(radial - 0.5), np.abs(angular - 0.5))
     return np.asarray(distance_from_middle - 0.5)
 

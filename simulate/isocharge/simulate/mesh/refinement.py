@@ -107,8 +107,8 @@ class RefinedTemplate(Template):
     def within(self, element: Integers, xi: Array, eta: Array) -> tuple[Integers, Array, Array]:
         """Convert positions in the original elements into positions in the elements; see `Template.within`.
 
-        All elements of one size are cells of a regular grid in their original element. Each cell has a unique code. The
-        code of the cell that contains a point is looked up among the codes of the elements of this size.
+        All elements of one size are cells of a regular grid in their original element. Each cell has a unique code. For
+        each size, the code of the cell that contains a point is searched among the codes of the elements of this size.
 
         Args:
             element: Index of the original element of each point, shape (n,).
@@ -210,28 +210,33 @@ class RefinedTemplate(Template):
         """
         order = self.resolution.order
         line = lobatto_nodes(order)
-        local_number = np.arange((order + 1) ** 2).reshape(order + 1, -1)
-        sides = np.stack([local_number[0], local_number[-1], local_number[:, 0], local_number[:, -1]])
 
+        # Nodes on the four sides of each element that is not of the smallest size
+        local_index = np.arange((order + 1) ** 2).reshape(order + 1, -1)  # rows along eta, columns along xi
+        sides = np.stack([local_index[0], local_index[-1], local_index[:, 0], local_index[:, -1]])
         large_elements = np.flatnonzero(self.size.max(axis=1) > self.size.min())
         nodes_on_sides = self.nodes[large_elements][:, sides]  # shape (n_large, 4, order + 1)
         points_on_sides = points.reshape(self.nodes.shape)[large_elements][:, sides]
+
         node_tree = _tree(points[self.first_seen])
         max_halvings = round(np.log2(self.size.max() / self.size.min()))
         sources: dict[int, tuple[Integers, Array]] = {}
         for halvings in range(1, max_halvings + 1):
+            # Possible nodes of smaller elements, if the side from -1 to 1 is divided into equal parts
             n_part = 2**halvings
-            part = np.arange(n_part)[:, None]
-            position_on_side = ((2.0 * part + 1.0 + line) / n_part - 1.0).ravel()  # from -1 to 1 along the side
+            part_centre = (2.0 * np.arange(n_part) + 1.0) / n_part - 1.0
+            position_on_side = (part_centre[:, None] + line / n_part).ravel()  # shape (n_part * (order + 1),)
             weights = lagrange_values(line, lobatto_weights(order), position_on_side)
             candidate_points = points_on_sides @ weights.T  # shape (n_large, 4, n_part * (order + 1))
 
+            # Nodes at these positions; the distance is infinite where there is no node.
             coordinates = np.stack([candidate_points.real, candidate_points.imag], axis=-1)
             distance, nearest_node = node_tree.query(coordinates, distance_upper_bound=NODE_TOLERANCE)
             for element, side, index in np.argwhere(np.isfinite(distance)):
                 node = int(nearest_node[element, side, index])
                 side_nodes = nodes_on_sides[element, side]
-                if node not in side_nodes:
+                is_node_of_large_element = node in side_nodes
+                if not is_node_of_large_element:
                     sources[node] = side_nodes, weights[index]
         return sources
 

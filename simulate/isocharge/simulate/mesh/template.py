@@ -62,7 +62,7 @@ class Template(Blocks):
         self.on_axis = (np.abs(node_points.imag) < 1e-9) & self.half
 
     def from_base(self, values: np.ndarray) -> np.ndarray:
-        """Return values at the nodes of the elements, from values at the nodes of the original (unsplit) elements.
+        """Convert values at the nodes of the original (unsplit) elements into values at the nodes of the elements.
 
         In this class no element is split, so the values do not change. `RefinedTemplate` interpolates.
 
@@ -91,7 +91,7 @@ class Template(Blocks):
 
 
 class SampleCurve(CurvedProbe):
-    """A circular footprint with the topology of another curved footprint, for the numbering of the nodes."""
+    """Circular footprint with the topology of another curved footprint. It is used to number the nodes."""
 
     angle = 0.0
     notation = "sample"

@@ -1,14 +1,10 @@
 """Nonlinear least squares over the product of a disk and an interval, for many small problems at once.
 
-Each problem is
-
-    min |r(u)|^2   over   u in D = unit disk x [-1, 1],
-
-where r has a few components and the derivatives J. A damped Gauss-Newton step solves
-(J'J + damping trace(J'J) / 3) du = -J'r (Levenberg 1944). The bounds of D are treated by an active set: if u lies on an
-edge and the negative gradient points out of D, the step follows the edge. On the edge of the disk, the curvature of the
-circle is added to the second derivatives. A search along the circle therefore also converges within a few steps, even
-if the minimum without bounds lies far outside of D.
+Each problem is to minimise |r(u)|^2 over u in D = unit disk x [-1, 1]. The residual r has a few components, and J is
+the matrix of its derivatives. A damped Gauss-Newton step solves (J'J + damping trace(J'J) / 3) du = -J'r (Levenberg
+1944). The bounds of D are treated by an active set: if u lies on an edge and the negative gradient points out of D, the
+step follows the edge. On the edge of the disk, the curvature of the circle is added to the second derivatives. A search
+along the circle therefore also converges within a few steps, even if the minimum without bounds lies far outside of D.
 """
 
 from collections.abc import Callable
@@ -28,8 +24,10 @@ MIN_CHANGE = 1e-7
 """Default of the change of |r|^2 below which the iteration ends, relative to 1 + |r|^2."""
 
 MAX_INCREASE = 1e-12
-"""Largest increase of |r|^2 that an accepted step may cause, relative to 1 + |r|^2. Near the minimum, rounding errors
-cause such increases."""
+"""Largest increase of |r|^2 that an accepted step may cause, relative to 1 + |r|^2.
+
+Near the minimum, rounding errors cause such increases.
+"""
 
 INITIAL_DAMPING = 1e-4
 """Damping of the first step, relative to the mean of the diagonal of J'J."""
@@ -53,14 +51,16 @@ EDGE_TOLERANCE = 1e-9
 """Distance from an edge of D below which a point counts as lying on the edge."""
 
 MEAN_OF_DIAGONAL = np.eye(3) / 3.0
-"""Matrix whose product with the trace of a 3 x 3 matrix is a diagonal matrix. All diagonal elements of the product are
-the mean of the diagonal of the 3 x 3 matrix."""
+"""Matrix whose product with the trace of a 3 x 3 matrix is a diagonal matrix.
+
+All diagonal elements of the product are the mean of the diagonal of the 3 x 3 matrix.
+"""
 
 
 def minimise(
     residuals: Residuals, start: Array, steps: int = MAX_STEPS, min_change: float = MIN_CHANGE
 ) -> tuple[Array, Array]:
-    """Find the local minimum of every problem to which the iteration from its starting point leads.
+    """Find a local minimum of every problem by an iteration from a starting point.
 
     Args:
         residuals: Function that evaluates the residuals of some of the problems.

@@ -68,7 +68,7 @@ def _cross(first: Array, second: Array) -> Array:
 
 
 def overlap(first: Array, second: Array, within: float = 0.0) -> bool:
-    """Return whether two polygons overlap, or are closer to each other than a given distance.
+    """Return whether two polygons overlap, or whether the distance between them is smaller than a given distance.
 
     Args:
         first: Corners (x, y), shape (n, 2).
@@ -126,9 +126,9 @@ def shared_area(first: Complexes, second: Complexes) -> float:
 def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float) -> Array:
     """Compute the area that a polygon has in common with disks.
 
-    For each edge, the area that the disk has in common with the triangle of the edge and the centre is computed, and
-    these signed areas are added. The part of an edge inside the circle contributes a triangle, and the parts outside
-    contribute sectors.
+    Each edge of the polygon forms a triangle with the centre of the disk. The result is the sum of the signed areas
+    that these triangles have in common with the disk. The part of an edge inside the circle contributes a triangle, and
+    the parts outside contribute sectors.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n,).
@@ -164,7 +164,7 @@ def gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:
     """Compute a Gauss rule for a convex polygon.
 
     The polygon is divided into triangles that share its first corner. The rule of a triangle is the rule of a square
-    one of whose sides is contracted to a point (Duffy 1982).
+    after one side of the square is contracted to a point (Duffy 1982).
 
     Args:
         corners: Corners (x, y), anticlockwise, shape (n, 2).
@@ -240,7 +240,7 @@ def _four_corners(corners: Complexes) -> Complexes:
 
 
 def _gauss_line_for(side: float, count: int, length: float) -> tuple[Array, Array]:
-    """Return the Gauss rule on [0, 1] with as many points as a side needs.
+    """Return the Gauss rule on [0, 1] whose number of points is sufficient for a side of a polygon.
 
     Args:
         side: Length of the side.

@@ -18,8 +18,10 @@ MERGE_DISTANCE = 1e-9
 """Distance below which two corners, or the y coordinates of two corners, are merged, mm."""
 
 MIN_BEND = 0.1
-"""Smallest allowed value of 1 + cos(angle) for the angle by which a trace bends, dimensionless. The length of a mitre
-is proportional to 1 / (1 + cos(angle)). The largest allowed bend is 154 degrees."""
+"""Smallest allowed value of 1 + cos(angle) for the angle by which a trace bends, dimensionless.
+
+The length of a mitre is proportional to 1 / (1 + cos(angle)). The largest allowed bend is 154 degrees.
+"""
 
 
 def is_simple(corners: Complexes) -> bool:
@@ -39,7 +41,7 @@ def is_simple(corners: Complexes) -> bool:
 
 
 def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> list[Complexes]:
-    """Divide the union of simple polygons into trapezoids without common area.
+    """Divide the union of simple polygons into trapezoids that do not overlap.
 
     The plane is cut into horizontal strips at every corner and at every crossing of two edges. The part of the union
     within a strip consists of trapezoids. A triangle is represented as a trapezoid with two equal corners.
@@ -118,7 +120,7 @@ def _edges(region: shapely.Geometry) -> tuple[Complexes, Complexes]:
 
 
 def subdivide(part: Complexes, max_side: float) -> list[Complexes]:
-    """Cut a quadrilateral into smaller quadrilaterals, or triangles where two of their corners coincide.
+    """Cut a quadrilateral into smaller quadrilaterals. If two corners of a part coincide, the part is a triangle.
 
     Args:
         part: Corners of the quadrilateral, shape (4,), mm.

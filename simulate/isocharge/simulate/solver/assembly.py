@@ -21,7 +21,7 @@ from isocharge.simulate.mesh.template import Template
 
 
 class Assembly:
-    """Linear solver for one template and number of unknowns per node.
+    """Linear solver for one template and one number of unknowns per node.
 
     Attributes:
         components: Number of unknowns per node.
@@ -74,7 +74,7 @@ class Assembly:
         self._reorder()
 
     def _set_pattern(self, skeleton_numbers: Integers) -> None:
-        """Compute the sparsity pattern of the skeleton matrix, and the position of each entry of the element matrices.
+        """Compute the sparsity pattern of the skeleton matrix, and the position of each element matrix in it.
 
         Entries of fixed unknowns get a position after the last entry.
 
@@ -216,7 +216,10 @@ def _factorise(matrix: csc_matrix, order: str) -> SuperLU:
 
 
 def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:
-    """Return which unknowns are free. The other unknowns are fixed by the clamp or by symmetry.
+    """Return which unknowns are free. The other unknowns are zero.
+
+    The clamp fixes U1, U2 and W on the rim. On the line of symmetry, U2 is fixed for even fields, and all unknowns
+    except U2 are fixed for odd fields.
 
     Args:
         mesh: Template of the mesh.
@@ -226,11 +229,14 @@ def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:
     Returns:
         Shape (n_node, components).
     """
+    component = np.arange(components)  # 0: U1, 1: U2, 2: W, 3: auxiliary unknown of bending
+    is_displacement = component < 3
+    is_u2 = component == 1
+    is_fixed_on_axis = ~is_u2 if odd else is_u2
+
     free = np.ones((mesh.n_node, components), dtype=bool)
-    free[mesh.on_rim, :3] = False
-    is_displacement_2 = np.arange(components) == 1
-    fixed_on_axis = ~is_displacement_2 if odd else is_displacement_2
-    free[np.ix_(mesh.on_axis, fixed_on_axis)] = False
+    free[np.ix_(mesh.on_rim, is_displacement)] = False
+    free[np.ix_(mesh.on_axis, is_fixed_on_axis)] = False
     return free
 
 

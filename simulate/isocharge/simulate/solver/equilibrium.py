@@ -27,7 +27,7 @@ HEIGHT = {"middle": 0.0, "top": 1.0, "bottom": -1.0}
 
 @dataclass(frozen=True, kw_only=True)
 class Equilibrium:
-    """The equilibrium of a film under a press, from which `deflection`, `touch_stress` and `touch_charge` are computed.
+    """Equilibrium of a film under a press. The functions `deflection`, `touch_stress` and `touch_charge` evaluate it.
 
     Attributes:
         film: The film.
@@ -85,7 +85,7 @@ class Equilibrium:
 def deflection(equilibrium: Equilibrium, points: Array) -> Array:
     """Compute the deflection at points of the film, relative to the flat film.
 
-    The deflection includes that of a static pressure.
+    The result includes the deflection by a static pressure.
 
     Args:
         equilibrium: The solved press.
@@ -263,7 +263,7 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
 
 
 def _rotated(equilibrium: Equilibrium, points: Array) -> Complexes:
-    """Convert points (x, y), shape (n, 2), mm, into points x + iy in the frame with the press on the positive x axis.
+    """Rotate points (x, y), shape (n, 2), mm, into the frame with the press on the positive x axis, as x + iy.
 
     Returns:
         Points, shape (n,), in film radii.

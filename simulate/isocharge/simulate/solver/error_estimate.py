@@ -1,4 +1,4 @@
-"""Estimates of the error of a charge by the mesh and by the theory, and warnings about effects that are not modelled.
+"""Estimates of the errors that the mesh and the theory cause in a charge, and warnings about omitted effects.
 
 In the inner part of the film, the error of the mesh is estimated from the shapes of the elements and the decay of their
 polynomial modes. This estimate is not reliable near the rim and for large footprints that are not circular, because the
@@ -79,7 +79,7 @@ def shape_error(mesh: PlacedMesh) -> float:
 
 
 def decay(mesh: PlacedMesh, slope: Array) -> float:
-    """Compute the share of the slopes of the deflection that is in the highest polynomial modes of the elements.
+    """Compute the share of the highest polynomial modes of the elements in the slopes of the deflection.
 
     Args:
         mesh: Mesh of the press.
@@ -105,7 +105,7 @@ def decay(mesh: PlacedMesh, slope: Array) -> float:
 
 
 def mesh_error(equilibrium: Equilibrium) -> float:
-    """Estimate the relative error of a charge that the mesh causes.
+    """Estimate the relative error that the mesh causes in a charge.
 
     The estimate is the difference from a second mesh if there is one. Otherwise it is predicted from the shapes of the
     elements and the decay of their modes.
@@ -124,7 +124,7 @@ def mesh_error(equilibrium: Equilibrium) -> float:
 
 
 def estimated_error(equilibrium: Equilibrium) -> float:
-    """Estimate the relative error of a charge that the mesh and the omitted terms of the theory cause.
+    """Estimate the relative error that the mesh and the omitted terms of the theory cause in a charge.
 
     Args:
         equilibrium: The solved press.

@@ -90,7 +90,7 @@ def check_friction(coefficient: float) -> None:
 
 
 def limited(holding: Array, largest: Array) -> Array:
-    """Reduce holding forces that exceed the largest friction to this friction, without a change of their direction.
+    """Limit the magnitudes of holding forces to the largest friction. The directions of the forces do not change.
 
     Args:
         holding: Forces (Fx, Fy) that prevent the slip, shape (n, 2), N.

@@ -155,13 +155,13 @@ def check_side_force(side_force: tuple[float, float], force: float) -> None:
 
 
 def layer_for(film: Film, force: float) -> float:
-    """Return the width of the thin rings at the rim for a force (N), in film radii."""
+    """Return the width (film radii) of the thin rings at the rim for a force (N)."""
     return LAYER_WIDTH * bending_length(film, force)
 
 
 @dataclass(frozen=True)
 class LoadCase:
-    """A press, and all decisions about its solve except the resolution of the mesh.
+    """A press, and all settings of its solve except the resolution of the mesh.
 
     Attributes:
         film: The film.
@@ -323,7 +323,7 @@ def needs_second_mesh(case: LoadCase) -> bool:
 
 
 def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
-    """Return the error for a press whose mesh of a resolution is too distorted."""
+    """Return the error that reports that the mesh under a press is too distorted."""
     return SceneError(
         f"press at ({case.at[0]:.4g}, {case.at[1]:.4g}) mm comes within "
         f"{case.film.radius - case.probe.farthest_distance(case.at):.3g} mm of the rim, too near for a mesh of order "

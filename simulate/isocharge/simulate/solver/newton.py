@@ -129,9 +129,9 @@ def parabolic_start(radius: np.ndarray, groups: DimensionlessGroups) -> Array:
 def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
     """Solve a linear theory: the deflection W under the load, and the in-plane displacement U that W causes.
 
-    The induced stress does not affect the deflection. The tangent of the flat film does not couple W and U, so each
-    further solve computes U and also a correction of W (iterative refinement). The energy norm of the correction is a
-    measure of the error of W.
+    The induced stress does not affect the deflection. The tangent of the flat film does not couple W and U. Each
+    further solve therefore computes U, and also a correction of W (iterative refinement). The energy norm of the
+    correction is a measure of the error of W.
 
     Args:
         elastic: The discrete film.
@@ -265,7 +265,9 @@ class _Iterate:
 
 
 def _stalled(step_sizes: list[float]) -> bool:
-    """Return whether the sizes of the steps no longer decrease, as along a direction without stiffness.
+    """Return whether the sizes of the steps no longer decrease.
+
+    This occurs along a direction in which the film has no stiffness.
 
     Args:
         step_sizes: Sizes of all steps so far, from the first to the last.

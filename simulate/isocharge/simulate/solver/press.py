@@ -199,7 +199,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 
 
 def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
-    """Solve the film under the static pressure alone, and add this solution to the equilibrium of a press as `rest`.
+    """Solve the film under the static pressure alone. Return the equilibrium of a press with this solution as `rest`.
 
     Args:
         equilibrium: Equilibrium of the press.

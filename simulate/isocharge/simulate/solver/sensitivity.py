@@ -6,10 +6,11 @@ displacement by
     du/dm = -K^-1 dR/dm,
 
 which costs one additional back substitution. Let alpha be the angle between an axis of the imperfection and the
-direction of the press. For an imperfection with two axes, the change is the sum of cos(2 alpha) times a field that is
-even with respect to a reflection in this direction, and sin(2 alpha) times a field that is odd. Both fields are solved
-on the meshed half of the film, with different fixed displacement components on the line of symmetry. The derivative
-dR/dm and the change of the stress are central differences of the residual and of the stress of a press.
+direction of the press. For an imperfection with two axes, the change is the sum of two fields with the factors cos(2
+alpha) and sin(2 alpha). With respect to a reflection in this direction, the first field is even and the second field is
+odd. Both fields are solved on the meshed half of the film, with different fixed displacement components on the line of
+symmetry. The derivative dR/dm and the change of the stress are central differences of the residual and of the stress of
+a press.
 """
 
 from collections.abc import Callable, Sequence
@@ -66,7 +67,7 @@ def _tension(direction: tuple[float, float, float]) -> Change:
 
 
 def _stiffness(angle: float) -> Change:
-    """Return the function that makes a film orthotropic.
+    """Return a function that makes a film orthotropic.
 
     The value of the imperfection is ln(E1 / E2). To first order, E1 = E (1 + value / 2) and E2 = E (1 - value / 2).
 
@@ -75,7 +76,7 @@ def _stiffness(angle: float) -> Change:
     """
 
     def with_stiffness_ratio(solved: Equilibrium, log_ratio: float) -> Equilibrium:
-        """Return the equilibrium of a film with this ln(E1 / E2)."""
+        """Return the equilibrium of a film with this value of ln(E1 / E2)."""
         plane_modulus = 1.0 / (1.0 - solved.groups.poisson**2)
         change_along_axis_1 = 0.5 * log_ratio * plane_modulus
         moduli_in_film_axes = np.diag([change_along_axis_1, -change_along_axis_1, 0.0])
@@ -208,7 +209,7 @@ def tension_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
 
 
 def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: Surface) -> Array:
-    """Compute the change of the scaled stress at the nodes by each field.
+    """Compute the change of the scaled stress at the nodes that each field causes.
 
     Args:
         solved: The solved press.
@@ -222,36 +223,46 @@ def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface:
         components = 3 if solved.groups.bending == 0.0 else 4
         elastic = ElasticFilm(solved.mesh.geometry, solved.groups)
         assemblies = [assembly(solved.mesh.template, components, odd) for odd in (False, True)]
-        factors = [factor_tangent(elastic, solver, solved.field) for solver in assemblies]
-        return np.stack([_stress_change(solved, field, factors[field.odd].solve, surface) for field in fields])
+        even_factor, odd_factor = (factor_tangent(elastic, solver, solved.field) for solver in assemblies)
+        changes = []
+        for field in fields:
+            factor = odd_factor if field.odd else even_factor
+            changes.append(_stress_change(solved, field, factor.solve, surface))
+        return np.stack(changes)
 
 
 def _stress_change(solved: Equilibrium, field: StressField, solve: Callable[[Array], Array], surface: Surface) -> Array:
-    """Compute the change of the scaled stress at the nodes by one field.
+    """Compute the change of the scaled stress at the nodes that one field causes.
 
     Args:
         solved: The solved press.
-        field: The field.
+        field: The imperfection, whose attribute `change` applies it to a press.
         solve: Function that solves K x = b for a vector b at the nodes, shape (n_node, 3).
         surface: Surface in the thickness.
 
     Returns:
         Change per unit of the imperfection, shape (n_element, n_local, 3).
     """
+    # Film with a positive and with a negative step of the imperfection, at first with the original displacements
     above = field.change(solved, STEP)
     below = field.change(solved, -STEP)
+
+    # Change of the displacements that restores the equilibrium after one positive step
     force_above = ElasticFilm(above.mesh.geometry, above.groups).residual(above.field)
     force_below = ElasticFilm(below.mesh.geometry, below.groups).residual(below.field)
-    displacement = -0.5 * solve(force_above - force_below)  # for one step of the imperfection
+    displacement_change = -0.5 * solve(force_above - force_below)
 
-    stress_above = nodal_stress(replace(above, field=above.field + displacement), surface)
-    stress_below = nodal_stress(replace(below, field=below.field - displacement), surface)
+    # Central difference of the stress
+    equilibrium_above = replace(above, field=above.field + displacement_change)
+    equilibrium_below = replace(below, field=below.field - displacement_change)
+    stress_above = nodal_stress(equilibrium_above, surface)
+    stress_below = nodal_stress(equilibrium_below, surface)
     change = (stress_above - stress_below) / (2.0 * STEP)
     if above.mesh.oval != 0.0:
         # The nodes move with the rim. Subtract the change of the stress by this displacement of the nodes.
         node_shift = (above.mesh.points - below.mesh.points) / (2.0 * STEP)
-        stress_slope = solved.mesh.node_derivatives(nodal_stress(solved, surface))
-        x_contribution = node_shift.real[..., None] * stress_slope[..., 0, :]
-        y_contribution = node_shift.imag[..., None] * stress_slope[..., 1, :]
+        stress_gradient = solved.mesh.node_derivatives(nodal_stress(solved, surface))
+        x_contribution = node_shift.real[..., None] * stress_gradient[..., 0, :]
+        y_contribution = node_shift.imag[..., None] * stress_gradient[..., 1, :]
         change -= x_contribution + y_contribution
     return np.asarray(change)

@@ -61,7 +61,7 @@ def stress_caution(film: Film, probe: Probe, force: float, limit: float = DEFAUL
 
 
 def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tuple[float, float]) -> float:
-    """Compute the largest force of a range that does not exceed a stress limit, with a relative error below 0.1 %.
+    """Compute the largest force of a range whose stress does not exceed a limit. The relative error is below 0.1 %.
 
     Args:
         film: The film.
@@ -87,7 +87,7 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
         return max_force
 
     def log_stress_ratio(log_force: float) -> float:
-        """Return ln(stress / limit), which is nearly linear in ln F because the stress is nearly a power of F."""
+        """Return ln(stress / limit). It is nearly linear in ln F, because the stress is nearly a power of F."""
         return float(np.log(largest_stress(film, probe, float(np.exp(log_force))) / limit))
 
     # The secant method ends after a step of 1 %, when its error is about 0.01 %.
