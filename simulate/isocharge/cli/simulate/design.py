@@ -174,7 +174,11 @@ def refuse_search_options(*, electrodes: int | None, keep: str | None, goal: str
 
 
 def _guard_table(found: GuardDesign) -> str:
-    """Return the position of the guard electrode, and what is computed without and with it, as a table."""
+    """Return a table with the position of the guard electrode.
+
+    The table also lists the share of presses that are not noticed and the limits of the position error, without and
+    with this electrode.
+    """
     x, y = found.guard.centre
     lines = [
         f"{found.guard.name:<10} {x:9.3f} {y:9.3f} mm",
@@ -213,8 +217,9 @@ def _table(result: Design) -> str:
 
 
 def _error_text(error: float, radius: float) -> str:
-    """Format a position error (mm) within a disk of a radius (mm).
+    """Format a position error (mm) of presses within a disk whose radius (mm) is given.
 
-    If the error reaches the radius, the charges do not determine the position, because the charge map folds.
+    If the error is not smaller than the radius, the charges do not determine the position, because the charge map has a
+    fold.
     """
     return f"{error:.3f}" if error < radius else "folds"

@@ -90,7 +90,7 @@ def identify_command(
 
 
 def _table(results: dict[str, Any]) -> str:
-    """Return the error statistics within the working area as a table with one line for each force.
+    """Return a table of the error statistics within the working area. Each force has one line.
 
     Args:
         results: Result of `Identification.to_dict`.

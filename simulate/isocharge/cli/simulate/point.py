@@ -124,7 +124,10 @@ def point_command(
 
 
 def _cautions(equilibrium: Equilibrium, accuracy: float) -> list[str]:
-    """Return a warning if the estimated error of the charges exceeds the required accuracy; otherwise no warnings."""
+    """Return a list with a warning if the estimated error of the charges exceeds the required accuracy.
+
+    Otherwise the list is empty.
+    """
     error = estimated_error(equilibrium)
     if not isfinite(error):
         return [f"a {equilibrium.theory.name} does not describe this film at all; omit --theory"]
@@ -134,7 +137,7 @@ def _cautions(equilibrium: Equilibrium, accuracy: float) -> list[str]:
 
 
 def _table(report: dict[str, Any]) -> str:
-    """Return the report of a press as lines for people: charges, side force, deflection, theory and solver."""
+    """Return the text that the command prints about a press: charges, side force, deflection, theory and solver."""
     lines = [f"charge {name:<10} {charge:10.2f} pC" for name, charge in report["charge_pC"].items()]
     if "side_force_N" in report:
         side_x, side_y = report["side_force_N"]

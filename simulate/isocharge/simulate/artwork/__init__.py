@@ -1,1 +1,1 @@
-"""Drawings of electrode layouts as DXF and SVG files, straight leads, and the reader of electrodes in DXF files."""
+"""Drawings of electrode layouts as DXF and SVG files, straight leads, and a reader of DXF drawings with electrodes."""

@@ -111,7 +111,7 @@ def to_dxf(document: Drawing) -> str:
 
 
 def to_svg(document: Drawing) -> str:
-    """Return a drawing as the text of an SVG file to scale, in which letters are drawn as outlines."""
+    """Return the text of an SVG file that shows a drawing to scale. Letters are drawn as outlines."""
     backend = SVGBackend()
     configuration = Configuration(background_policy=BackgroundPolicy.WHITE)
     Frontend(RenderContext(document), backend, config=configuration).draw_layout(document.modelspace())

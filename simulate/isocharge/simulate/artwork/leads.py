@@ -13,8 +13,10 @@ SAMPLE_DISTANCE = 0.1
 _DEGREES = np.arange(1.0, 90.0)
 
 TRIED_ANGLES = np.deg2rad(np.concatenate([[0.0], np.stack([_DEGREES, -_DEGREES], axis=1).ravel()]))
-"""Angles of the leads that are tried, relative to the outward radial direction, rad. The angles are ordered by
-magnitude, so that the first lead without a conflict deviates least from the radial direction."""
+"""Angles of the leads that are tried, relative to the outward radial direction, rad.
+
+The angles are ordered by magnitude, so that the first lead without a conflict deviates least from the radial direction.
+"""
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ def _possible_paths(centre: Array, radius: float) -> Array:
 
 
 def _clearance(path: Array, width: float, electrodes: list[Electrode], leads: list[Array]) -> float:
-    """Return the smallest distance of the edge of a lead from electrodes and other leads.
+    """Return the smallest distance between the edge of a lead and the electrodes and other leads.
 
     Args:
         path: Both ends (x, y) of the centre line of the lead, shape (2, 2), mm.
@@ -110,7 +112,7 @@ def _clearance(path: Array, width: float, electrodes: list[Electrode], leads: li
 
 
 def _distance_from_boxes(points: Array, electrode: Electrode) -> float:
-    """Return the smallest distance of points, shape (n, 2), from the bounding boxes of an electrode, mm."""
+    """Return the smallest distance (mm) between points, shape (n, 2), and the bounding boxes of an electrode."""
     low, high = (corners[:, None] for corners in electrode.boxes)  # each of shape (n_box, 1, 2)
     offset = np.maximum(np.maximum(low - points, points - high), 0.0)  # zero for coordinates within the box
     return float(np.linalg.norm(offset, axis=2).min())

@@ -136,7 +136,7 @@ def _width(line: Any) -> float:
 
 
 def _names(document: Any, groups: list[list[Electrode]], scale: float) -> list[str]:
-    """Return the names of groups of polygons, each of which becomes an electrode.
+    """Return a name for each group of polygons. Each group becomes an electrode.
 
     The name of a group is the text of the drawing that is nearest to the first polygon of the group. If two groups have
     the same text, or the drawing has no texts, the names are the letters from A to Z, followed by numbers. There may

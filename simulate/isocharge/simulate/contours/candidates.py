@@ -1,4 +1,4 @@
-"""Candidates for the meeting of contours, and the grid of positions at which the search for them starts.
+"""Candidates for the point at which contours meet, and the grid of positions at which the search for candidates starts.
 
 The module `triangulation` improves several candidates for each of many presses at once.
 """
@@ -19,8 +19,10 @@ FORCES = 24
 """Number of forces at which the charges of each node are tabulated, equally spaced in ln F."""
 
 MIN_SLOPE = 0.02
-"""Lower bound for the slope of a charge, relative to the median slope of the electrode, dimensionless. It keeps the
-distance = difference / slope finite where the charge has an extremum."""
+"""Lower bound for the slope of a charge, relative to the median slope of the electrode, dimensionless.
+
+It keeps the distance = difference / slope finite where the charge has an extremum.
+"""
 
 RANGE_MARGIN = 0.02
 """Margin by which a charge may exceed the range of the charges of all nodes, relative to the range, dimensionless."""
@@ -28,7 +30,7 @@ RANGE_MARGIN = 0.02
 
 @dataclass(frozen=True)
 class Candidates:
-    """Possible positions of presses, any number for each press.
+    """Possible positions of presses. Each press may have any number of them.
 
     Attributes:
         press: Number of the press, shape (n,).
@@ -51,7 +53,7 @@ class Candidates:
         return cls(press, contact, np.full(press.size, np.inf))
 
     def __getitem__(self, rows: np.ndarray) -> "Candidates":
-        """Return some of the candidates, which are given by a mask or by row numbers."""
+        """Return the candidates that a mask or an array of row indices selects."""
         return Candidates(self.press[rows], self.contact[rows], self.spread[rows])
 
     def joined(self, other: "Candidates") -> "Candidates":
@@ -63,7 +65,7 @@ class Candidates:
         )
 
     def improved(self, contact: Array, spread: Array) -> "Candidates":
-        """Replace the contacts of those candidates for which the new contact has a smaller spread.
+        """Replace the contact of each candidate whose new contact has a smaller spread.
 
         Args:
             contact: New contact of each candidate, shape (n, 3), mm and N.
@@ -233,7 +235,7 @@ class SeedGrid:
         return press, node[press, column]
 
     def is_out_of_range(self, charge: Array, force: Array | None) -> Booleans:
-        """Return which presses have a charge outside the range of the charges of all nodes.
+        """Return a mask of the presses with at least one charge that is outside the range of the charges at the nodes.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.

@@ -1,8 +1,8 @@
 """Charge as a function of the distance along lines from an electrode (Mirbagheri et al. 2007, Fig. 2, 4 and 7).
 
-This is the mapping scheme of the paper. The lines start at the centre of an electrode at equal angles, and the presses
-on a line have equal distances. The paper fits a polynomial to the charge along each line. The module `graphical_method`
-draws contours through the roots of these polynomials.
+This is the mapping scheme of the paper. The lines start at the centre of an electrode. The angles between neighbouring
+lines are equal, and so are the distances between neighbouring presses on a line. The paper fits a polynomial to the
+charge along each line. The module `graphical_method` draws contours through the roots of these polynomials.
 """
 
 from collections.abc import Sequence
@@ -26,8 +26,10 @@ ANGLE_STEP = np.deg2rad(10.0)
 """Default angle between lines, rad, as in the paper."""
 
 HALF_ANGLE = np.deg2rad(70.0)
-"""Default of the largest angle between a line and the direction of the centre of the film, rad. The paper does not
-state an angle."""
+"""Default of the largest angle between a line and the direction of the centre of the film, rad.
+
+The paper does not state an angle.
+"""
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,9 @@ class Mapping:
         step: float = STEP,
         length: float = LENGTH,
     ) -> "Mapping":
-        """Create lines at equal angles. The last angle always has a line, even if its distance to the previous line is
-        smaller than the step.
+        """Create lines at equal angles.
+
+        The last angle always has a line, even if its distance to the previous line is smaller than the step.
 
         Args:
             sensor: Sensor, whose calibration determines the positions of the electrodes.
@@ -97,7 +100,10 @@ class Mapping:
 
     @property
     def radius(self) -> float:
-        """Distance of the farthest press from the centre of the film, mm; smallest radius of a suitable charge map."""
+        """Distance of the farthest press from the centre of the film, mm.
+
+        The radius of a charge map must not be smaller.
+        """
         return float(np.linalg.norm(self.points, axis=-1).max())
 
     def finer(self, count: int) -> "Mapping":

@@ -1,4 +1,4 @@
-"""Isocharge contours: curves on which presses of one force give an electrode the same charge.
+"""Isocharge contours: curves on which all presses with the same force cause the same charge on an electrode.
 
 Contours are traced by marching squares on a grid. The module `graphical_method` draws the same contours by the method
 of Mirbagheri et al. (2007).
@@ -15,8 +15,10 @@ from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate.forward.charge_map import ChargeMap, check_forces
 
 GRID_SPACING = 0.2
-"""Largest distance between neighbouring points of the grid, mm. The deviation of a contour from a straight line within
-this distance is a few micrometres."""
+"""Largest distance between neighbouring points of the grid, mm.
+
+The deviation of a contour from a straight line within this distance is a few micrometres.
+"""
 
 TRACED_RADIUS = 1.0 - 5e-4
 """Radius within which contours are traced, in units of the radius of the charge map, dimensionless."""
@@ -24,7 +26,7 @@ TRACED_RADIUS = 1.0 - 5e-4
 
 @dataclass(frozen=True)
 class ContourField:
-    """Contours of presses of one force over the domain of a charge map.
+    """Contours over the domain of a charge map for presses with one force.
 
     Attributes:
         charge_map: Charges as a function of the contact. Splines are faster than a forward map.

@@ -1,4 +1,4 @@
-"""Result of a triangulation: positions of presses, or the reason why a press has no position."""
+"""Result of a triangulation: the positions of presses, and for each press without a position the reason."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -23,7 +23,7 @@ AMBIGUOUS_SPREAD = 0.01
 
 
 class Meeting(IntEnum):
-    """Result of the search for the meeting of contours of one press."""
+    """Result of the search for the point at which the contours of one press meet."""
 
     met = 0
     no_contour = 1

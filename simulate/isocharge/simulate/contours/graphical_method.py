@@ -22,8 +22,10 @@ from isocharge.simulate.contours.fix import AMBIGUOUS_RATIO, MIN_DISTANCE, TOLER
 from isocharge.simulate.forward.charge_map import as_charges
 
 DEGREE = 4
-"""Default degree of the polynomial along a line. The paper does not state a degree; polynomials of lower degree do not
-describe the charge near the electrode."""
+"""Default degree of the polynomial along a line.
+
+The paper does not state a degree; polynomials of lower degree do not describe the charge near the electrode.
+"""
 
 NOWHERE = np.full(2, np.nan)
 """Position of a press whose contours do not meet."""
@@ -163,7 +165,7 @@ def _root(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) 
 
 
 class _Location(NamedTuple):
-    """Location of one press, or of the meeting of three contours.
+    """Location of one press, or of the point at which three contours meet.
 
     Attributes:
         position: Position (x, y), shape (2,), mm; NaN if there is none.

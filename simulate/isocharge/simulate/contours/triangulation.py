@@ -1,10 +1,10 @@
-"""Triangulation: position of a press from the meeting of contours (Mirbagheri et al. 2007, Fig. 9 and 10).
+"""Triangulation: position of a press from the point at which contours meet (Mirbagheri et al. 2007, Fig. 9 and 10).
 
-Each charge restricts the position of the press to an isocharge contour. The paper takes three crossings of the contours
-of three electrodes that are near each other, and uses their mean as the position; with four electrodes, it averages
-over the four triples. `Triangulation.locate` does the same: it searches for positions near all contours, finds the
-crossing of each pair of contours by Newton's method, and reports in `Fix.status` if there is no position or more than
-one.
+Each charge restricts the position of the press to an isocharge contour. The contours of three electrodes have three
+crossings near the press, and the paper uses the mean of these crossings as the position. With four electrodes, the
+paper averages over the four triples of electrodes. `Triangulation.locate` computes the same mean. It searches for
+positions near all contours, and finds the crossing of each pair of contours by Newton's method. `Fix.status` states if
+there is no position or more than one.
 
 If the force is unknown, the contours depend on it. `Triangulation.locate_with_force` finds the position and the force
 with the smallest mean square distance from the contours.
@@ -55,7 +55,7 @@ CHUNK = 512
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Estimator of positions by the meeting of contours.
+    """Estimator of positions from the points at which contours meet.
 
     Attributes:
         charge_map: Charges as a function of the contact. A forward map is replaced by splines, which takes some
@@ -205,8 +205,8 @@ class Triangulation:
     def _second_seeds(self, closest: Candidates, *, fixed: bool) -> Candidates:
         """Create starting points for a second meeting across a fold.
 
-        Two starting points lie on opposite sides of each meeting, in the direction in which the distances from the
-        contours change least.
+        For each meeting, two starting points are placed on opposite sides of it. They lie in the direction in which the
+        distances from the contours change least.
 
         Args:
             closest: Meetings of the contours that have been found.
@@ -243,7 +243,7 @@ class Triangulation:
         return best[best.spread <= self.tolerance].distinct(MIN_DISTANCE)
 
     def _cross(self, charge: Array, candidates: Candidates) -> Candidates:
-        """Replace candidates by the crossings of contours near them.
+        """Replace each candidate by the mean of the crossings of the contours near this candidate.
 
         Three contours have three crossings of two contours. The contours meet if all three crossings lie within the
         tolerance of their mean. The new position of a candidate is the average of this mean over all triples of

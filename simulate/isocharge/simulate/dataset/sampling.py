@@ -108,7 +108,7 @@ class Sweep:
         return self._presses_of_probe(0, 1, FULL_TURN).contact
 
     def over(self, probes: Sequence[Probe]) -> SweepPresses:
-        """Return the presses of a sweep with several probes, which alternate.
+        """Return the presses of a sweep with several probes. Successive presses use the probes in turn.
 
         Args:
             probes: Probes of the sweep.
@@ -177,7 +177,7 @@ class Sweep:
     def _grid(self, max_count: int, period: float) -> tuple[Complexes, Array, Array]:
         """Return the presses of a grid.
 
-        The number of steps in each direction is chosen equal at first. The number of forces is then increased as far as
+        At first, the number of steps is the same in each direction. The number of forces is then increased as far as
         the number of presses allows.
 
         Args:

@@ -4,8 +4,8 @@
     README.md         data card, a description for readers
     shard-00000.npz   x_mm, y_mm, force_N, probe, orientation_deg, charge_pC[n, electrode]
 
-A dataset is written under a temporary name and renamed when it is complete. Data that was measured on a rig has the
-same format without the entries `solver` and `seed`.
+A dataset is written under a temporary name and renamed when it is complete. Measured data has the same format, but its
+manifest has no entries `solver` and `seed`.
 """
 
 import io
@@ -291,7 +291,7 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
 
 
 def _difference(sensor: Sensor, expected: Sensor) -> str:
-    """Describe how a sensor differs from the expected sensor, for an error message.
+    """Describe the differences between a sensor and the expected sensor for an error message.
 
     Args:
         sensor: Sensor that was given.

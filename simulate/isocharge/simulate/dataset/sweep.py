@@ -1,7 +1,7 @@
 """Simulation of a sweep: many presses over a range of positions and forces, and their charges.
 
-A forward map is solved for every probe and evaluated for every press. Both are divided into tasks that do not depend on
-the executor, so that the files do not depend on the executor either. Finished parts are saved in a folder next to the
+A forward map is solved for every probe and evaluated for every press. The work is divided into tasks in the same way
+for every executor, so that the files are the same for every executor. Finished parts are saved in a folder next to the
 dataset, from which an interrupted run is resumed.
 """
 
@@ -39,8 +39,11 @@ SHARD_SIZE = 16384
 """Default number of samples in a shard."""
 
 TASK_SIZE = 8192
-"""Largest number of presses in a task. A task then takes about a second, which is long compared with the time for
-sending the forward map (12 MB) to the worker."""
+"""Largest number of presses in a task.
+
+A task then takes about a second, which is long compared with the time for sending the forward map (12 MB) to the
+worker.
+"""
 
 
 def run_sweep(

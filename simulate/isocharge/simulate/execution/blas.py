@@ -11,7 +11,7 @@ def single_threaded_blas() -> AbstractContextManager[object]:
     """Return a context manager within which BLAS uses one thread.
 
     Operations on many small matrices are faster with one thread. Several threads would wait for each other in busy
-    loops, and these waits are long if other processes occupy the remaining cores.
+    loops. These waits are long if other processes use the remaining cores.
     """
     limiter: AbstractContextManager[object] = _CONTROLLER.limit(limits=1, user_api="blas")
     return limiter

@@ -1,7 +1,7 @@
 """Execution of long computations with a `concurrent.futures.Executor`, such as a process pool or a Dask cluster.
 
-The results do not depend on the executor, on the number of workers, or on the order in which the workers finish,
-because the work is divided into jobs beforehand and the results are returned in the order of the jobs.
+The work is divided into jobs beforehand, and the results are returned in the order of the jobs. The results therefore
+do not depend on the executor, on the number of workers, or on the order in which the workers finish.
 """
 
 import multiprocessing
@@ -26,8 +26,10 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 MAX_PENDING = 64
-"""Default of the largest number of submitted jobs whose results have not been returned yet. It is enough for about
-thirty workers and limits the memory that finished results occupy."""
+"""Default of the largest number of submitted jobs whose results have not been returned yet.
+
+It is enough for about thirty workers and limits the memory that finished results occupy.
+"""
 
 CONNECT_TIMEOUT_s = 10.0
 """Longest time to wait for a connection to a Dask cluster, s."""
@@ -38,7 +40,7 @@ def in_order(
 ) -> Iterator[Result]:
     """Call a function with every job and yield the results in the order of the jobs.
 
-    The iterable of jobs is consumed only as far as jobs can be submitted.
+    A job is taken from the iterable only when it can be submitted.
 
     Args:
         executor: Executor that runs the jobs, such as a process pool with any start method, a thread pool, or
@@ -140,7 +142,8 @@ def local_workers(count: int) -> Iterator[Executor | None]:
 
 
 def _initialise_worker(worker_end: Connection) -> None:
-    """Leave interrupts to the parent process, and end this worker when the parent closes its end of the pipe."""
+    """Ignore interrupts, which the parent process handles, and end this worker when the parent closes its end of the
+    pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, args=(worker_end,), daemon=True).start()

@@ -26,15 +26,19 @@ MIN_DISTANCE = 1.0
 """Smallest distance between the contacts of an ambiguous pair, mm."""
 
 MIN_DISTANCE_SIGMAS = 6.0
-"""Smallest distance between the contacts of an ambiguous pair, in standard deviations of the position. If the distance
-is smaller, the two contacts count as a single contact with a large uncertainty."""
+"""Smallest distance between the contacts of an ambiguous pair, in standard deviations of the position.
+
+If the distance is smaller, the two contacts count as a single contact with a large uncertainty.
+"""
 
 FORCES = 8
 """Number of forces at which the charges of the second contact are tabulated."""
 
 EXPONENT = 2.0 / 3.0
-"""Exponent of the force in the charge of a membrane without pretension, dimensionless. The ratio of the charge to this
-power of the force is tabulated, because the ratio depends only weakly on the force."""
+"""Exponent of the force in the charge of a membrane without pretension, dimensionless.
+
+The ratio of the charge to this power of the force is tabulated, because the ratio depends only weakly on the force.
+"""
 
 NEIGHBOURS = 9
 """Number of lattice points, including the point itself, among which a candidate must have the smallest difference."""
@@ -45,7 +49,9 @@ MAX_CANDIDATES = 2
 
 @dataclass(frozen=True)
 class AmbiguousPairs:
-    """Pairs of contacts with the same charges. The outer contact of a pair is farther from the centre than the other.
+    """Pairs of contacts with the same charges.
+
+    The outer contact of a pair is the contact that is farther from the centre of the film.
 
     The pairs are ordered by the distance of the outer contact from the centre.
 
@@ -81,7 +87,10 @@ class AmbiguousPairs:
 
     @property
     def summary(self) -> str:
-        """Sentence about the pair whose outer contact is nearest to the centre; empty without pairs."""
+        """Sentence about the pair whose outer contact is nearest to the centre.
+
+        The text is empty if there are no pairs.
+        """
         if not len(self):
             return ""
         x, y, force = self.first[0]
@@ -189,7 +198,7 @@ def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Arr
     barycentric = barycentric_weights(log_nodes)
 
     def weights(log_force: Array) -> Array:
-        """Compute the weights of the ratios at the nodes, whose weighted sum is the charge.
+        """Compute the weights with which the ratios at the nodes are summed to give the charge.
 
         Args:
             log_force: Values of ln F, shape (n,).

@@ -30,9 +30,11 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import INNER_RADIUS, Rings, onto_disk
 
 SEGMENT_LENGTH = 0.02
-"""Length below which a segment with reversed orientation counts as a fold, mm. Beside an electrode, the orientation may
-be reversed within 0.1 mm although the charges are not ambiguous at 1 N. On a circle of four electrodes, where there is
-a fold, the orientation is reversed within about 0.01 mm."""
+"""Length below which a segment with reversed orientation counts as a fold, mm.
+
+Beside an electrode, the orientation may be reversed within 0.1 mm although the charges are not ambiguous at 1 N. On a
+circle of four electrodes, where there is a fold, the orientation is reversed within about 0.01 mm.
+"""
 
 MAX_STEPS = 40
 """Largest number of steps of the compass search. Most minima need 8 to 20; minima in narrow valleys need more."""
@@ -64,7 +66,8 @@ def has_reversed_orientation(first: Array, second: Array) -> Booleans:
 
 
 def _unit_columns(jacobian: Array) -> Array:
-    """Scale the columns to unit length, so that rounding errors do not change the sign of the determinant."""
+    """Scale the columns of a matrix to unit length, so that rounding errors do not change the sign of its
+    determinant."""
     length = np.linalg.norm(jacobian, axis=-2, keepdims=True)
     return np.asarray(jacobian / np.maximum(length, np.finfo(float).tiny))
 
@@ -155,11 +158,11 @@ class _FoldSearch:
         return scaled_derivatives(self.charge_map, contact, self.noise)
 
     def smallest_singular_value(self, position: Array) -> Array:
-        """Compute the smallest singular value of J / sigma for the position, shape (n,), 1/mm."""
+        """Compute the smallest singular value of J / sigma with respect to the position, shape (n,), 1/mm."""
         return singular_values(self.scaled(position))[:, 1]
 
     def folds_between(self, rings: Rings, scaled: Array) -> Array:
-        """Find folds between neighbouring positions of the rings.
+        """Find folds between neighbouring positions on the same ring or on neighbouring rings.
 
         Args:
             rings: Positions.
@@ -177,7 +180,7 @@ class _FoldSearch:
         return self._bisect(first, second)
 
     def _bisect(self, first: Array, second: Array) -> Array:
-        """Bisect segments between whose ends the orientation of the map is reversed.
+        """Bisect segments. The charge map has opposite orientations at the two ends of each segment.
 
         In each round, a segment is replaced by the half in which the orientation is reversed, until it is shorter than
         `SEGMENT_LENGTH`.

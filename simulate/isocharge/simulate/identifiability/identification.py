@@ -34,7 +34,9 @@ from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 MAX_SEARCH_RADIUS = 0.9
-"""Largest search radius in units of the film radius, dimensionless. Forward maps with larger radii need finer meshes.
+"""Largest search radius in units of the film radius, dimensionless.
+
+Forward maps with larger radii need finer meshes.
 """
 
 RADIUS_REDUCTION = 0.9
@@ -98,7 +100,7 @@ class LimitMap:
         )
 
     def statistics(self) -> dict[str, float]:
-        """Compute statistics of the errors, in which each position is weighted with the area that it represents."""
+        """Compute statistics of the errors. The weight of a position is the area that it represents."""
         area = np.repeat(self.rings.distance, self.position.shape[1])
         position = self.position.ravel()
         force = 100.0 * self.relative_force.ravel()
@@ -174,8 +176,8 @@ class Identification:
     def determined_share(self) -> float:
         """Share of the searched disk in which the error does not exceed its limit for any force, dimensionless.
 
-        The disk includes the regions on both sides of folds. In these regions, the charges determine the contact only
-        together with other information, such as preceding frames, that distinguishes contacts with the same charges.
+        The disk includes the regions on both sides of folds. In these regions, different contacts may have the same
+        charges. Other information, such as preceding frames, is then necessary to distinguish these contacts.
         """
         is_allowed = np.all([limits.position <= self.area.error for limits in self.maps], axis=0)
         return float(np.average(is_allowed.mean(axis=1), weights=self.maps[0].rings.distance))
@@ -215,7 +217,7 @@ class Identification:
         return f"The side force of the probe can be estimated {', '.join(errors)} (median)."
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the results for JSON, in which infinite radii are None."""
+        """Return the results as values for JSON. An infinite radius becomes None."""
         area = self.area
         return {
             "sensor": self.sensor.name,
@@ -321,7 +323,7 @@ def search_radius(sensor: Sensor, probe: Probe) -> float:
 def map_to_search(
     sensor: Sensor, probe: Probe, force_range: tuple[float, float], executor: Executor | None = None
 ) -> ForwardMap:
-    """Solve a forward map over the search radius, or over a smaller radius if the charges cannot be interpolated.
+    """Solve a forward map over the search radius. If the charges cannot be interpolated there, use a smaller radius.
 
     Args:
         sensor: Sensor.

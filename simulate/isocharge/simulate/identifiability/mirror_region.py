@@ -1,4 +1,4 @@
-"""The mirror region: positions outside the working area where a press has the charges of a press inside it.
+"""The mirror region: positions outside the working area where a press has the same charges as a press inside it.
 
 If all electrodes lie on one circle of radius R, the mirror region covers almost the whole film. A point load at the
 distance r from the centre has nearly the same influence on the points of this circle as a point load at R^2 / r. The
@@ -21,8 +21,10 @@ from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 DETECTABLE_SIGMAS = 5.0
-"""Difference of charges above which a press can be noticed, in standard deviations of the noise. It is the smallest
-limit of the misfit in `isocharge.serve`."""
+"""Difference of charges above which a press can be noticed, in standard deviations of the noise.
+
+It is the smallest limit of the misfit in `isocharge.serve`.
+"""
 
 FORCE_COUNT = 5
 """Number of forces of the presses at each position."""
@@ -40,13 +42,15 @@ N_CANDIDATES = 1024
 """Number of contacts from which the search for the nearest contact starts."""
 
 INTERIOR = 0.98
-"""Distance from the centre up to which a contact counts as inside the working area, in units of its radius. A contact
-on the edge does not explain the charges; the search only stopped there."""
+"""Distance from the centre up to which a contact counts as inside the working area, in units of its radius.
+
+A contact on the edge does not explain the charges; the search only stopped there.
+"""
 
 
 @dataclass(frozen=True)
 class MirrorRegion:
-    """Share of the presses outside the working area that have the charges of a press inside it, by position.
+    """Share of the presses outside the working area that have the same charges as a press inside it, at each position.
 
     Attributes:
         inner: Radius of the working area, mm.
@@ -98,12 +102,14 @@ class MirrorRegion:
 
     @property
     def total_share(self) -> float:
-        """Share of the presses outside the working area that have the charges of a press inside it, dimensionless."""
+        """Share of the presses outside the working area that have the same charges as a press inside it,
+        dimensionless."""
         return float(np.average(self.share.mean(axis=1), weights=self.distance))
 
     @property
     def summary(self) -> str:
-        """Sentence that states how many presses outside the working area have the charges of a press inside it."""
+        """Sentence about the share of presses outside the working area that have the same charges as a press inside
+        it."""
         presses = (
             f"presses of {self.forces[0]:.2g} to {self.forces[-1]:.2g} N from {self.inner:.3g} to {self.outer:.3g} mm "
             "from the centre"
@@ -128,7 +134,7 @@ class MirrorRegion:
 
 
 def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
-    """Return for which charges a press in a domain has the same charges, up to the noise.
+    """Return a mask of the charges that a press in a domain also causes, up to the noise.
 
     Args:
         inside: Charge map of the domain.

@@ -1,7 +1,7 @@
 """Search for the contact whose charges are nearest to given charges.
 
-The distance of the charges Q(c) of a contact c from given charges Q is |(Q - Q(c)) / sigma|, where sigma is the
-standard deviation of the noise of each charge. The distance is minimised over the contacts of a domain.
+Let Q be the given charges, q(c) the charges of a contact c, and sigma the standard deviation of the noise of each
+charge. The distance of q(c) from Q is |(Q - q(c)) / sigma|. The distance is minimised over the contacts of a domain.
 """
 
 from collections.abc import Callable
@@ -19,12 +19,16 @@ STEPS = 8
 """Number of steps from a start near the solution. Most charges need five."""
 
 CANDIDATES = 4096
-"""Number of contacts among which the starting points of a search are chosen. The contacts are distributed over the
-domain, and a quarter of them lie on the edge of the disk."""
+"""Number of contacts among which the starting points of a search are chosen.
+
+The contacts are distributed over the domain, and a quarter of them lie on the edge of the disk.
+"""
 
 START_SEPARATION = 0.25
 """Smallest distance between the starts of one search in unit coordinates, in which the radius of the domain is one.
-Starts that are nearer to each other mostly lead to the same local minimum."""
+
+Starts that are nearer to each other mostly lead to the same local minimum.
+"""
 
 CHUNK = 2048
 """Number of charges that are compared with all candidates at once, which limits the memory."""
@@ -72,7 +76,7 @@ def explain(
     """
 
     def given_sigma(rows: Integers, _: Array) -> Array:
-        """Return the given standard deviations of these rows of the charges, pC."""
+        """Return the given standard deviations that belong to some rows of the charges, pC."""
         return np.asarray(sigma[rows])
 
     return _descend(charge_map, charge, given_sigma, start, MAX_STEPS, min_change)
@@ -116,7 +120,8 @@ def _descend(
         return np.column_stack([log_contact[:, :2], force])
 
     def residuals(rows: Integers, unit_coordinates: Array) -> tuple[Array, Array]:
-        """Return the residuals of rows, shape (k, n_electrode), and their derivatives, shape (k, 3, n_electrode)."""
+        """Return the residuals of some rows of the charges, shape (k, n_electrode), and their derivatives, shape (k, 3,
+        n_electrode)."""
         predicted, slopes = linearised(charge_map, to_contact(unit_coordinates))
         sigma = sigma_of(rows, predicted)
         derivatives = -slopes * half_width / sigma[..., None]
@@ -192,7 +197,9 @@ def _unit_candidates(count: int) -> Array:
 def _nearest_rows(
     charge: Array, sigma: Array, candidate_charges: Array, is_neighbour: Booleans, count: int
 ) -> Integers:
-    """Find the candidates whose charges are nearest to each row of charges, and which are not neighbours of each other.
+    """For each row of charges, find the candidates with the nearest charges.
+
+    Candidates that are neighbours of each other are not returned together.
 
     A few searches for the smallest distance are faster than sorting all distances.
 

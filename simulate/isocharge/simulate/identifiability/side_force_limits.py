@@ -1,8 +1,8 @@
 """Cramer-Rao limits of contacts with an unknown side force.
 
 Such a contact has five parameters: x, y, the force F, and the side force (Fx, Fy). The limits of the five parameters
-are computed for a side force of zero. The sensor must have at least six electrodes, because five charges always fit
-five parameters, even if the model of the film is wrong.
+are computed for a side force of zero. The sensor must have at least six electrodes. With five electrodes, five
+parameters always fit the five charges, even if the model of the film is wrong.
 """
 
 from concurrent.futures import Executor
@@ -35,7 +35,7 @@ ANGLE_COUNT = 36
 
 @dataclass(frozen=True)
 class SideForceLimits:
-    """Limits of contacts with one force whose side force is unknown, at positions in the working area.
+    """Limits of contacts with an unknown side force. All contacts have the same force, and lie in the working area.
 
     Attributes:
         force: Force of the contacts, N.
@@ -82,7 +82,7 @@ class SideForceLimits:
         return self._median(self.side_force) <= MAX_SIDE_FORCE_ERROR
 
     def statistics(self) -> dict[str, Any]:
-        """Compute statistics of the errors, in which each position is weighted with the area that it represents."""
+        """Compute statistics of the errors. The weight of a position is the area that it represents."""
         return {
             "force_N": self.force,
             "side_force_median_percent": 100.0 * self._median(self.side_force),
@@ -95,7 +95,10 @@ class SideForceLimits:
         }
 
     def _median(self, values: Array) -> float:
-        """Compute the median of values at the positions, weighted with the area that each position represents."""
+        """Compute the weighted median of values at the positions.
+
+        The weight of a position is the area that it represents.
+        """
         relative_area = np.repeat(np.arange(1, RING_COUNT + 1), ANGLE_COUNT)  # proportional to the radius of the ring
         order = np.argsort(values)
         cumulative_area = np.cumsum(relative_area[order])

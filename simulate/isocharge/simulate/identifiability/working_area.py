@@ -21,12 +21,16 @@ RADIUS_STEP = 0.1
 """Step to which radii of working areas are rounded down, mm."""
 
 MAX_CONFIRMATIONS = 4
-"""Largest number of times that the error is evaluated again on finer rings within the area. Near an electrode, the
-error may exceed its limit between two of the first rings."""
+"""Largest number of times that the error is evaluated again on finer rings within the area.
+
+Near an electrode, the error may exceed its limit between two of the first rings.
+"""
 
 Bound = Literal["fold", "ambiguous pair", "error", "search"]
-"""Reason for the radius of a working area. "search" means that only the radius of the search bounds the area. The error
-grows without limit towards a fold, so an area that ends before a fold mostly has the bound "error"."""
+"""Reason for the radius of a working area. "search" means that only the radius of the search bounds the area.
+
+The error grows without limit towards a fold, so an area that ends before a fold mostly has the bound "error".
+"""
 
 
 @dataclass(frozen=True)
@@ -142,7 +146,8 @@ def working_area(
 
 
 def _confirmed(charge_map: ChargeMap, radius: float, forces: list[float], noise: NoiseModel, error: float) -> float:
-    """Evaluate the error again on rings within a radius, and reduce the radius where the error exceeds its limit.
+    """Evaluate the error again on rings within a radius, and reduce the radius if the error of a ring exceeds its
+    limit.
 
     Args:
         charge_map: Charges as a function of the contact.
@@ -194,7 +199,7 @@ def _error_radius(charge_map: ChargeMap, rings: Rings, force: float, noise: Nois
 
 
 def _nearest_exceeding(charge_map: ChargeMap, position: Array, force: float, noise: NoiseModel, error: float) -> float:
-    """Return the distance from the centre of the nearest position whose error exceeds its limit, mm; or infinity.
+    """Return the smallest distance from the centre at which the error of a position exceeds its limit, mm; or infinity.
 
     Args:
         charge_map: Charges as a function of the contact.

@@ -42,7 +42,7 @@ WEIGHT_MAP_HEADER = "x_mm,y_mm,weight"
 
 @dataclass(frozen=True)
 class Nuisances:
-    """Standard deviations of parameters that are not known exactly when a press is read.
+    """Prior standard deviations of parameters that are not known exactly when a press is measured.
 
     Attributes:
         probe_radius: Standard deviation of the probe radius, mm. It includes an unknown distribution of the pressure.
@@ -203,7 +203,10 @@ class DesignCase:
         self._check_kept_electrodes()
 
     def _check_kept_electrodes(self) -> None:
-        """Check the names of the kept electrodes, and the side of the new squares for the readout 'edge'."""
+        """Check the names of the kept electrodes.
+
+        For the readout 'edge', also check the side length of the new squares.
+        """
         if len(set(self.keep)) < len(self.keep):
             raise InputError(f"keep: expected different names, got {', '.join(self.keep)}")
         if len(self.keep) >= self.electrodes:
@@ -256,8 +259,10 @@ class DesignCase:
 
     @property
     def fine_grid(self) -> Array:
-        """Positions of presses on a fine grid, shape (n, 2), mm. A coarse grid misses the largest error, which occurs
-        mostly beside an electrode."""
+        """Positions of presses on a fine grid, shape (n, 2), mm.
+
+        A coarse grid misses the largest error, which occurs mostly beside an electrode.
+        """
         return square_grid(self.radius, self.radius / FINE_GRID_STEPS)
 
     def weights(self, presses: Array) -> Array:
@@ -265,7 +270,8 @@ class DesignCase:
         return self.goal.weigh(presses) if isinstance(self.goal, WeightMap) else np.ones(len(presses))
 
     def clearance(self, positions: Array) -> Array:
-        """Compute how far single squares are beyond the smallest distances from the rim and the kept electrodes.
+        """Compute by how much the distances of single squares from the rim and the kept electrodes exceed the required
+        distances.
 
         Args:
             positions: Centres of the squares, shape (n, 2), mm.
@@ -283,7 +289,7 @@ class DesignCase:
         return np.asarray(np.min(clearances, axis=0))
 
     def pair_clearance(self, positions: Array, others: Array) -> Array:
-        """Compute how far pairs of new squares are beyond the smallest distance between electrodes.
+        """Compute by how much the distances between pairs of new squares exceed the required distance.
 
         Args:
             positions: Centres of the first squares, shape (n, 2), mm.
@@ -322,7 +328,7 @@ class DesignCase:
         return replace(self.sensor, name=name, electrodes=electrodes, calibration=Calibration())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all parameters of the case for JSON, except the sensor and the weights."""
+        """Return all parameters of the case except the sensor and the weights, as values for JSON."""
         return {
             "electrodes": self.electrodes,
             "radius_mm": self.radius,
@@ -344,6 +350,6 @@ class DesignCase:
 
 
 def _check_length(name: str, value: float, minimum: float) -> None:
-    """Raise an InputError if a length (mm) is not finite or smaller than the minimum (mm)."""
+    """Raise an InputError if a length (mm) is not finite, or if it is smaller than the minimum (mm)."""
     if not (np.isfinite(value) and value >= minimum):
         raise InputError(f"{name}: expected a length from {minimum:g} mm, got {value} mm")

@@ -53,8 +53,10 @@ ANGLES = 64
 """Number of columns of the grid, at equal angles."""
 
 MARGIN = 0.03
-"""Width of the gap of the grid on either side of the circle, in units of rho, dimensionless. In the gap, the finite
-differences would be wrong because of the kink of the stress."""
+"""Width of the gap of the grid on either side of the circle, in units of rho, dimensionless.
+
+In the gap, the finite differences would be wrong because of the kink of the stress.
+"""
 
 RELATIVE_STEP = 0.02
 """Step of the finite differences with respect to position and probe radius, in units of the probe radius."""
@@ -72,9 +74,12 @@ N_DISTANCES_WIDE = 8
 """Number of distances that are solved if the radius is more than a quarter of the film radius."""
 
 GAUSS_RULES = ((1.4, 10), (2.5, 4), (np.inf, 2))
-"""Integration rules of squares. Each pair consists of the largest distance of a square from a press and the number of
-Gauss points per side up to this distance. The unit of the distances is the sum of half the diagonal of the square and
-the probe radius. The kink of the stress crosses only squares within the first distance."""
+"""Integration rules of squares.
+
+Each pair consists of the largest distance of a square from a press and the number of Gauss points per side up to this
+distance. The unit of the distances is the sum of half the diagonal of the square and the probe radius. The kink of the
+stress crosses only squares within the first distance.
+"""
 
 PRESS_CHUNK = 256
 """Number of presses that are evaluated at once, which limits the memory to about 100 MB."""
@@ -135,7 +140,7 @@ class ChargeTable:
         return cls(film.radius, probe, (sensor.piezo.d31, sensor.piezo.d32), distance, stress)
 
     def rows(self, presses: Array, centres: Array, side: float, others: tuple[Electrode, ...] = ()) -> Array:
-        """Compute charges and derivatives of squares and of other electrodes.
+        """Compute the charges of squares and of other electrodes, and the derivatives of these charges.
 
         The charges are means over the areas of the electrodes, regardless of the readout of the sensor.
 
@@ -158,7 +163,7 @@ class ChargeTable:
 
 @dataclass(frozen=True)
 class _PressedFilm:
-    """Charge per area on the grids of several presses.
+    """Charge per area on the polar grids of several presses.
 
     Attributes:
         table: Charge table.
@@ -354,7 +359,7 @@ def _stress_at(
     def changed_stress(
         x: float = 0.0, y: float = 0.0, log_force: float = 0.0, radius: float = 0.0, pretension: float = 0.0
     ) -> Array:
-        """Return the stress on the grid after a change of each parameter, shape (n_node, 3), MPa."""
+        """Return the stress on the grid for changed parameters, shape (n_node, 3), MPa."""
         changed_film = replace(film, pretension=film.pretension + pretension)
         changed_probe = Circle(probe.radius + radius)
         changed_force = force * float(np.exp(log_force))

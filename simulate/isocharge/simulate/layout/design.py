@@ -35,7 +35,7 @@ NOT_SEARCHED = "folds and ambiguous pairs could not be looked for: the charges v
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """Lower limits of the position error of one layout under the presses of a design case.
+    """Lower limits of the position error of one layout. They are computed for the presses of a design case.
 
     Attributes:
         presses: Positions of the presses on a square grid, shape (n, 2), mm.

@@ -1,10 +1,11 @@
-"""Position of a guard electrode: one further square with which presses outside the working area can be noticed.
+"""Position of a guard electrode: one further square, whose charge reveals presses outside the working area.
 
 Electrodes on one circle give a press outside the circle nearly the charges of a press inside it (`mirror_region`). A
 further electrode at another distance from the centre has different charges under both presses. The search first finds
-the presses outside the working area that cannot be noticed, with the contacts inside it that have the same charges. For
-each position of the further square it then counts those for which a descent from this contact still finds a contact
-with the same charges. The mirror region of the best positions is computed by a search over the whole working area.
+pairs of contacts with the same charges: a press outside the working area, which cannot be noticed, and a contact inside
+it. For each position of the further square, the search then starts a descent from the inner contact of each pair. It
+counts the pairs for which the descent still finds a contact with the same charges. The mirror region of the best
+positions is computed by a search over the whole working area.
 """
 
 from concurrent.futures import Executor
@@ -143,8 +144,8 @@ def guard_case(sensor: Sensor, radius: float, **settings: Any) -> DesignCase:
 def design_guard(case: DesignCase, *, executor: Executor | None = None) -> GuardDesign:
     """Find the position of one further square with which the fewest presses outside the working area go unnoticed.
 
-    Among the positions with nearly the smallest share of such presses, the one with the smallest position limits in the
-    working area is chosen.
+    Several positions may have nearly the smallest share of such presses. Among these positions, the position with the
+    smallest position limits in the working area is chosen.
 
     Args:
         case: Case of `guard_case`.
@@ -281,7 +282,7 @@ class JoinedMap:
 
 
 def _presses_outside(case: DesignCase, outer_map: ForwardMap) -> Array:
-    """Return presses spread over the film outside the working area, shape (n, 3), mm and N.
+    """Return presses that are spread over the film outside the working area, shape (n, 3), mm and N.
 
     Their forces repeat over those of the mirror region.
     """

@@ -1,10 +1,10 @@
 """Lower limit of the position error of a layout, with nuisance parameters.
 
 Let A = d(charge) / d(x, y, ln F, nuisances) for all electrodes, W the diagonal matrix of the Fisher information that
-one reading provides about its charge, and P the inverse of the prior covariance. The information about all parameters
-is B = A' W A + P. The Cramer-Rao limit of the position, with marginalised nuisances, is the block of the inverse of B
-that belongs to x and y. A further electrode adds a matrix a a' to B, where a is the row of sqrt(W) A that belongs to
-this electrode. The limit then changes according to Sherman and Morrison (1950):
+one reading provides about its charge, and P the inverse of the prior covariance. The Fisher information matrix of all
+parameters is B = A' W A + P. The Cramer-Rao limit of the position, with marginalised nuisances, is the block of the
+inverse of B that belongs to x and y. A further electrode adds a matrix a a' to B, where a is the row of sqrt(W) A that
+belongs to this electrode. The limit then changes according to Sherman and Morrison (1950):
 
     tr_xy (B + a a')^-1 = tr_xy B^-1 - |(B^-1 a)_xy|^2 / (1 + a' B^-1 a).
 """
@@ -26,7 +26,7 @@ LOG_FORCE_PRIOR_STD = 10.0
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """Position errors as a function of the rows of a `ChargeTable`.
+    """Model that computes position errors from the rows of a `ChargeTable`.
 
     Attributes:
         noise: Noise of the readings, including the uncertainty of the gains.
@@ -95,7 +95,8 @@ def position_variance(inverse: Array) -> Array:
 
 
 def with_one_more(sensitivity: Array, candidates: Array) -> Array:
-    """Compute the squared errors of a layout with each of many candidates for one further electrode.
+    """Compute the squared errors of a layout to which one further electrode is added, for many candidates for this
+    electrode.
 
     Args:
         sensitivity: Sensitivities of the electrodes of the layout, shape (n_press, n_electrode, 5).

@@ -48,15 +48,19 @@ GRID_STEPS = 20
 """Number of steps of the grid of positions from the centre outwards."""
 
 GRID_EXTENT = 1.0 / 3.0
-"""Distance by which the grid of positions extends beyond the presses, in units of the film radius, dimensionless. The
-charges of electrodes farther out change little."""
+"""Distance by which the grid of positions extends beyond the presses, in units of the film radius, dimensionless.
+
+The charges of electrodes farther out change little.
+"""
 
 MAX_FINALISTS = 3
 """Largest number of layouts that are refined."""
 
 MIN_DIFFERENCE = 2e-3
-"""Relative difference of the errors above which two layouts count as different, dimensionless. Layouts that differ less
-are mostly rotations of each other."""
+"""Relative difference of the errors above which two layouts count as different, dimensionless.
+
+Layouts that differ less are mostly rotations of each other.
+"""
 
 MAX_ROUNDS = 8
 """Largest number of rounds of the refinement."""
@@ -71,8 +75,10 @@ MAX_ACTIVE = 60
 """Largest number of presses that become constraints."""
 
 FIRST_STEP = 0.2
-"""Largest change of a coordinate in the first round, in units of the side of a square. It is halved after each round
-without improvement."""
+"""Largest change of a coordinate in the first round, in units of the side of a square.
+
+It is halved after each round without improvement.
+"""
 
 LAST_STEP = 0.02
 """Largest change of a coordinate below which the refinement ends, in units of the side of a square."""
@@ -376,7 +382,7 @@ class _Exchange:
 
     @classmethod
     def of(cls, search: Search, grid: Array) -> "_Exchange":
-        """Evaluate the sensitivities of a square at every position of a grid.
+        """Create an exchange from a search, and evaluate the sensitivities of a square at every position of a grid.
 
         Args:
             search: Search with its design case and charge table.

@@ -1,4 +1,4 @@
-"""Simulation of the measuring chain: effect of film, amplifier and converter on touch charges over time.
+"""Simulation of the measuring chain: how the film, the amplifier and the converter change touch charges over time.
 
 A charge amplifier is a leaky integrator with the time constant tau = R C, so that a step of the charge decays by a
 factor of e within tau. The output of reading n is
@@ -210,7 +210,7 @@ class Measurement:
         return self._convert(noisy_output)
 
     def _relaxed(self, charge: Array) -> Array:
-        """Apply creep and the thermoelastic effect to touch charges.
+        """Compute the effect of creep and of the thermoelastic effect on touch charges.
 
         Both effects are sums of decaying exponentials. Each exponential is computed by a recursive filter of the
         changes of the charge. The state of the filter is stored for the next call.

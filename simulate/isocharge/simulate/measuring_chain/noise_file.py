@@ -1,4 +1,4 @@
-"""Noise models and amplifiers of the levels clean, reference, bench and surgery, or from a TOML file."""
+"""Noise models and amplifiers for the levels clean, reference, bench and surgery, and their reader from a TOML file."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -57,8 +57,10 @@ KEY_NAMES = {
     "film_time": "film_time_s",
     "limit": "limit_pC",
 }
-"""Keys of the TOML file by the attributes of `Amplifier`. These keys differ from the attributes, because they contain
-the unit."""
+"""Keys of the TOML file by the attributes of `Amplifier`.
+
+These keys differ from the attributes, because they contain the unit.
+"""
 
 AmplifierFile = defstruct(
     "AmplifierFile",
@@ -76,8 +78,10 @@ AmplifierFile = defstruct(
     frozen=True,
     rename=KEY_NAMES,
 )
-"""Content of the TOML file: the noise, and the attributes of `Amplifier` with their bounds. An absent key has the value
-of the level `like`."""
+"""Content of the TOML file: the noise, and the attributes of `Amplifier` with their bounds.
+
+An absent key has the value of the level `like`.
+"""
 
 
 def load_amplifier(level: str) -> Amplifier:

@@ -1,4 +1,4 @@
-"""Pictures of the lower limit of the position error over the film, for an identification and for a design."""
+"""Pictures that show the lower limit of the position error over the film for an identification or a design."""
 
 from typing import Any
 
@@ -61,7 +61,7 @@ def identification_picture(identification: Identification) -> Figure:
 
 
 def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMap) -> Any:
-    """Draw the position errors for one force as colours, with folds, working area and electrodes to scale.
+    """Draw the position errors for one force as colours. Folds, working area and electrodes are drawn to scale.
 
     Args:
         axes: Axes of matplotlib.
@@ -121,7 +121,9 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
 
 
 def error_maps_picture(design: Design) -> Figure:
-    """Draw the position errors with the nuisances of the case as colours, for the initial and the new layout.
+    """Draw the position errors of the initial and the new layout as colours.
+
+    The errors include the nuisances of the case.
 
     Args:
         design: Result of the design.

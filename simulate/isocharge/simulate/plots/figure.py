@@ -31,8 +31,10 @@ DPI = 130
 """Resolution of PNG files, dots per inch."""
 
 LAST_SHADE = 0.92
-"""End of the part of the viridis colour map that `shades` uses, from 0 to 1. The remaining part is hardly visible on
-white."""
+"""End of the part of the viridis colour map that `shades` uses, from 0 to 1.
+
+The remaining part is hardly visible on white.
+"""
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -112,5 +114,5 @@ def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
 
 
 def save_picture(figure: Figure, path: Path) -> None:
-    """Write a figure in the format of the suffix of the path. A failed write leaves no partial file."""
+    """Write a figure to a file. The suffix of the path selects the format. A failed write leaves no partial file."""
     write_whole(path, picture_bytes(figure, path.suffix.lstrip(".").lower()))

@@ -17,8 +17,10 @@ from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
 
 DRAWN_RADIUS = 0.999999
-"""Radius up to which the deflection is drawn, in units of the film radius. Because of rounding errors, points on the
-rim may lie outside the film."""
+"""Radius up to which the deflection is drawn, in units of the film radius.
+
+Because of rounding errors, points on the rim may lie outside the film.
+"""
 
 
 def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool = True, ink: str = INK) -> None:
@@ -100,7 +102,7 @@ def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "", highl
 
 
 def draw_charge_map(axes: Any, charge_map: ChargeMap, number: int, force: float = 1.0, count: int = 81) -> None:
-    """Draw the charge of one electrode over the position of a press as shades and labelled contours.
+    """Draw the charge of one electrode as a function of the position of a press, as shades and labelled contours.
 
     Args:
         axes: Matplotlib axes.

@@ -37,7 +37,7 @@ def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
 
 
 def _draw_region(axes: Any, sensor: Sensor, mirror: MirrorRegion) -> Any:
-    """Draw the shares as colours, with the clamp, the working area and the electrodes to scale.
+    """Draw the shares as colours. The clamp, the working area and the electrodes are drawn to scale.
 
     Args:
         axes: Axes of matplotlib.

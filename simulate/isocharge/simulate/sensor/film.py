@@ -1,4 +1,4 @@
-"""Properties of the film, and its piezoelectric coefficients."""
+"""Mechanical properties and piezoelectric coefficients of the film."""
 
 import math
 from dataclasses import dataclass
@@ -17,8 +17,10 @@ MIN_THICKNESS = 1e-4
 """Smallest thickness of a film, mm. Smaller values are probably in metres."""
 
 MAX_PIEZO = 1e5
-"""Largest piezoelectric or pyroelectric coefficient, pC/N or pC/(mm^2 K). It is thirty times the coefficient of the
-strongest crystals."""
+"""Largest piezoelectric or pyroelectric coefficient, pC/N or pC/(mm^2 K).
+
+It is thirty times the coefficient of the strongest crystals.
+"""
 
 MIN_PIEZO = 1e-3
 """Smallest coefficient d31, d32, d33 or d12 other than zero, pC/N. Smaller values are probably in C/N."""
@@ -73,7 +75,10 @@ class Coat:
     layers: tuple[tuple[tuple[tuple[float, float], ...], ...], ...]
 
     def __repr__(self) -> str:
-        """Return a short text with the stiffness and the number of polygons, without their many corners."""
+        """Return a short text with the stiffness and the number of polygons.
+
+        The corners are omitted, because there are many.
+        """
         return f"Coat({self.stiffness:.4g} N/mm, {len(self.layers[0])} parts)"
 
 
@@ -139,7 +144,7 @@ class Film:
 
     @property
     def asymmetries(self) -> dict[str, object]:
-        """Names and values of the attributes that make the film differ from an axisymmetric film."""
+        """Names and values of the attributes because of which the film is not axisymmetric."""
         names = ("deviator", "young_ratio", "shear", "axis", "oval", "oval_axis", "coat")
         return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(Film, name)}
 

@@ -1,8 +1,9 @@
-"""The unknown parameters of a real film, and their prior distribution about the description in a sensor file.
+"""The unknown parameters of a real film, and their prior distribution.
 
-Before anything is measured, the properties of the film, its coefficients and the gains are uncertain by a few percent,
-and the positions of the electrodes by tenths of a millimetre. The pretension is almost unknown. Calibrations start from
-this prior distribution, virtual films are drawn from it, and networks for all films are trained with films from it.
+The prior distribution is centred on the description in a sensor file. Before anything is measured, the properties of
+the film, its coefficients and the gains are uncertain by a few percent, and the positions of the electrodes by tenths
+of a millimetre. The pretension is almost unknown. Calibrations start from this prior distribution, virtual films are
+drawn from it, and networks for all films are trained with films from it.
 
 `PARAMETERS` declares each parameter that all films have. The parameter vector also contains one gain for each
 electrode. Each parameter is a deviation from the sensor file, so it is zero for the described film. Only the parameter
@@ -179,7 +180,7 @@ class PretensionParameter(FilmParameter):
         return prior.spread.pretension / float(np.sqrt(12.0))
 
     def bounds(self, prior: "FilmPrior") -> tuple[float, float]:
-        """Return zero and a value somewhat above the largest pretension of the prior distribution."""
+        """Return zero, and a value slightly larger than the largest pretension of the prior distribution."""
         return 0.0, MAX_PRETENSION_FACTOR * prior.spread.pretension
 
 
@@ -231,7 +232,7 @@ def gain_parameter(electrode: str) -> FilmParameter:
 
 @dataclass(frozen=True)
 class FilmPrior:
-    """Prior distribution of the films that a described sensor may have, and of the radius of its probe.
+    """Prior distribution of the film of a described sensor, and of the radius of the probe.
 
     Attributes:
         sensor: The sensor as described.
@@ -301,8 +302,7 @@ class FilmPrior:
 
     @cached_property
     def file_factors(self) -> Array:
-        """Factors that convert the units of the parameters into those of files of calibrations, shape
-        (n_parameter,)."""
+        """Factors that convert the parameters into the units of calibration files, shape (n_parameter,)."""
         return np.array([parameter.file_factor for parameter in self.parameters])
 
     @cached_property
@@ -429,7 +429,7 @@ def _components_of(sensor: Sensor, probe: Circle) -> Components:
 
 
 def _rounded_corners(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
-    """Return the corners of the parts of each electrode, rounded to a nanometre, mm."""
+    """Return the corners (mm) of the parts of each electrode, rounded to a nanometre."""
     return {
         electrode.name: [(round(x, 6), round(y, 6)) for part in electrode.parts for x, y in part]
         for electrode in sensor.electrodes

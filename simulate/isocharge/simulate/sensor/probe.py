@@ -35,7 +35,7 @@ NOTATIONS: tuple[ProbeNotation, ...] = tuple(notation for shape in PROBE_SHAPES 
 
 
 def _listed(forms: list[str]) -> str:
-    """Join the forms of several notations in a text such as "a, b or c"."""
+    """Join the forms of several notations to a text such as "a, b or c"."""
     return f"{', '.join(forms[:-1])} or {forms[-1]}"
 
 

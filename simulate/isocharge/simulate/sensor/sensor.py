@@ -31,12 +31,16 @@ MAX_CORNERS = 256
 """Largest number of corners of a polygon."""
 
 MAX_ELECTRODE_CORNERS = 2048
-"""Largest number of corners of all polygons of an electrode. The number is limited because all pairs of edges are
-searched for intersections."""
+"""Largest number of corners of all polygons of an electrode.
+
+The number is limited because all pairs of edges are searched for intersections.
+"""
 
 MIN_EXTENT = 0.02
-"""Smallest accepted value of the larger extent of an electrode along x and y, mm. Smaller values are probably in
-metres."""
+"""Smallest accepted value of the larger extent of an electrode along x and y, mm.
+
+Smaller values are probably in metres.
+"""
 
 MAX_PART_SIDE = 3.0
 """Longest side of the parts of an electrode that is not convex, mm."""
@@ -173,7 +177,7 @@ class Electrode:
 
     @cached_property
     def metal(self) -> tuple[Array, ...]:
-        """Metal on the front, whether or not it collects charge, as convex parts like `parts`."""
+        """All metal on the front as convex parts like `parts`, including metal that collects no charge."""
         return replace(self, back=()).parts if self.back else self.parts
 
     @cached_property
@@ -234,7 +238,7 @@ class Calibration:
         return np.asarray(charge + self.crosstalk * charge_of_others)
 
     def place(self, points: Array) -> Array:
-        """Convert positions in the layout into positions on the real film.
+        """Convert nominal positions in the layout into calibrated positions on the real film.
 
         Args:
             points: Positions (x, y), shape (..., 2), mm.

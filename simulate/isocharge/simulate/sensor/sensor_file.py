@@ -83,8 +83,8 @@ class PiezoTable(Settings, frozen=True):
 class PolygonTable(Settings, frozen=True):
     """Description of an electrode that is not a square.
 
-    The electrode consists of a pad on the front, and optionally of further polygons and a trace on the front, and of
-    polygons on the back.
+    The electrode has a pad on the front. It may also have further polygons and a trace on the front, and polygons on
+    the back.
     """
 
     polygon_mm: tuple[Point, ...]
@@ -212,7 +212,7 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
 
 
 def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
-    """Return the tables of the file of a sensor, which can be written as JSON or TOML.
+    """Return a sensor as the tables of a sensor file. They can be written as JSON or TOML.
 
     If `sensor_from_dict` reads these tables, the result is the same sensor, except for rounding errors.
 
@@ -282,7 +282,7 @@ def film_to_dict(film: Film) -> dict[str, Any]:
 
 
 def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
-    """Return the text of the file of a sensor.
+    """Return a sensor as the text of a sensor file.
 
     If `load_sensor` reads this text, the result is the same sensor, except for rounding errors.
 

@@ -1,4 +1,7 @@
-"""Checks of lengths and stresses, which also detect values in metres and pascals; rounding of numbers for files."""
+"""Checks of lengths and stresses, and rounding of numbers for files.
+
+The checks also detect values in metres and pascals.
+"""
 
 import math
 

@@ -142,7 +142,7 @@ def calibrate_command(
 
 
 def calibrate_into(presses: MeasuredPresses, problem: CalibrationProblem, output: Path, *, json: bool) -> None:
-    """Calibrate a film, write its model, and print the result; the common part of `calibrate` and `fit`.
+    """Calibrate a film, write its model, and print the result. The commands `calibrate` and `fit` call this function.
 
     Args:
         presses: The measured presses.
@@ -166,7 +166,7 @@ def _fit(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationRe
 
 
 def _print_result(result: CalibrationResult | None, proposed: list[ProposedPress], *, json: bool) -> None:
-    """Print a calibration, if there is one, and the presses that are proposed.
+    """Print the result of a calibration, if there is one, and the proposed presses.
 
     Args:
         result: Result of the calibration; None if only presses are proposed.
@@ -188,7 +188,7 @@ def _print_result(result: CalibrationResult | None, proposed: list[ProposedPress
 
 
 def _with_temperature(presses: MeasuredPresses, temperature_C: float | None) -> MeasuredPresses:
-    """Return the presses with this temperature if their own temperatures are unknown."""
+    """Return the presses with a temperature for the whole film, unless their temperatures are known already."""
     if temperature_C is None or presses.knows_temperature:
         return presses
     return replace(presses, temperature_C=np.full(len(presses), temperature_C))
@@ -232,7 +232,7 @@ def _check_usage(
 
 
 def _check_side_forces(file: Path | None, friction: float, side_force: float, *, is_moved: bool) -> None:
-    """Refuse side forces if nothing that they concern is given.
+    """Refuse an option about side forces if neither presses nor a model are given to which it applies.
 
     Args:
         file: File of presses.

@@ -314,7 +314,7 @@ def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | N
 
 
 def refuse_training_options(config: Path | None, version: int, radius: str) -> None:
-    """Refuse options that have no meaning if the film is calibrated, because no network is trained then.
+    """Refuse options of the network's training if the film is calibrated. No network is trained in this case.
 
     Args:
         config: File with training settings; None if the option was not given.
@@ -343,7 +343,7 @@ def refuse_training_options(config: Path | None, version: int, radius: str) -> N
 def _film_prior(
     dataset: Path | None, sensor: str | None, notations: list[str], radius: str, config: Path | None
 ) -> FilmPrior:
-    """Return the distribution of the films of a sensor for `--films`, after a check of the other options.
+    """Check the other options, and return the distribution of the films of a sensor for `--films`.
 
     Args:
         dataset: Dataset or file of presses, which must be None.

@@ -33,7 +33,7 @@ from isocharge.train.calibration.session import PressSession
 
 @dataclass(frozen=True)
 class SensorPort:
-    """Port of a sensor, as the options describe it.
+    """Port of a sensor. The command-line options describe it.
 
     Attributes:
         url: Device path or pyserial URL of the port, or a file of bytes.
@@ -183,7 +183,10 @@ def _open_session(
 
 
 def _check_list(contacts: Array, session: PressSession, name: str) -> None:
-    """Raise PressError if a calibration would refuse a press of a machine's list. The message names the row."""
+    """Raise PressError if the list of a machine contains a press that a calibration would refuse.
+
+    The message names the row.
+    """
     for number, contact in enumerate(contacts, start=1):
         with error_prefix(f"{name}, press {number}: ", PressError):
             session.check(contact)
@@ -237,18 +240,19 @@ def _ignore_press(session: PressSession, press: SteadyPress) -> None:
 
 
 def _print_press(session: PressSession, press: SteadyPress) -> None:
-    """Print a line of JSON with the last press and the accuracy with which the film is known after this press."""
+    """Print one line of JSON: the last press, and the accuracy with which the film is known after this press."""
     show_json(_press_table(session, press) | {"next": None})
 
 
 def _print_proposing(session: PressSession, press: SteadyPress) -> None:
-    """Print the last press as a line of JSON, with the press that is proposed next."""
+    """Print one line of JSON: the last press, and the press that is proposed next."""
     proposed = None if session.enough else vars(session.proposed)
     show_json(_press_table(session, press) | {"next": proposed})
 
 
 def _press_table(session: PressSession, press: SteadyPress) -> dict[str, object]:
-    """Return the last press of a session and the accuracy with which the film is known after it, for JSON."""
+    """Return values for JSON: the last press of a session, and the accuracy with which the film is known after this
+    press."""
     electrodes = session.presses.electrodes
     result = session.result
     return {

@@ -38,7 +38,8 @@ OnTaken = Callable[[PressSession, SteadyPress], None]
 
 
 class Screen:
-    """Messages for a person on stderr: sentences, and about once a second the charges while a press settles."""
+    """Messages on stderr for the person who presses: sentences, and the charges about once per second while a press
+    settles."""
 
     def __init__(self, electrodes: tuple[str, ...]) -> None:
         """Set up the screen.
@@ -164,7 +165,7 @@ class Dialogue:
             self._screen.say(f"   row {number} is left out: {event.reason}")
 
     def _wait_for(self, *phases: Phase) -> WatchResult:
-        """Return the next reading in one of these phases, and show the phases of the readings before it."""
+        """Wait for the next reading in one of the given phases. Earlier readings only update the displayed phase."""
         while True:
             event = self._events.next()
             if isinstance(event, str):
@@ -271,7 +272,7 @@ class Dialogue:
 
 
 def _count_rows_made(session: PressSession, contacts: Array) -> int:
-    """Return the number of rows of a list of contacts up to the last press of the session.
+    """Return the number of rows in a list of contacts up to and including the last press of the session.
 
     Args:
         session: The session.

@@ -14,7 +14,7 @@ JOIN_TIMEOUT_s = 1.0
 
 
 class SessionEnd(Exception):
-    """The person ends the session, or the input or the port has ended."""
+    """The session ends: the person ended it, or the input or the port has ended."""
 
 
 class PressEvents:

@@ -1,4 +1,4 @@
-"""Resumable training and release of a model: the common part of `isocharge train fit` and `isocharge train distil`."""
+"""Resumable training and release of a model. `isocharge train fit` and `isocharge train distil` use this module."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -106,7 +106,7 @@ def train_and_release(
 
 
 def _errors_sentence(metadata: ModelMetadata) -> str:
-    """Return the errors of a model in words."""
+    """Return text that states the errors of a model."""
     errors = metadata.errors
     return (
         f"{_measured_presses_words(metadata)}position error {errors['position_median_mm']:g} mm median, "

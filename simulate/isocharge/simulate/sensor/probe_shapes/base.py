@@ -59,7 +59,7 @@ class ProbeNotation:
 
     @property
     def form(self) -> str:
-        """The notation with placeholders for the numbers, as help texts and error messages show it."""
+        """The notation with placeholders for the numbers. Help texts and error messages show it."""
         return f"{self.name}:{self.parameters}"
 
     def parse(self, text: str) -> "Probe | None":
@@ -81,7 +81,9 @@ class ProbeNotation:
 
 @dataclass(frozen=True)
 class FootprintTopology:
-    """Number and kind of the mesh blocks that a footprint needs. Probes with the same topology share a mesh template.
+    """Number and kind of the mesh blocks that a footprint needs.
+
+    Probes with the same topology use the same mesh template.
 
     Attributes:
         n_corner: Number of corners of the core polygon. The core polygon of a polygonal footprint is the footprint.
@@ -129,8 +131,10 @@ class Probe(ABC):
     @property
     @abstractmethod
     def period(self) -> float:
-        """Smallest rotation that maps the footprint onto itself, rad. Zero for a circle, which has no smallest
-        rotation."""
+        """Smallest rotation that maps the footprint onto itself, rad.
+
+        Zero for a circle, which has no smallest rotation.
+        """
 
     @property
     @abstractmethod
@@ -232,7 +236,10 @@ class CurvedProbe(Probe):
 
     @property
     def topology(self) -> FootprintTopology:
-        """A core polygon with the rotational symmetry of the footprint, and a layer up to its boundary."""
+        """Topology with a core polygon and a layer up to the boundary.
+
+        The core polygon has the rotational symmetry of the footprint.
+        """
         symmetry_order = round(math.tau / self.period)  # number of rotations that map the footprint onto itself
         n_corner = 4 if symmetry_order in (1, 2) else symmetry_order
         return FootprintTopology(n_corner, is_curved=True, fills_circle=False)

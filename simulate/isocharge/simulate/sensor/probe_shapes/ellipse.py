@@ -74,6 +74,6 @@ class Ellipse(CurvedProbe):
         return float(area_on_unit_disk) * 0.25 * self.width * self.height
 
     def _on_unit_disk(self, points: Complexes) -> Complexes:
-        """Map points (relative to the centre, mm) by the affine map that maps the ellipse onto the unit disk."""
+        """Apply the affine map that maps the ellipse onto the unit disk to points (relative to the centre, mm)."""
         unrotated = points * np.exp(-1j * self.angle)
         return np.asarray(2.0 * unrotated.real / self.width + 2.0j * unrotated.imag / self.height)

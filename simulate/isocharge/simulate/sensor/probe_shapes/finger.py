@@ -51,9 +51,9 @@ class Finger(RoundProbe):
     def force_share(self, corners: Array, at: complex) -> float:
         """Return the share of the force that acts on a convex polygon.
 
-        The pressure exceeds the fraction t of its peak within a disk of radius a sqrt(1 - t^2). The force on the
-        polygon is the peak pressure times the integral over t of the area that the polygon has in common with this
-        disk.
+        The pressure exceeds the fraction t of its peak within a disk of radius a sqrt(1 - t^2). Let A(t) be the area
+        that the polygon shares with this disk. The force on the polygon is the peak pressure times the integral of A(t)
+        over t.
 
         Args:
             corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
