@@ -13,7 +13,7 @@ from isocharge.common.progress import listening
 from isocharge.common.resumable_run import resume_parts
 from isocharge.simulate import Dataset, Domain, NoiseModel, Samples
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config
-from isocharge.train.training import descent
+from isocharge.train.training import descent, misfit_training
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fit import fit_identity, train_network
 from isocharge.train.training.losses import (
@@ -109,8 +109,9 @@ def settings(hidden=(16, 16), misfit_hidden=(8, 8), weights="float32", electrode
 
 @pytest.fixture
 def split_once(trained, monkeypatch):
-    """Use the split of the session's training, because the search for folds takes longer than these trainings."""
+    """Use the split of the session's training and few outside presses, which take longer than these trainings."""
     monkeypatch.setattr(Split, "of", lambda *_: trained.split)
+    monkeypatch.setattr(misfit_training, "N_OUTSIDE_PRESSES", 200)
 
 
 def weights(dataset, config, **options):
@@ -300,13 +301,15 @@ class Killed(BaseException):
     """Stands for a SIGKILL; no code but the test catches it."""
 
 
-LONGER = settings((12, 12), (10, 10), steps=20, misfit_steps=230, batch=64)
+LONGER = settings((12, 12), (10, 10), steps=20, misfit_steps=REPORT_EVERY + 10, batch=64)
 
 
-@pytest.mark.usefixtures("split_once")
+@pytest.mark.usefixtures("split_once", "_short_reports")
 def test_a_killed_training_continues_only_with_its_own_presses_and_settings(dataset, tmp_path, monkeypatch):
-    """After a kill in the second network, the first network and the examples are not computed again."""
-    monkeypatch.setattr(descent, "SAVE_EVERY_S", 0.0)
+    """Kill the training of the misfit network, and continue without computing the first network and the examples again.
+
+    The kill happens at the first report of the misfit network. Each step is saved, so few steps are trained.
+    """
 
     def kill(title, *_):
         if title == "training the misfit network":
