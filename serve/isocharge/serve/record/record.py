@@ -79,7 +79,7 @@ class Tracking(Struct, frozen=True):
     ] = None
     other: Annotated[
         OtherContact | None,
-        Meaning("Another contact with the same charges, where a film folds and it is not known which touches."),
+        Meaning("Another contact with the same charges, if the film folds and it is unknown which of them is real."),
     ] = None
 
 
