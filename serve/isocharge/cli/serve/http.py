@@ -115,7 +115,7 @@ def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
 
 
 def _report(traffic: Traffic, level: str, event: str, message: str) -> None:
-    """Report an event of the server as a line of the log or, without a log, as a sentence on stderr.
+    """Report an event of the server as a line of the log. If there is no log, print a sentence on stderr.
 
     Args:
         traffic: Counters of the server, which have the log.

@@ -223,14 +223,14 @@ class Columns:
 
     Args:
         names: Names of all numbers; an empty text for a number without a name.
-        scales: Value of one count of each number.
-        flags: Position of the flags; None if there are none.
+        scales: Factor by which each number is multiplied, in the unit of the field per count.
+        flags: Position of the number that contains the flags; None if there is no such number.
 
     Attributes:
         seq: Position of the frame counter; None if there is none.
         time: Position of the clock; None if there is none.
         time_unit_us: Unit of the clock, us.
-        channels: Positions of the channels, each with the value of one count.
+        channels: Position and factor of each channel.
         names: Names of the channels; empty if they have no names.
     """
 

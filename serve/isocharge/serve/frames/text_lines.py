@@ -92,12 +92,12 @@ def _csv(text: str) -> Line:
     """Parse a line of numbers between separators, or a header with the names of the columns."""
     cells = _SEPARATOR.split(text.rstrip(",; \t"))
     try:
-        return Line(Notation.csv, (), tuple(map(parse_number, cells)))
+        return Line(Notation.csv, values=tuple(map(parse_number, cells)))
     except ValueError:
         are_names = all(map(_NAME.fullmatch, cells))
         are_different = len(set(cells)) == len(cells)
         if are_names and are_different:
-            return Line(Notation.header, tuple(cells))
+            return Line(Notation.header, names=tuple(cells))
         raise
 
 
@@ -114,7 +114,7 @@ def _sentence(text: str) -> Line:
     _name, *cells = _SEPARATOR.split(content.rstrip(",; \t"))
     if not cells:
         raise ValueError(f"expected numbers after the first word, got {text[:100]!r}")
-    return Line(Notation.sentence, (), tuple(map(parse_number, cells)))
+    return Line(Notation.sentence, values=tuple(map(parse_number, cells)))
 
 
 def _pairs(text: str) -> Line:
@@ -128,7 +128,7 @@ def _pairs(text: str) -> Line:
         name, value = match.groups()
         pairs[name] = parse_number(value)
         position = match.end()
-    return Line(Notation.pairs, tuple(pairs), tuple(pairs.values()))
+    return Line(Notation.pairs, names=tuple(pairs), values=tuple(pairs.values()))
 
 
 def _teleplot(text: str) -> Line:
@@ -153,7 +153,7 @@ def _teleplot(text: str) -> Line:
     if times:
         pairs[TELEPLOT_TIME] = parse_number(times[0])
     pairs[name.strip()] = parse_number(value)
-    return Line(Notation.teleplot, tuple(pairs), tuple(pairs.values()))
+    return Line(Notation.teleplot, names=tuple(pairs), values=tuple(pairs.values()))
 
 
 def _json(text: str) -> Line:
@@ -164,11 +164,11 @@ def _json(text: str) -> Line:
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
     if isinstance(content, list) and content and all(isinstance(number, float) for number in content):
-        return Line(Notation.csv, (), tuple(content))
+        return Line(Notation.csv, values=tuple(content))
     numbers = dict(_json_numbers("", content))
     if not numbers:
         raise ValueError(f"expected numbers, got {text!r}")
-    return Line(Notation.json, tuple(numbers), tuple(numbers.values()))
+    return Line(Notation.json, names=tuple(numbers), values=tuple(numbers.values()))
 
 
 def _json_numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, float]]:

@@ -43,12 +43,12 @@ class RecordedStream:
         """
         self._stream = stream
         self.recorder = recorder
-        self._given_recorder = recorder  # The caller opened this recording and closes it.
+        self._caller_recorder = recorder  # The caller opened this recording and closes it.
         self._current_chunk: tuple[Chunk, list[str]] | None = None
         self._requests: deque[Callable[[], None]] = deque()
-        self._recording_requested: deque[Recorder | None] = deque(maxlen=1)
-        self._load_requested: Load | None = None
-        self._loading: Future[Predictor] | None = None
+        self._next_recorder: deque[Recorder | None] = deque(maxlen=1)
+        self._next_load: Load | None = None
+        self._loading_model: Future[Predictor] | None = None
 
     @property
     def predictor(self) -> Predictor:
@@ -75,7 +75,7 @@ class RecordedStream:
         Args:
             recorder: The next recording, which the stream opens and closes; None for no recording.
         """
-        self._recording_requested.append(recorder)
+        self._next_recorder.append(recorder)
         self._requests.append(self._record)
 
     def request_marker(self, marker: Marker) -> None:
@@ -92,7 +92,7 @@ class RecordedStream:
         Args:
             load: Function that loads the model.
         """
-        self._load_requested = load
+        self._next_load = load
 
     def follow(self, chunks: Iterable[Chunk]) -> Generator[PredictionRecord]:
         """Yield the records until the chunks end.
@@ -111,7 +111,7 @@ class RecordedStream:
         """
         try:
             for chunk in chunks:
-                if self._load_requested or self._loading:
+                if self._next_load or self._loading_model:
                     self._continue_loading()
                 while self._requests:
                     execute_request = self._requests.popleft()
@@ -139,10 +139,10 @@ class RecordedStream:
         The stream is restarted, so that the records of the recording depend only on the bytes in the recording. If the
         file cannot be created, an error is logged.
         """
-        if not self._recording_requested:  # a later request was executed instead of this one
+        if not self._next_recorder:  # a later request was executed instead of this one
             return
         self._end_recording()
-        recorder = self._recording_requested.pop()
+        recorder = self._next_recorder.pop()
         if recorder is not None:
             try:
                 self.recorder = recorder.__enter__()
@@ -158,7 +158,7 @@ class RecordedStream:
         """End the present recording. If this object has opened the recording, close it."""
         recorder = self.recorder
         self.recorder = None
-        if recorder is not None and recorder is not self._given_recorder:
+        if recorder is not None and recorder is not self._caller_recorder:
             recorder.close()
 
     def _mark(self, marker: Marker) -> None:
@@ -168,14 +168,14 @@ class RecordedStream:
 
     def _continue_loading(self) -> None:
         """Use the requested model if it has been loaded, and begin to load the next requested model."""
-        if self._loading is not None and self._loading.done():
-            self._use(self._loading)
-            self._loading = None
-        if self._load_requested and self._loading is None:
-            load = self._load_requested
-            self._load_requested = None
+        if self._loading_model is not None and self._loading_model.done():
+            self._use(self._loading_model)
+            self._loading_model = None
+        if self._next_load and self._loading_model is None:
+            load = self._next_load
+            self._next_load = None
             loader = ThreadPoolExecutor(1, "model")
-            self._loading = loader.submit(load)
+            self._loading_model = loader.submit(load)
             loader.shutdown(wait=False)
 
     def _use(self, loaded: "Future[Predictor]") -> None:

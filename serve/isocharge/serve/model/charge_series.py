@@ -1,5 +1,4 @@
-"""Chebyshev series in position and force that describes the charges of a film, and the file `charges.npz` of this
-series.
+"""Charges of a film as a Chebyshev series in position and force. The file `charges.npz` stores the series.
 
 A network maps charges to a contact. If several contacts give the same charges (a fold of the forward map), a network
 cannot distinguish them. The tracker then compares the measured charges with this series:
@@ -146,8 +145,9 @@ def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Charge
     x_degree = x_count - 1
     y_degree = y_count - 1
     force_degree = force_count - 1
+    has_equal_degrees = x_degree == y_degree
     has_valid_degrees = 1 <= x_degree <= MAX_DEGREE and 1 <= force_degree <= MAX_DEGREE
-    if x_degree != y_degree or not has_valid_degrees:
+    if not (has_equal_degrees and has_valid_degrees):
         raise ValueError(
             f"series: expected equal degrees in x and y and degrees from 1 to {MAX_DEGREE}, got {x_degree}, "
             f"{y_degree} and {force_degree} in the force"

@@ -316,11 +316,14 @@ def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: in
     if len(hidden_names) % 2 or len(set(about.constants)) < len(about.constants):
         raise ValueError(f"constants: expected pairs of names that differ, got {cut(str(about.constants))}")
     n_electrode = finite_array(arrays, "typical_pC", (None,)).size
+
+    # The inputs of the first layer are the charges. The inputs of each later layer are the neurons of the layer before.
     n_input = n_electrode
     for weight, bias in zip(hidden_names[::2], hidden_names[1::2], strict=True):
         n_neuron = finite_array(arrays, weight, (n_node, n_input, None)).shape[2]
         finite_array(arrays, bias, (n_node, n_neuron))
         n_input = n_neuron
+
     n_output = finite_array(arrays, output_weight, (n_node, n_input, None)).shape[2]
     finite_array(arrays, output_bias, (n_node, n_output))
     finite_array(arrays, skip_weight, (n_node, n_electrode, n_output))

@@ -17,7 +17,7 @@ ROS2_SUFFIX = ".ros2.mcap"
 class McapOutput:
     """Writes records into a new MCAP file.
 
-    If the records come from a sensor, the file has its name from the beginning. In a replay, the file gets its name
+    If the records come from a sensor, the file is created under its final name. In a replay, the file gets its name
     when it is complete.
     """
 

@@ -82,7 +82,7 @@ def _load_kind(entry_point: EntryPoint) -> OutputKind:
 
 
 def _failure(target: str, error: Exception) -> OutputError:
-    """Return the error that is shown for an unexpected exception, such as an exception in another package."""
+    """Return the error that the user sees after an unexpected exception, for example in another package."""
     return OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
 
 
@@ -167,7 +167,7 @@ class Outputs:
                 raise _failure(target, error) from error
 
     def close(self) -> None:
-        """Close all open outputs, and count the records that are missing in each output.
+        """Close all open outputs. For each output, count the records that are missing.
 
         Raises:
             OSError, IsochargeError: The first error of an output. The other outputs are closed as well.

@@ -41,8 +41,8 @@ class StandardOutput:
 class TextFile:
     """Writes a line for each record into a new file.
 
-    If the records come from a sensor, the file has its name from the beginning and grows by whole lines. In a replay,
-    the file gets its name when it is complete.
+    If the records come from a sensor, the file is created under its final name, and whole lines are appended to it. In
+    a replay, the file gets its name when it is complete.
     """
 
     def __init__(self, path: Path, line_of: LineOf, header: str | None = None, *, is_live: bool) -> None:

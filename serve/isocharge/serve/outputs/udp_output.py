@@ -1,4 +1,4 @@
-"""Records as UDP datagrams, one JSON object in each.
+"""Output of records as UDP datagrams. Each datagram contains one JSON object.
 
 The UDP server of PlotJuggler with the JSON protocol can read the records without a conversion. PlotJuggler expects one
 object in each datagram, and uses the number `timestamp` as the time. Nulls are ignored. Each other number is shown as a
@@ -18,7 +18,7 @@ MAX_PORT = 65535
 
 
 class UdpOutput:
-    """Sends each record as a datagram, whether a program receives it or not."""
+    """Sends each record as a datagram. A program need not receive the datagram."""
 
     def __init__(self, address: str) -> None:
         """Look up the receiver, and open the socket.

@@ -1,4 +1,4 @@
-"""Conversion of the clock of a device to the time of the host, after its wraps are removed.
+"""Conversion of the clock of a device to the time of the host. The wraps of the clock are removed first.
 
 Arrival times jitter with the delays of the kernel, the cable and the reading program. The clock of the device does not
 jitter, but its rate differs from the rate of the clock of the host. A delay-locked loop of second order (Adriaensen,
@@ -116,7 +116,7 @@ class DeviceClock:
         return self._predict(self._device_us) - arrived_s > MAX_DEVIATION_s
 
     def arrived(self, arrival_s: float) -> None:
-        """Fit the clock to the arrival of a chunk, whose last reading must be the latest reading.
+        """Fit the clock to the arrival of a chunk. The last reading of the chunk must be the latest reading.
 
         The chunks of a file all arrive at the same time, so an arrival is used only if it differs from the previous
         arrival.

@@ -79,7 +79,7 @@ def _is_table_of_presses(name: str, first_line: bytes) -> bool:
     """Return whether a file is a CSV table of presses or records.
 
     A table has columns that only presses or records have. A file whose name ends in `.csv` is also a table if its
-    header has only names, and none of them is a column of boards.
+    header contains only names, and boards send no columns with these names.
 
     Args:
         name: Name of the file.

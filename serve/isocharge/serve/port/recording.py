@@ -138,7 +138,7 @@ class Recorder:
         self._write('{"back": true}')
 
     def model(self, label: str) -> None:
-        """Write the label, `name/version`, of the model that computes the records from here on."""
+        """Write the label (`name/version`) of the model that computes all later records."""
         self._write(json.dumps({"use": label}))
 
     def mark(self, marker: Marker) -> None:
@@ -176,7 +176,7 @@ class Back(NamedTuple):
 
 
 class NewModel(NamedTuple):
-    """The label, `name/version`, of the model that computed the records from here on."""
+    """Label (`name/version`) of the model that computed all records after this line."""
 
     label: str
 
@@ -297,7 +297,7 @@ class _Header(Struct):
 
 
 class _Entry(Struct):
-    """A later line of a recording: a record, or an object with one of the other keys."""
+    """A line of a recording after the first line. It is a record, or an object with one of the other keys."""
 
     timestamp: float | None = None
     latency_us: Latency | None = None
@@ -347,7 +347,7 @@ class RecordedClock:
         self._latencies_us = deque(event.latencies_us)
 
     def __call__(self) -> int:
-        """Return the time of the next record on the clock of `Chunk.clock_ns`, ns.
+        """Return the time of the next record, ns. The clock is the same as for `Chunk.clock_ns`.
 
         After the last record of the chunk, the time of its arrival is returned.
         """

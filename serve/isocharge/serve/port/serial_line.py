@@ -1,14 +1,14 @@
 """Connections to a board, and the requests that some boards need before they send a frame.
 
-A line is a serial port, opened by pyserial, or a UDP socket. If the system has file descriptors for ports, a serial
-port is read with two system calls. Each datagram of a socket is one chunk.
+A line is a serial port, opened by pyserial, or a UDP socket. If the system has file descriptors for ports, reading a
+serial port takes two system calls. Each datagram of a socket is one chunk.
 
 Some boards send one line of text in each datagram, without a line feed at its end. A line feed is then added, because
 parsers of text need it. If a datagram of the board has ended with a line feed, nothing is added to later datagrams.
 
-On a line with two wires, both ends receive everything that is sent. The request therefore returns before the answer,
-and has to be removed from the received bytes. The next request waits until the answer has arrived and the line is
-quiet.
+On a line with two wires, both ends receive everything that is sent. The line therefore returns the request as an echo
+before the answer, and the echo has to be removed from the received bytes. The next request waits until the answer has
+arrived and the line is quiet.
 """
 
 import importlib
@@ -122,7 +122,10 @@ MAX_READ_BYTES = 65536
 
 
 def _terminal_errors() -> tuple[type[Exception], ...]:
-    """Return the exceptions other than OSError that pyserial raises; none on systems without POSIX terminals."""
+    """Return the exceptions other than OSError that pyserial raises.
+
+    The result is empty on systems without POSIX terminals.
+    """
     try:
         return (importlib.import_module("termios").error,)
     except ImportError:
@@ -151,7 +154,7 @@ class SerialLine:
     """
 
     def __init__(self, url: str, baud: int) -> None:
-        """Open the line without delays for the collection of bytes. The class describes the arguments."""
+        """Open the line. The system is set to deliver bytes without a delay. The class describes the arguments."""
         # pyserial is imported only here, so that programs that only predict need not wait for the import.
         serial = importlib.import_module("serial")
         if url.startswith("tcp://"):

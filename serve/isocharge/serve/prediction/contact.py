@@ -1,7 +1,7 @@
 """Contacts that a model computes from charges, and the domain in which the model is valid.
 
-A contact has ten numbers in a fixed order, on which other programs rely. `Validity` compares contacts with the domain
-for which a model was trained, and returns the flags `outside`, `beyond`, `misfit` and `stress`.
+A contact has ten numbers. Other programs rely on the order of these numbers. `Validity` compares contacts with the
+domain for which a model was trained, and returns the flags `outside`, `beyond`, `misfit` and `stress`.
 """
 
 import math
@@ -52,7 +52,8 @@ class Contact(NamedTuple):
     def widened(self, shift: tuple[float, float, float]) -> "Contact":
         """Return the contact with larger standard deviations, which include an additional, independent error.
 
-        The error changes x, y and the force together. Its covariances are therefore added, too.
+        A single error changes x, y and the force, so their changes are fully correlated. The covariances of these
+        changes are therefore added, too.
 
         Args:
             shift: Changes of x and y, mm, and of the force, N, that one standard deviation of the error causes.
@@ -112,7 +113,7 @@ REUSE_FORCE_RATIO = 0.05
 
 
 class Sensitivity:
-    """Change of a contact with an uncertain parameter.
+    """Sensitivity of a contact to a parameter whose value is uncertain.
 
     The change is computed from a second prediction with another value of the parameter. The change is reused while the
     contact hardly moves, so that most frames of a held press need one prediction instead of two.
@@ -253,7 +254,8 @@ class Validity:
 
     @cached_property
     def implausible_limits(self) -> tuple[float, float]:
-        """Squared distance from the centre, mm^2, and force, N, beyond which an output cannot be a measurement."""
+        """Limits beyond which an output cannot be a measurement: the squared distance from the centre, mm^2, and the
+        force, N."""
         radius_mm = np.linalg.norm(self.corners_mm - self.centre_mm, axis=1).max()
         _, max_force_N = self.force_range_N
         return float(IMPLAUSIBLE_FACTOR * radius_mm) ** 2, IMPLAUSIBLE_FACTOR * max_force_N
@@ -368,7 +370,7 @@ class Validity:
 
 
 def _flag_words(is_outside: bool, is_beyond: bool, has_misfit: bool, yields: bool) -> tuple[str, ...]:
-    """Return the flag of each condition that is true.
+    """Return the flags of all conditions that are true.
 
     Args:
         is_outside: Whether the contact is outside the working area or the range of forces.

@@ -36,8 +36,8 @@ log = logging.getLogger(__name__)
 class Predictor:
     """A loaded model that computes contacts from charges.
 
-    `predict` and `predict_into` share memory for one press, so each thread needs its own Predictor. `predict_batch`
-    does not use this memory and may be called from any thread.
+    `predict` and `predict_into` write into memory that the predictor allocates once. Each thread therefore needs its
+    own Predictor. `predict_batch` does not use this memory and may be called from any thread.
 
     Attributes:
         folder: Version folder of the model.
@@ -107,8 +107,9 @@ class Predictor:
             ChargeError: If the number of charges is wrong, or a charge is not finite.
         """
         values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else charge_pC
+        # `write_finite` writes the charges, and returns False if it cannot convert them or a charge is not finite.
         if not write_finite(self._press.write, values):
-            # The slow conversion accepts other number types, and raises an error that names the electrode.
+            # The slow conversion accepts other number types. It raises an error that names the electrode.
             self._press.write(*as_press(charge_pC, self.metadata.electrodes))
         self._press.run()
         contact = Contact(*self._press.read())
@@ -122,9 +123,9 @@ class Predictor:
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """Return the reasons why a contact of this model may be wrong: `outside`, `beyond`, `misfit`, `stress`.
 
-        With three electrodes, the three charges determine the three unknowns without redundancy. A wrong charge then
-        usually gives the charges of another press. The wrong charge is detected only if the contact of this press lies
-        outside the working area or the range of forces.
+        With three electrodes, there are as many charges as unknowns, so the charges contain no redundancy. A wrong
+        charge then usually gives the charges of another press. The wrong charge is detected only if the contact of this
+        press lies outside the working area or the range of forces.
         """
         return self.validity.flags(contact)
 
@@ -205,7 +206,7 @@ def _describe(value: object) -> str:
 
 
 def _check_bound_memory(press: BoundPress, model: Model) -> None:
-    """Check that this version of onnxruntime reads and writes the bound memory and not copies of it.
+    """Check that this version of onnxruntime reads and writes the bound memory itself, not a copy.
 
     Args:
         press: Bound memory for one press of the model.

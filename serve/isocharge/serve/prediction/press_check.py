@@ -1,4 +1,6 @@
-"""Comparison of a model with measured presses: its errors, the part that noise and rig explain, and a verdict.
+"""Comparison of a model with measured presses.
+
+The result contains the errors of the model, the part that noise and rig explain, and a verdict.
 
 If the noise of the charges and the uncertainty of the rig do not explain the errors, the model does not describe the
 film. Either the film was never calibrated, or it has aged or crept since then. A drift of the film first appears as a
@@ -89,7 +91,7 @@ class PressCheck:
     errors: PressErrors
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON by names that contain the units; unknown values are None."""
+        """Return a dictionary of plain values for JSON. The names contain the units, and unknown values are None."""
         agreement = self.agreement
         degrees = agreement.degrees
         values = {
@@ -118,9 +120,9 @@ class PressCheck:
 def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     """Compare a model with measured presses.
 
-    A press is compared if all its charges and its position or force are known. The known values must lie in the working
-    area and the range of forces of the model. A few bad presses are reported and excluded if all other presses agree
-    with the model.
+    A press is compared if all its charges are known, and also its position, its force, or both. The known values must
+    lie in the working area and the range of forces of the model. A few bad presses are reported and excluded if all
+    other presses agree with the model.
 
     Args:
         predictor: The model.
@@ -188,7 +190,7 @@ def _bad_presses(errors: PressErrors) -> Booleans:
 
 
 def _improbable_presses(errors: PressErrors, is_compared: Booleans) -> Booleans:
-    """Return which of the compared presses have errors that noise and rig hardly cause, shape (n,).
+    """Return which of the compared presses have errors that noise and rig are very unlikely to cause, shape (n,).
 
     The limit of the probability is divided by the number of presses (Bonferroni). If all presses are good, the
     probability that at least one of them is improbable is then `BAD_PRESS_PROBABILITY`.
@@ -287,7 +289,7 @@ def _verdict(
 
 
 def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: ErrorSummary | None) -> Iterator[str]:
-    """Yield notes about the remedies for a model that does not fit.
+    """If the model does not fit, yield notes about possible remedies.
 
     Args:
         metadata: Metadata of the model, which state whether it was calibrated.
@@ -318,7 +320,7 @@ def _explaining_rig_std(errors: ErrorSummary) -> float:
 
 
 def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]:
-    """Yield a note for each reason why presses were excluded, with the numbers of these presses.
+    """Yield a note for each reason why presses were excluded. The note lists the rows of these presses.
 
     Args:
         errors: Errors of all presses, with the reasons.
@@ -356,7 +358,7 @@ def _bad_press_notes(errors: PressErrors, is_bad: Booleans) -> Iterator[str]:
 
 
 def _misfit_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]:
-    """Yield a note if too many of all presses, including the excluded ones, have a misfit above the limit."""
+    """Yield a note if too many presses have a misfit above the limit. Excluded presses are also counted."""
     all_rows = np.ones(len(errors.lines), dtype=np.bool_)
     misfit_text = _frequent_misfits(errors, all_rows, metadata)
     if misfit_text:

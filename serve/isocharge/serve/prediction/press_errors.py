@@ -86,7 +86,7 @@ class PressErrors:
         return np.hypot(self.error[:, X], self.error[:, Y])
 
     def row(self, press: int) -> dict[str, Any]:
-        """Return the values of one press by names that contain the units."""
+        """Return the values of one press as a dictionary. The names contain the units."""
         error = self.error[press]
         noise_std = self.noise_std[press]
         rig_std = self.rig_std[press]
@@ -188,7 +188,7 @@ def _flags(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], 
 def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tuple[str, ...]:
     """Return the reason why each press is excluded; empty if the press is compared.
 
-    The measured position and force, not the predicted ones, determine whether a press lies in the domain of the model.
+    Whether a press lies in the domain of the model is determined from the measured position and force.
     """
     x_mm, y_mm, force_N = presses.contact.T
     min_force_N, max_force_N = metadata.force_range_N
@@ -273,7 +273,7 @@ class ErrorSummary:
 
 @dataclass(frozen=True)
 class CommonError:
-    """The error that all presses have in common, estimated by the weighted mean.
+    """Error that all presses have in common. It is estimated by a weighted mean.
 
     Attributes:
         mean: Weighted mean, mm, or relative to the force; NaN if no error is known.
@@ -287,7 +287,9 @@ class CommonError:
 
     @classmethod
     def of(cls, error: Array, variance: Array) -> "CommonError":
-        """Estimate the error that all presses have in common, by the mean weighted with the inverse variances.
+        """Estimate the error that all presses have in common.
+
+        The estimate is the mean weighted with the inverse variances.
 
         Args:
             error: Errors, shape (n,); NaN where unknown.

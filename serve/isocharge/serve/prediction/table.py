@@ -134,7 +134,7 @@ def write_contacts(
 def blocks(rows: Array) -> Iterator[Array]:
     """Yield blocks of `BLOCK_ROWS` rows.
 
-    The rows are converted to Python numbers, which need five times as much memory as an array.
+    The rows are converted to Python numbers, so that they need five times as much memory as an array.
     """
     for start in range(0, len(rows), BLOCK_ROWS):
         yield rows[start : start + BLOCK_ROWS]

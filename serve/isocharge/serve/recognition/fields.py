@@ -1,8 +1,8 @@
 """Recognition of the fields of a frame: sync bytes, frame counter, clock and channels.
 
-Every division of the bytes into fields has a score in bits. The score is the number of bits that the values of a frame
-need if the previous frame is known, plus the `Weights` of the fields. The division with the lowest score is chosen. The
-weights give simple divisions, such as adjacent channels of one type, a lower score.
+Every division of the bytes into fields has a score in bits. The score is the sum of two numbers: the bits that are
+needed to encode the values of a frame after the previous frame, and the `Weights` of the fields. The division with the
+lowest score is chosen. The weights give simple divisions, such as adjacent channels of one type, a lower score.
 `tests/benchmarks/fit_recognition.py` fits the weights on random boards.
 """
 
@@ -119,7 +119,7 @@ class Part(NamedTuple):
 def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) -> list[list[Part]]:
     """Return the possible parts that begin at each byte of a frame.
 
-    The first possible part at each byte is a single byte without a meaning.
+    For each byte, the first entry is a part of one byte without a meaning.
 
     Args:
         rows: Bytes of the frames, each followed by the next frame, shape (n, 2 * length). The frames may begin at any
@@ -151,7 +151,9 @@ def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) ->
 def _number_parts(
     number_bytes: Bytes, is_constant: Booleans, is_zero: Booleans, kind: str, rate_Hz: float, weights: Weights
 ) -> Iterator[Part]:
-    """Yield the possible meanings of bytes as a number of one type: frame counter or clock, and channel.
+    """Yield the possible meanings of bytes that are read as a number of one type.
+
+    The meanings are frame counter or clock, and channel.
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
@@ -201,7 +203,7 @@ def _number_parts(
 def split_frame(
     parts_at: Sequence[Sequence[Part]], syncs: Iterable[int], weights: Weights
 ) -> tuple[float, int, tuple[Part, ...]]:
-    """Divide a frame into parts so that the sum of their scores is as low as possible.
+    """Divide a frame into the parts with the lowest sum of scores.
 
     The division is found by dynamic programming, from the last byte to the first.
 
@@ -216,7 +218,7 @@ def split_frame(
 
     @cache
     def best_division(position: int, row: str) -> tuple[float, tuple[Part, ...]]:
-        """Return the lowest score of all bytes from a position to the end, and the parts with this score.
+        """Find the best division of the bytes from a position to the end, and return its score and its parts.
 
         Args:
             position: Position of the first byte.
@@ -275,5 +277,8 @@ def _values(number_bytes: Bytes, kind: str) -> Array:
 
 
 def _bits(step: Array, unit: float, size: int) -> float:
-    """Return the mean number of bits that steps of a number need, in steps of `unit`; at most its size in bits."""
+    """Return the mean number of bits for a step of a number that changes by multiples of `unit`.
+
+    The result is at most the size of the number.
+    """
     return float(np.fmin(np.log2(1.0 + np.abs(step) / unit), 8 * size).mean())

@@ -1,8 +1,8 @@
 """Recognition of the framing: the beginning and the length of frames, and their checksum.
 
-A stream with byte stuffing is split at its delimiter. In other streams, some bytes are the same in every frame, and
-therefore repeat after the length of a frame. The repetitions of each pair of bytes cover a part of the stream. The pair
-that covers the largest part is chosen. The position of this pair in the frame is not known yet.
+A stream with byte stuffing is split at its delimiter. In other streams, some bytes are the same in every frame. Such
+bytes therefore repeat after the length of a frame. The repetitions of each pair of bytes cover a part of the stream.
+The pair that covers the largest part is chosen. The position of this pair in the frame is not known yet.
 
 Named checksums are tried with every possible first byte. For cyclic redundancy checks without a name, only the
 polynomials have to be tried. The initial value, the final value and all constant bytes contribute the same constant in
@@ -81,13 +81,16 @@ class Windows(NamedTuple):
 
 
 def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
-    """Return the most frequent byte at each position, and whether nearly all frames have it, shape (length,) each."""
+    """Return the most frequent byte at each position, and whether nearly all frames have this byte.
+
+    Both arrays have the shape (length,).
+    """
     usual = np.array([np.bincount(column).argmax() for column in rows.T], np.uint8)
     return usual, (rows == usual).mean(axis=0) >= CONSTANT_SHARE
 
 
 def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Windows]:
-    """Yield every possible division of a stream into frames, the most certain first.
+    """Yield every possible division of a stream into frames, in the order of decreasing certainty.
 
     Args:
         chunks: The bytes of the stream.
@@ -165,7 +168,7 @@ def _synchronised(stream: Bytes) -> Iterator[Windows]:
                 best_starts[length] = starts
 
     def order_of(length: int) -> tuple[float, int]:
-        """Return a key that sorts by falling coverage, in steps of 10 %, and then by rising length."""
+        """Return a key that sorts by decreasing coverage in steps of 10 %, and then by increasing length."""
         return -round(best_coverage[length], 1), length
 
     for length in sorted(best_coverage, key=order_of)[:MAX_FRAME_LENGTHS]:
@@ -239,7 +242,7 @@ class Check(NamedTuple):
 
 
 def find_checks(rows: Bytes) -> Iterator[Check]:
-    """Yield the checksums that fit the frames, the widest first.
+    """Yield the checksums that fit the frames, from the widest to the narrowest.
 
     Args:
         rows: Bytes of the frames, shape (n, length).

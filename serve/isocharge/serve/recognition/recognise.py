@@ -201,7 +201,7 @@ def _parse_all(parser: Parser, chunks: Sequence[bytes]) -> tuple[list[Frame], fl
 
 
 def _text_keys(layout: Layout, frames: Sequence[Frame], rate_Hz: float) -> dict[str, Any]:
-    """Return the keys of a device file for lines of text.
+    """Return the keys that a device file for lines of text needs.
 
     If the columns have no names and one of them is a counter or a clock, all columns get names. The header of a CSV
     stream is copied to the device file, because a program that starts later does not receive the header.

@@ -1,4 +1,4 @@
-"""The prediction record: its fields, declared once, and the forms that are derived from the declaration.
+"""The prediction record. Its fields are declared once, and all other forms are derived from this declaration.
 
 `record` declares the fields with their types, units and meanings. `fields` reads the declaration. `csv_rows`, `schema`
 and `reference` derive the columns of CSV, the JSON Schema and the table of the documentation from this declaration. The

@@ -88,7 +88,7 @@ def _type_and_meaning(annotation: Any, where: str) -> tuple[Any, Meaning]:
 
 
 def _without_none(declared: Any) -> tuple[Any, bool]:
-    """Return a type without None, and whether None was one of its alternatives."""
+    """Return a type without its alternative None, and whether it had this alternative."""
     if get_origin(declared) not in (Union, UnionType):
         return declared, False
     (value_type,) = (alternative for alternative in get_args(declared) if alternative is not NoneType)

@@ -214,7 +214,7 @@ NO_CONTACT: dict[str, Any] = UNKNOWN_CONTACT | {"force_N": 0.0}
 
 
 def selected_fields(*, with_tracking: bool, with_film: bool) -> tuple[Field, ...]:
-    """Return the fields that every record has, and the fields of the optional groups that are selected.
+    """Return the fields that every record has, and those of the selected optional groups.
 
     Args:
         with_tracking: Whether to include the fields of the tracking.

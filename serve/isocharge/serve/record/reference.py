@@ -24,13 +24,13 @@ GROUPS = {"tracking": "with `[track]`", "film": "with `[follow]`"}
 
 
 def record_table() -> str:
-    """Return the table of all fields of a record, with the fields of nested objects below their object."""
+    """Return the table of all fields of a record. The fields of a nested object follow this object."""
     header = ["| field | type | unit | meaning | present |", "|---|---|---|---|---|"]
     return "\n".join([*header, *_rows(RECORD_FIELDS)]) + "\n"
 
 
 def _rows(fields: Iterable[Field], prefix: str = "", group: str = "") -> Iterator[str]:
-    """Yield a row of the table for each field, and after it the rows of the fields that it contains.
+    """Yield a row of the table for each field. If a field contains further fields, their rows follow.
 
     Args:
         fields: The fields.

@@ -1,10 +1,10 @@
 """JSON Schema of the records of a sensor.
 
 The schema describes the fields twice. The viewers Foxglove and Lichtblick read the top-level key `properties`, and
-expect a single `type` for each field. A number that may be null is therefore declared as "number" there. Validators of
-draft 7 of JSON Schema follow the top-level `$ref` to `definitions/record` and ignore all other top-level keys. In this
-definition, null is allowed for every field that may be null. Viewers therefore list all fields, and validators accept
-all records.
+expect a single `type` for each field. A number that may be null is therefore declared as "number" in `properties`.
+Validators of draft 7 of JSON Schema follow the top-level `$ref` to `definitions/record` and ignore all other top-level
+keys. In this definition, null is allowed for every field that may be null. Viewers therefore list all fields, and
+validators accept all records.
 """
 
 from collections.abc import Sequence

@@ -136,6 +136,7 @@ class SignalChain:
             stages.append(HumStage(settings.hum, n_electrode))
         self._tare_stage = TareStage(settings.tare, n_electrode)
         stages.append(self._tare_stage)
+        # The offset stage is the last stage that stores the charge at rest. Warming is subtracted there.
         offset_stage: OffsetStage = self._tare_stage
         warmth_s = None
         if settings.memory is not None:
@@ -145,7 +146,8 @@ class SignalChain:
         elif settings.tau_s is not None:
             offset_stage = LeakStage(settings.leak, settings.tau_s)
             stages.append(offset_stage)
-        self._touch_stage = TouchStage(settings.touch, list(stages))
+        earlier_stages = stages.copy()  # a copy, because further stages are appended below
+        self._touch_stage = TouchStage(settings.touch, earlier_stages)
         stages += [self._touch_stage, PressFlags()]
         if settings.thermal is not None:
             if misfit is None:
@@ -156,7 +158,7 @@ class SignalChain:
     def advance(
         self, values: Array, t_s: float, dt_s: float, *, limited: bool = False, flags: tuple[str, ...] = ()
     ) -> Reading:
-        """Process the next frame with all stages, and return the touch charges with the flags.
+        """Process the next frame with all stages, and return its touch charges and its flags.
 
         Args:
             values: Values as the device sent them, in the unit of the device, shape (electrodes,).

@@ -2,8 +2,8 @@
 
 A fixed notch filter rings after every touch. For example, a step of 850 pC through a notch of 1 Hz takes a second to
 settle. Therefore the hum itself is estimated and subtracted (Widrow et al., "Adaptive noise cancelling", 1975;
-normalised least mean squares). In each channel, the hum is a sine of known frequency whose amplitude and phase change
-slowly.
+normalised least mean squares). The hum in each channel is a sine wave of known frequency. Its amplitude and its phase
+change slowly.
 
 The estimate is updated with the differences of consecutive frames, because a touch changes these differences only
 briefly. Each difference is clipped. The filter does not delay the signal.

@@ -6,7 +6,7 @@ frame by frame,
     q[n] = q[n-1] + i[n] - b dt,        i[n] = v[n] - a v[n-1],        a = exp(-dt / tau),
 
 where i is the innovation and b is the inflow (pC/s), the current that flows in because of offset, bias and slow
-warming. The inflow is estimated from the innovation, because an estimate from the output v would diverge. The inflow is
+warming. The inflow is estimated from the innovation. An estimate from the output v would diverge. The inflow is
 estimated only out of contact, where the innovation consists of b dt and noise.
 
 Three rules keep the frames of a touch from changing the inflow. Each innovation is clipped. A touch uses the inflow

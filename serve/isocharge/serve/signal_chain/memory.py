@@ -1,6 +1,6 @@
 """Correction of the memory of the film (creep, thermoelastic step and warmth) and of the leak of the amplifiers.
 
-A step of the touch charge q changes the charge of the film by this step times
+After a step of the touch charge q, the charge of the film changes by the size of the step times
 
     h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / warmth_s).
 
@@ -21,9 +21,9 @@ Out of contact, q is 0, so that y gives d. A fading-memory filter (g = 1 - f^2, 
 estimates d and its slope. During a touch, d and its slope are predicted from their values `look_back_s` before the
 touch.
 
-After a release, the remaining charge shows the errors of `creep` and `thermoelastic`. A Kalman filter estimates a scale
-factor for each of these two settings from the remaining charge. The noise of this measurement includes the change that
-warmth may have caused since the touch began.
+After a release, a charge remains because of the errors of `creep` and `thermoelastic`. A Kalman filter estimates a
+scale factor for each of these two settings from the remaining charge. The noise of this measurement includes the change
+that warmth may have caused since the touch began.
 """
 
 import math
@@ -123,7 +123,7 @@ class Film(NamedTuple):
 
     @classmethod
     def of(cls, creep: float, thermoelastic: float, variances: ScaleVariances) -> "Film":
-        """Return the film with this creep and this thermoelastic step."""
+        """Return the description of a film with this creep and this thermoelastic step."""
         response = creep * SCALE_RESPONSE[0] + thermoelastic * SCALE_RESPONSE[1]
         response[WARMTH_ROW] = 1.0
         response[CHARGE_ROW] += 1.0
@@ -297,7 +297,7 @@ def undo_memory(
 
 
 class RemainingCharge(NamedTuple):
-    """Charge that remains after a release, in the direction of the predicted charges.
+    """Component of the charge after a release along the predicted charges.
 
     The charges of all electrodes are projected onto the sum of the predicted charges of creep and thermoelastic step.
 
@@ -315,7 +315,7 @@ class RemainingCharge(NamedTuple):
 
 
 def _remaining_charge(memory: Memory, creep_pC: Array, step_pC: Array) -> RemainingCharge | None:
-    """Measure the charge that remains after a release, in the direction of the predicted charges.
+    """Measure the charge that remains after a release. The result is its component along the predicted charges.
 
     Args:
         memory: State of this frame.
@@ -413,7 +413,7 @@ def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
 def add_warmth(
     memory: Memory, change_pC: Array | float, rate_pC_per_s: Array | float, *, is_learned: bool = True
 ) -> Memory:
-    """Return the state in which a part of the touch charge is assigned to the warmth.
+    """Return the state after a part of the touch charge has been assigned to the warmth.
 
     Args:
         memory: The state.
@@ -438,7 +438,8 @@ def add_warmth(
 def charge_scale_std(memory: Memory) -> float:
     """Return the relative standard deviation that all touch charges have in common, dimensionless.
 
-    The value follows from the variances of the scale factors of creep and step. Without a touch, it is 0.
+    It is computed from the variances of two scale factors, those of creep and of the thermoelastic step. Without a
+    touch, it is 0.
     """
     film = memory.film
     total_rows_pC = memory.rows_pC.sum(axis=1)  # summed over the electrodes, shape (rows,)

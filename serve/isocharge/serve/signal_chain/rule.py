@@ -1,4 +1,7 @@
-"""Base class of the settings of a stage, which are a section of a device file, and types of settings with bounds."""
+"""Base class of the settings of a stage, and types of settings with bounds.
+
+The settings of a stage are a section of a device file.
+"""
 
 from typing import Annotated
 

@@ -75,7 +75,7 @@ class Stage(ABC):
 
 
 class OffsetStage(Stage):
-    """A stage that stores the charge at rest, from which the touch charge is measured."""
+    """A stage that stores the charge at rest. The touch charge is measured relative to this charge."""
 
     @abstractmethod
     def add_warming(self, change: "WarmingChange") -> None:

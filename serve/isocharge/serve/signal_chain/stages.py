@@ -286,6 +286,8 @@ class TouchStage(Stage):
     def _next_touch(self, previous_touch: Touch, frame: ChainFrame) -> Touch:
         """Return the state of the touch detection after a frame. Without a rule, every frame is a touch.
 
+        The base is the smallest total charge since the last release. It decays exponentially with time.
+
         Args:
             previous_touch: State after the previous frame.
             frame: The frame, after the earlier stages.
@@ -303,7 +305,7 @@ class TouchStage(Stage):
 
 
 class PressFlags(Stage):
-    """Flags a press in which an amplifier was at its limit, and charges that are well below zero."""
+    """Sets flags for presses in which an amplifier was at its limit, and for charges well below zero."""
 
     def __init__(self) -> None:
         """Begin without a press."""

@@ -1,4 +1,7 @@
-"""Measurement of the tare, which is the mean and the noise of the charge of each electrode in quiet frames."""
+"""Measurement of the tare in quiet frames.
+
+The tare consists of the mean and the noise of the charge of each electrode.
+"""
 
 from typing import NamedTuple
 

@@ -1,13 +1,13 @@
-"""Estimation of the warming of the film during a press, with the misfit of the model.
+"""Estimation of the warming of the film during a press. The estimate uses the misfit of the model.
 
 A change of temperature adds a charge to every electrode (pyroelectricity). The charges of all electrodes are equal, or
 have known ratios. During a touch, the charge at rest cannot be measured. A contact has three unknowns, so four
 electrodes have one charge more than the contact needs.
 
-The estimate of the common charge p is the charge whose subtraction makes the remaining charges fit a single contact
-best. The squared misfit is a parabola in p, and its curvature gives the variance of the estimate. A Kalman filter
-describes p as a random walk that begins at 0 with every touch. If the memory of the film predicts the warmth, the slope
-of p is the random walk.
+A trial value of the common charge p is subtracted from all charges. The estimate is the trial value with which the
+remaining charges fit a single contact best. The squared misfit is a parabola in p, and its curvature gives the variance
+of the estimate. A Kalman filter describes p as a random walk that begins at 0 with every touch. If the memory of the
+film predicts the warmth, the slope of p is the random walk.
 
 At positions where a press increases all charges equally, warming cannot be distinguished from force, and the curvature
 vanishes. With three electrodes, this is the case at every position. With four electrodes, it is the case near the
@@ -130,27 +130,30 @@ def track_thermal_drift(
 def _predicted_variances(
     rule: ThermalRule, state: ThermalDrift, waited_s: float, warmth_s: float | None
 ) -> tuple[float, float, float]:
-    """Return the predicted variance of p, its covariance with the slope, and the variance of the slope.
+    """Predict the uncertainty of the common charge p and of its rate of change.
 
     Args:
         rule: Settings of the estimate of warming.
         state: State at the last estimate.
         waited_s: Time since the last estimate, s.
-        warmth_s: Time constant with which the slope of p decays, s; None if the slope is not predicted.
+        warmth_s: Time constant with which the rate of p decays, s; None if the rate is not predicted.
+
+    Returns:
+        Variance of p, covariance of p and its rate, and variance of the rate.
     """
     if warmth_s is None:
         return state.variance_pC2 + rule.wander_pC**2 * waited_s, 0.0, 0.0
-    # The process noise of the slope is such that p changes by `wander_pC` in one second.
-    slope_noise = 3.0 * rule.wander_pC**2 * waited_s
+    # The process noise of the rate is such that p changes by `wander_pC` in one second.
+    rate_noise = 3.0 * rule.wander_pC**2 * waited_s
     decay = math.exp(-waited_s / warmth_s)
-    slope_effect_s = warmth_s * (1.0 - decay)  # change of p for a slope of 1
+    rate_effect_s = warmth_s * (1.0 - decay)  # change of p for a rate of 1
     covariance = state.covariance
     rate_variance = state.rate_variance
     variance_pC2 = (
         state.variance_pC2
-        + slope_effect_s * (2.0 * covariance + slope_effect_s * rate_variance)
-        + slope_noise * waited_s**2 / 3.0
+        + rate_effect_s * (2.0 * covariance + rate_effect_s * rate_variance)
+        + rate_noise * waited_s**2 / 3.0
     )
-    predicted_covariance = decay * (covariance + slope_effect_s * rate_variance) + 0.5 * slope_noise * waited_s
-    predicted_rate_variance = decay * decay * rate_variance + slope_noise
+    predicted_covariance = decay * (covariance + rate_effect_s * rate_variance) + 0.5 * rate_noise * waited_s
+    predicted_rate_variance = decay * decay * rate_variance + rate_noise
     return variance_pC2, predicted_covariance, predicted_rate_variance

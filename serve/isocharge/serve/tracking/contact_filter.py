@@ -31,7 +31,7 @@ MIN_FORCE_N = 1e-6
 
 
 class MeasuredContact(NamedTuple):
-    """A contact predicted by a model, in the form in which the filters process it.
+    """A contact that a model has predicted, converted to the quantities that the filters process.
 
     Attributes:
         position: Position x + iy, mm.
@@ -111,7 +111,7 @@ class ContactFilter:
         return self._tracked
 
     def _measured(self, contact: Contact, flags: tuple[str, ...]) -> MeasuredContact:
-        """Return the contact in the form in which the filters process it.
+        """Return the contact, converted to the quantities that the filters process.
 
         Args:
             contact: Contact predicted by the model.

@@ -1,4 +1,4 @@
-"""Gaussian mixture that follows a contact on a film whose map from contacts to charges folds.
+"""Gaussian mixture that follows a contact on a film with a fold in its map from contacts to charges.
 
 Where the map folds, several contacts have the same charges, and a single frame cannot distinguish them. A sequence of
 frames can distinguish them, because one contact crosses the fold while the other contact turns back at the fold.
@@ -166,7 +166,7 @@ class ContactMixture:
         return [hypothesis.extrapolated(t_s - self._t_s) for hypothesis in self._hypotheses]
 
     def _process_step(self, t_s: float) -> None:
-        """Update the mixture with the average of the frames of a step, which ends at time `t_s`."""
+        """Update the mixture with the mean charges of the frames of a step. The step ends at time `t_s`."""
         charges, times_s = zip(*self._step_frames, strict=True)
         frame_count = len(times_s)
         mean_time_s = sum(times_s) / frame_count
@@ -263,7 +263,7 @@ class ContactMixture:
     def _most_probable_states(
         self, prior: Components, measurement: Measurement, iterations: int
     ) -> tuple[Array, LinearisedUpdate]:
-        """Search for the most probable state of each component with the measured charges.
+        """Search for the state of each component that is most probable after the measured charges.
 
         Args:
             prior: Predicted components.
@@ -378,7 +378,7 @@ class ContactMixture:
         return sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)
 
     def _is_same_contact(self, components: Components, rows: Integers) -> Booleans:
-        """Return which components describe the same contact as the first one of them.
+        """Return which components describe the same contact as the first component.
 
         Args:
             components: All components.

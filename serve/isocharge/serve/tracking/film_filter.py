@@ -86,7 +86,7 @@ LEVEL_CHANGE_PROBABILITY = 0.0003
 
 
 class TouchResiduals(NamedTuple):
-    """Squared misfits of a touch after the corrections of the most likely offset level.
+    """Squared misfits of a touch after it is corrected with the most likely offset level.
 
     All values are relative to the mean squared misfit of good touches.
 
@@ -103,7 +103,9 @@ class TouchResiduals(NamedTuple):
 
 
 class KalmanUpdate(NamedTuple):
-    """Update of the linear unknowns by a good touch, at each level and pretension.
+    """Changes of the estimates of the linear unknowns by a good touch.
+
+    There is one estimate for each level and each pretension.
 
     Attributes:
         mean_change: Change of the mean, shape (n_level, n_pretension, n_unknown).
@@ -205,7 +207,7 @@ class FilmFilter:
 
     @property
     def is_offset_too_large(self) -> bool:
-        """Whether the offsets are probably larger than the filter tolerates."""
+        """Whether the offsets are probably larger than the largest offsets that the filter tolerates."""
         if self._level_std.size == 1:
             return False
         is_at_last_level = self._likeliest_level == self._level_std.size - 1
@@ -363,7 +365,9 @@ class FilmFilter:
         return self._residuals(misfit, jacobian, noise_covariance)
 
     def _kalman_update(self, misfit: Array, jacobian: Array, noise_covariance: Array) -> KalmanUpdate:
-        """Compute the update of the linear unknowns by a touch at each level and pretension.
+        """Compute how a touch changes the estimates of the linear unknowns.
+
+        There is one estimate for each level and each pretension.
 
         Args:
             misfit: Misfit vectors of the touch, shape (n_pretension, n_electrode).
@@ -387,7 +391,7 @@ class FilmFilter:
         )
 
     def _noise_covariance(self, jacobian: Array) -> Array:
-        """Return the covariance of the misfit vector of a touch whose linear unknowns are known.
+        """Return the covariance of the misfit vector of a touch, if the linear unknowns are known.
 
         The covariance is the identity matrix for a good touch, plus a term for the scatter of the offset from touch to
         touch.
@@ -404,10 +408,10 @@ class FilmFilter:
         return np.asarray(np.eye(self._layout.electrodes) + scatter)
 
     def _linearise(self, charge_pC: Array, log_changes: Array) -> tuple[Array, Array]:
-        """Compute the misfit vector of a touch at each pretension, and its Jacobian for the linear unknowns.
+        """Compute the misfit vector of a touch at each pretension, and the Jacobian for the linear unknowns.
 
-        The derivatives are finite differences. The step of the offset is the estimated mean offset of the level, so
-        that the misfit vector without this offset is exact.
+        The derivatives are finite differences. The finite step of the offset is the estimated mean offset of the level.
+        The misfit vector without this offset is therefore exact.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
@@ -420,7 +424,8 @@ class FilmFilter:
         layout = self._layout
         offset_step_pC = self._offset_steps()
 
-        # The network evaluates the charges of the touch and all changed charges at once.
+        # The network evaluates the charges of the touch and all changed charges at once. The groups have the shapes
+        # (1, n_electrode), (n_electrode, n_electrode), (n_level, n_electrode) and (n_direction, n_electrode).
         changed_charges = [
             charge_pC[None],
             charge_pC + GAIN_STD * np.diag(charge_pC),
@@ -431,6 +436,8 @@ class FilmFilter:
         group_ends = np.cumsum([len(group) for group in changed_charges])
         (misfit,), with_gain, without_offset, with_direction = np.split(vectors, group_ends[:-1])
 
+        # The derivatives have the shape (n_unknown, n_pretension, n_electrode). The unknowns become the last axis.
+        # Only the derivative with respect to the offset depends on the level.
         jacobian = np.empty((*self._probability.shape, layout.electrodes, layout.size))
         jacobian[..., layout.gains] = np.moveaxis(with_gain - misfit, 0, 2)
         jacobian[..., layout.offset] = (misfit - without_offset) / offset_step_pC[:, None, None]
@@ -448,7 +455,7 @@ class FilmFilter:
         return np.where(is_small, SMALLEST_OFFSET_STEP_pC, mean_offset_pC)
 
     def _residuals(self, misfit: Array, jacobian: Array, noise_covariance: Array) -> TouchResiduals:
-        """Return the squared misfits of a touch after the corrections of the most likely offset level.
+        """Return the squared misfits of a touch after it is corrected with the most likely offset level.
 
         Args:
             misfit: Misfit vectors, as `_linearise` returns them.

@@ -145,7 +145,9 @@ class PeakFrame(NamedTuple):
 
 
 class SquaredMisfits(NamedTuple):
-    """Squared misfits of one touch, relative to the mean squared misfit of good touches, at most `LARGEST_SQUARE`.
+    """Squared misfits of one touch, relative to the mean squared misfit of good touches.
+
+    They are limited to `LARGEST_SQUARE`.
 
     Attributes:
         filtered: Squared misfit after the correction by all linear unknowns, at each pretension, shape (n_pretension,).
@@ -334,7 +336,7 @@ class FilmFollower:
         return self._recent_estimates[0] if is_old_enough else self._calibrated_estimate
 
     def _squared_misfits(self, charge_pC: Array, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
-        """Return the squared misfits of a touch by which it is decided whether the film is lost.
+        """Return the squared misfits of a touch. They determine whether the film is lost.
 
         Args:
             charge_pC: Touch charges of the frame with the largest force, shape (n_electrode,), pC.
@@ -376,7 +378,7 @@ class FilmFollower:
         return bool(sum_by_wrong_gain.min() < sum_by_pretension.min() - WRONG_GAIN_MARGIN)
 
     def _estimate(self) -> FilmStateEstimate:
-        """Return the mean estimate of the film over two hypotheses, which have equal prior probabilities.
+        """Return the mean estimate of the film over two hypotheses. Both hypotheses have the same prior probability.
 
         The first hypothesis is that the pretension has changed since the calibration. The second hypothesis is that it
         has not changed.
@@ -393,7 +395,7 @@ class FilmFollower:
         return FilmStateEstimate(pretension_MPa, std, directions, directions_per_MPa)
 
     def _filter_variance(self) -> float:
-        """Return the variance of the pretension in the filter, with the error of the correction for offsets, MPa^2."""
+        """Return the variance of the pretension, MPa^2. It includes the error of the correction for offsets."""
         deviations_MPa = self._filter.grid_MPa - self._filter.mean_MPa
         variance = float(self._filter.probability @ deviations_MPa**2)
         return variance + (OFFSET_CORRECTION_ERROR * self._filter.offset_correction_MPa) ** 2
@@ -411,7 +413,7 @@ class FilmFollower:
         return 1.0 / (1.0 + odds_of_unchanged)
 
     def _apply_estimate(self, estimate: FilmStateEstimate) -> None:
-        """Compute contacts from now on with a new estimate of the film.
+        """Use a new estimate of the film to compute all later contacts.
 
         If the pretension has changed by less than `SMALLEST_CHANGE_MPa`, the present models are kept.
         """

@@ -1,8 +1,8 @@
-"""Noise of the measured contacts: the shape of its covariance, and its size as estimated from the frames.
+"""Noise of the measured contacts, which is described by the shape of its covariance and by its estimated size.
 
-The standard deviations that a model reports are those of the noise in its training. The noise of a board may be smaller
-or larger. Noise changes from frame to frame, but a contact moves smoothly. The size of the noise is therefore estimated
-from the residuals of a linear extrapolation through the two previous frames.
+The standard deviations that a model reports apply to the noise with which the model was trained. The noise of a board
+may be smaller or larger. Noise changes from frame to frame, but a contact moves smoothly. The size of the noise is
+therefore estimated from the residuals of a linear extrapolation through the two previous frames.
 """
 
 import math

@@ -91,7 +91,7 @@ class ContactHypothesis(NamedTuple):
 
     @property
     def contact(self) -> Contact:
-        """The contact in the form in which a model predicts it."""
+        """The contact of the component as a `Contact`, the type that a model predicts."""
         x_mm, y_mm, log_force = self.mean[CONTACT].tolist()
         covariance = self.covariance[CONTACT, CONTACT]
         std = np.sqrt(covariance.diagonal())
@@ -119,7 +119,7 @@ class ContactHypothesis(NamedTuple):
 
     @property
     def moving_probability(self) -> float:
-        """Probability that the estimated velocity of a contact at rest would be smaller than the present velocity.
+        """Probability that a contact at rest would have a smaller estimated velocity than this component.
 
         The probability is the result of a chi-squared test of the velocity.
         """

@@ -28,7 +28,7 @@ class Measurement(NamedTuple):
 
 
 class LinearisedUpdate(NamedTuple):
-    """Quantities of a Kalman update, linearised about a state of each component.
+    """Quantities of a Kalman update. The measurement is linearised about one state of each component.
 
     Attributes:
         charge_pC: Charges of the state, shape (n, n_electrode), pC.
@@ -107,7 +107,7 @@ def updated_covariance(prior: Components, linearised: LinearisedUpdate) -> Array
 
 
 def limit_iteration_step(step: Array) -> Array:
-    """Shorten steps of the state, shape (n, 6 + n_electrode), to those within which the linearisation is accurate."""
+    """Shorten steps of the state, shape (n, 6 + n_electrode), so that the linearisation is accurate over each step."""
     position_excess = np.hypot(step[:, X], step[:, Y]) / MAX_ITERATION_STEP_mm
     force_excess = np.abs(step[:, LOG_FORCE]) / MAX_ITERATION_LOG_STEP
     excess = np.maximum(position_excess, force_excess)

@@ -1,4 +1,4 @@
-"""Motion of contacts: the process noise that the filters of the tracking assume."""
+"""Process noise that the tracking filters assume for the motion of a contact."""
 
 from typing import NamedTuple
 

@@ -9,13 +9,13 @@ GRID_STEP_MPa = 0.02
 
 
 def evenly_spaced(low: float, high: float, step: float) -> Array:
-    """Return evenly spaced numbers from `low` to `high`, whose distance is as near to `step` as possible."""
+    """Return evenly spaced numbers from `low` to `high`. Their distance is as close to `step` as possible."""
     interval_count = max(round((high - low) / step), 1)
     return np.linspace(low, high, interval_count + 1)
 
 
 def normal_probabilities(deviation: Reals, std: float) -> Array:
-    """Return the probabilities of evenly spaced deviations from the mean of a normal distribution.
+    """Return the probabilities of evenly spaced deviations from the mean. The distribution is normal.
 
     The probabilities add up to 1.
     """

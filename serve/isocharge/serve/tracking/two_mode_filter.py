@@ -2,8 +2,8 @@
 
 The filter is an interacting multiple model (Blom and Bar-Shalom 1988). Each mode has a Kalman filter. Before each
 frame, the estimates of the two modes are mixed, because the contact may have changed from one mode to the other. The
-innovations then determine the probability of each mode. The held mode has no velocity. The moving mode has a
-constant velocity with white acceleration, and an unknown velocity when a movement begins.
+innovations then determine the probability of each mode. The held mode has no velocity. In the moving mode, the velocity
+is unknown when a movement begins, and then changes by a white acceleration.
 
 A position is a complex number x + iy, and the logarithm of a force is a real number. All covariances are assumed to be
 multiples of the covariance of the measurement. A single variance then replaces each matrix, and a step takes
@@ -105,8 +105,8 @@ class TwoModeFilter:
     def step(self, measured: complex, dt_s: float, shape: CovarianceShape, stated_variance: float) -> Estimate | None:
         """Process the next frame.
 
-        The function is one linear sequence without calls of `min`, `max` and `CovarianceShape.mean_square`, because
-        function calls would take a third of its time.
+        The function does not call `min`, `max` and `CovarianceShape.mean_square`, because function calls would take a
+        third of its time.
 
         Args:
             measured: The measured value.

@@ -129,7 +129,7 @@ class RecordedTape(Tape):
         self._file.close()
 
     def _map(self, capacity: int) -> None:
-        """Map the file to memory with room for a number of samples."""
+        """Map the file to memory. The mapped memory has room for a given number of samples."""
         self._ring = np.memmap(self._file, self._ring.dtype, "r+", shape=(capacity,))
 
     def overview(self) -> list[float]:
@@ -289,14 +289,14 @@ class Hub:
         self.tape.close()
 
     def handle(self, request: LiveRequest | ReplayRequest, viewer: "Viewer") -> bool:
-        """Carry out a request of a page, and return whether it was carried out or passed to the reader."""
+        """Carry out a request of a page, or pass it to the reader. Return whether one of these has succeeded."""
         if isinstance(request, ReplayRequest):
             viewer.apply(request)
             return True
         return self._link.send_request(request)
 
     async def run(self) -> None:
-        """Receive samples and messages, and wake the viewers, until the reader has ended."""
+        """Receive samples and messages, and wake the viewers. The method ends when the reader has ended."""
         progress_update_s = 0.0
         while self._link.is_open:
             self._receive()
@@ -309,7 +309,7 @@ class Hub:
         self._wake_viewers()
 
     def _wake_viewers(self) -> None:
-        """Let all viewers check whether there is something to send."""
+        """Wake all viewers, which then check whether they have new samples."""
         for viewer in self.viewers:
             viewer.wake.set()
 
@@ -343,7 +343,7 @@ class Hub:
 
 
 class Viewer:
-    """One browser, and the part of the stream that it has received.
+    """State of one browser, which contains the part of the stream that the browser has received.
 
     Args:
         hub: The stream.
@@ -428,7 +428,7 @@ class Viewer:
         return samples_message(self._sent_messages, now_s, samples, self._missed_samples, begin_anew=begins_anew)
 
     def _begin_anew_after_jump(self) -> None:
-        """Let the next message begin with the samples before the new position if the viewer has selected a position."""
+        """If the viewer has selected a position, let the next message begin with the samples before this position."""
         playhead = self._playhead
         tape = self._hub.tape
         if playhead is None or not playhead.has_jumped or not tape.total:

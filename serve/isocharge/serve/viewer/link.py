@@ -97,7 +97,7 @@ class ReaderEnd(LinkEnd):
         return REQUEST_DECODER.decode(data) if data else None
 
     def close(self) -> None:
-        """Close this end, and let a thread that waits in `wait_for_request` continue."""
+        """Close this end. A thread that waits in `wait_for_request` then continues."""
         self.is_open = False
         with suppress(OSError):
             self.messages.shutdown(socket.SHUT_RDWR)

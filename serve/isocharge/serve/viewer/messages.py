@@ -7,8 +7,8 @@ file of isocharge.
 
 A binary message to the page is little-endian: kind (u8, 1), zero (u8), number of samples (u16), number of the message
 (u32), time of sending (Unix time in seconds, f64), number of records that this page has missed (u32), options (u32, bit
-0: discard what was shown before), and the samples. The page confirms each message that it has drawn by a binary message
-with the number of the message (u32).
+0: discard what was shown before), and the samples. When the page has drawn a message, it sends a confirmation, which is
+a binary message with the number (u32) of the drawn message.
 
 A sample is a prediction record of fixed size. If contacts are tracked, it contains the tracked contact instead of the
 contact of the frame. Several records are coalesced to one sample if there are more records than a browser can show. A
@@ -59,7 +59,7 @@ OTHER_PREFIX = "other_"
 
 
 def _live_numbers() -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the numbers in a sample: those of the record, and those of its `other` contact."""
+    """Return the names of the numbers in a sample, which come from the record and from its `other` contact."""
 
     def live_names(fields: Sequence[Field]) -> tuple[str, ...]:
         """Return the names of the fields that are numbers and are shown on the live page."""
@@ -108,7 +108,7 @@ class SampleFormat:
         self.dtype = np.dtype(fields)
 
     def describe(self) -> dict[str, Any]:
-        """Return the layout for the page: the size of a sample, and the offset of each number in it, bytes."""
+        """Return the layout for the page: the size of a sample (bytes), and the offset of each number (bytes)."""
         offsets = {}
         for name, (_type, offset, *_title) in (self.dtype.fields or {}).items():
             if name != "padding":
@@ -173,7 +173,7 @@ def coalesce(samples: Samples, max_samples: int) -> Samples:
 
 
 def _shown_positions(samples: Samples, edges: np.ndarray) -> np.ndarray:
-    """Return the position of the sample that represents each run, shape (n_run,).
+    """Return the index of the sample that represents each run, shape (n_run,).
 
     Args:
         samples: The samples, shape (n,).
@@ -336,7 +336,9 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
 
 
 def _electrode_polygons(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[list[float]]]]:
-    """Return the polygons of each electrode on the real film: its pad, then further metal such as leads.
+    """Return the polygons of each electrode on the real film.
+
+    The first polygon is the pad, and the others are further metal such as leads.
 
     Args:
         sensor: Description of the sensor in the metadata of the model, which may be incomplete.
@@ -394,7 +396,7 @@ def _designed_polygons(parts: Mapping[str, Any], name: str) -> list[list[Point]]
 
 
 def _calibrated_corners(corners: list[Point], calibration: Any) -> list[list[float]]:
-    """Return corners that are rotated about the centre and then shifted by the result of a calibration.
+    """Rotate corners about the centre, and then shift them. The angle and the shift are results of a calibration.
 
     Args:
         corners: Corners (x, y) in the design, mm.

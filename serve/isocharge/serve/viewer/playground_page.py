@@ -80,7 +80,7 @@ def _page_data(series: StressSeries, models: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _describe_model(name: str, series: StressSeries) -> dict[str, Any]:
-    """Return the description of a model for the page, with its network.
+    """Return the description of a model for the page. The description contains the network.
 
     Args:
         name: Name or path of the model.

@@ -157,7 +157,7 @@ class RateLimit:
         self._latest_s = now_s
 
     def allows(self, count: int, now_s: float) -> bool:
-        """Count received data, and return whether they are within the limit.
+        """Count received data, and return whether their amount is within the limit.
 
         Args:
             count: Size of the data, bytes.
@@ -174,7 +174,7 @@ class PageConnection(ServerConnection):
     """A connection that is ended if its client sends too much data. The data include control frames such as pings."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Start the limit of the data with the connection."""
+        """Create the data limit of the connection when the connection begins."""
         self._rate_limit = RateLimit(MAX_BURST_BYTES, MAX_BYTES_PER_S, time.monotonic())
         super().connection_made(transport)
 
@@ -329,7 +329,7 @@ def _select_subprotocol(_connection: ServerConnection, offered: Sequence[Subprot
 
 
 def _last_response(response: Response) -> http11.Response:
-    """Convert a response to a response of `websockets` after which the connection is closed."""
+    """Convert a response to the type of the package `websockets`. The connection is closed after this response."""
     headers = Headers([(name.decode(), value.decode()) for name, value in response.headers])
     headers["Connection"] = "close"
     return http11.Response(response.status, HTTPStatus(response.status).phrase, headers, response.body)

@@ -176,8 +176,8 @@ def wander(
 ) -> Script:
     """Create a script of random presses that move over the film, with pauses between them.
 
-    The position and the logarithm of the force vary smoothly within a press. The forces stay in their range, because a
-    forward map is valid only in a range of forces.
+    The position and the logarithm of the force vary smoothly within a press. The forces stay within the given range,
+    because a forward map is only valid in a range of forces.
 
     Args:
         seed: Seed of all random choices.
@@ -234,7 +234,7 @@ def _random_path(rng: np.random.Generator, t_s: Array) -> Complexes:
 
 
 def _force_level(rng: np.random.Generator, t_s: Array, duration_s: float) -> Array:
-    """Draw the level of the force of a press, from 0 (smallest force) to 1 (largest force), shape (n,).
+    """Draw the force of a press as a level from 0 (smallest force) to 1 (largest force), shape (n,).
 
     Args:
         rng: Source of the random numbers.

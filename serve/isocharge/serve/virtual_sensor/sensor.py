@@ -1,4 +1,4 @@
-"""Virtual sensor: a pseudo-terminal that sends the frames of a board, with charges from any forward map.
+"""Virtual sensor, which is a pseudo-terminal that sends the frames of a board. The charges come from any forward map.
 
 The touch charges of the whole script are computed before the first frame is sent. The amplifier, whose output depends
 on earlier charges, processes the charges block by block. Frames are written at absolute times, so the frame rate does
@@ -54,7 +54,7 @@ class PseudoPort:
         self.url = os.ttyname(self._reader)
 
     def write_whole(self, data: bytes) -> bool:
-        """Write data completely, or not at all if the buffer is too full, without waiting.
+        """Write data without waiting. If the buffer has not enough room for all data, nothing is written.
 
         Returns:
             Whether the data were written.
@@ -236,7 +236,9 @@ class VirtualSensor:
         self._next_script = (script, _clean_charges(charges, script), clean_pC_per_K)
 
     def frames(self) -> Iterator[bytes]:
-        """Yield the bytes of each frame without waiting for its time; empty bytes for a frame that a fault loses.
+        """Yield the bytes of each frame without waiting for its time.
+
+        The bytes are empty if the frame is lost by a fault.
 
         The frames are computed in blocks. A new script takes effect at the beginning of a block, and the last script is
         repeated without end.

@@ -44,7 +44,7 @@ CONTENT_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
 """Field of a tensor's contents that holds the numbers, by number type."""
 
 
-def read_request(message: Any, loaded: LoadedVersion, batch: int) -> InferRequest:
+def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> InferRequest:
     """Parse a ModelInferRequest, and return the charges and the requested outputs.
 
     If the charges of the request are raw contents, the outputs of the response are raw contents, too.
@@ -52,12 +52,12 @@ def read_request(message: Any, loaded: LoadedVersion, batch: int) -> InferReques
     Args:
         message: The message.
         loaded: The model.
-        batch: Largest number of presses in one request.
+        max_presses: Largest number of presses in one request.
 
     Raises:
         RequestError: If the message is not a request for this model.
         ChargeError: If a charge is not finite.
-        TooLarge: If there are more presses than `batch`.
+        TooLarge: If there are more presses than `max_presses`.
     """
     raw_contents = message.raw_input_contents
     if len(raw_contents) > 1:
@@ -69,7 +69,7 @@ def read_request(message: Any, loaded: LoadedVersion, batch: int) -> InferReques
         "outputs": [{"name": output.name, "parameters": _unsupported_parameters(output)} for output in message.outputs],
         "parameters": {"binary_data_output": raw is not None},
     }
-    return parse_request(json_object, raw or b"", loaded, batch)
+    return parse_request(json_object, raw or b"", loaded, max_presses)
 
 
 def _input_object(tensor: Any, raw: bytes | None) -> dict[str, Any]:

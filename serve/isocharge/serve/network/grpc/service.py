@@ -254,6 +254,7 @@ class Service:
             TooMany: If there are too many calls, and no call waits for a message.
         """
         if self._open_count >= self._limits.connections:
+            # The ended call still counts as open until its task has reacted, so the count may exceed the limit briefly.
             self._end_waiting_call()
         self._open_count += 1
         try:
@@ -271,6 +272,7 @@ class Service:
             raise TooMany(f"all {self._limits.connections} calls are taken; try again later")
         oldest = next(iter(self._waiting))
         del self._waiting[oldest]
+        # A deadline in the present makes the timeout of the waiting call expire at once.
         oldest.reschedule(asyncio.get_running_loop().time())
 
     async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:

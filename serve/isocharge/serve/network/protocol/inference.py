@@ -1,5 +1,4 @@
-"""One inference of the Open Inference Protocol, which consists of reading the request, running the model and writing
-the response.
+"""One inference of the Open Inference Protocol. Its steps read the request, run the model and write the response.
 
 A body is JSON, which may be followed by binary tensors. If there are binary tensors, a header contains the length of
 the JSON. The gRPC service converts its messages to the same JSON objects and also uses `parse_request`.
@@ -127,22 +126,22 @@ def read_object(text: bytes) -> dict[str, Any]:
     return content
 
 
-def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, batch: int) -> InferRequest:
+def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, max_presses: int) -> InferRequest:
     """Read a request from the body of an HTTP request.
 
     Args:
         body: The body, not compressed.
         header_length: Value of the header Inference-Header-Content-Length; None if the request has no binary tensor.
         loaded: The model.
-        batch: Largest number of presses in one request.
+        max_presses: Largest number of presses in one request.
 
     Raises:
         RequestError: If the body is not a request for this model.
         ChargeError: If a charge is not finite.
-        TooLarge: If there are more presses than `batch`.
+        TooLarge: If there are more presses than `max_presses`.
     """
     if header_length is None:
-        return parse_request(read_object(body), b"", loaded, batch)
+        return parse_request(read_object(body), b"", loaded, max_presses)
     # The digits are tested first, because int() accepts signs, blanks and underscores, and is slow for a long text.
     is_short_number = header_length.isdigit() and len(header_length) <= 12
     if not is_short_number or int(header_length) > len(body):
@@ -151,11 +150,11 @@ def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, 
             f"got {header_length.decode('latin-1')!r:.50}"
         )
     json_length = int(header_length)
-    return parse_request(read_object(body[:json_length]), memoryview(body)[json_length:], loaded, batch)
+    return parse_request(read_object(body[:json_length]), memoryview(body)[json_length:], loaded, max_presses)
 
 
 def parse_request(
-    content: dict[str, Any], binary: bytes | memoryview, loaded: LoadedVersion, batch: int
+    content: dict[str, Any], binary: bytes | memoryview, loaded: LoadedVersion, max_presses: int
 ) -> InferRequest:
     """Parse a request from a JSON object.
 
@@ -163,12 +162,12 @@ def parse_request(
         content: The object.
         binary: Bytes that follow the JSON. They are the charges if the input has the parameter `binary_data_size`.
         loaded: The model. If the request names no outputs, all outputs of the model are computed.
-        batch: Largest number of presses in one request.
+        max_presses: Largest number of presses in one request.
 
     Raises:
         RequestError: If the object is not a request for this model.
         ChargeError: If a charge is not finite.
-        TooLarge: If there are more presses than `batch`.
+        TooLarge: If there are more presses than `max_presses`.
     """
     body = convert(content, InferBody, "", RequestError)
     default_is_binary = body.parameters.binary_data_output
@@ -177,7 +176,7 @@ def parse_request(
     else:
         names = loaded.outputs
         binary_names = frozenset(names if default_is_binary else ())
-    charges = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, batch)
+    charges = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, max_presses)
     return InferRequest(body.id, charges, names, binary_names)
 
 
@@ -211,7 +210,9 @@ def _requested_outputs(
     return names, frozenset(binary_names)
 
 
-def _read_charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[str, ...], batch: int) -> Singles:
+def _read_charges(
+    tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[str, ...], max_presses: int
+) -> Singles:
     """Return the charges of an input tensor, shape (n, electrodes), pC.
 
     The shape is checked before any memory of that size is used.
@@ -220,12 +221,12 @@ def _read_charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: t
         tensor: The input tensor.
         binary: Bytes that follow the JSON text; empty if there are none.
         electrodes: Electrodes of the model.
-        batch: Largest number of presses in one request.
+        max_presses: Largest number of presses in one request.
 
     Raises:
         RequestError: If the shape or the data are not valid.
         ChargeError: If a charge is not finite.
-        TooLarge: If there are more presses than `batch`.
+        TooLarge: If there are more presses than `max_presses`.
     """
     shape = tensor.shape
     if len(shape) != 2 or shape[0] < 1 or shape[1] != len(electrodes):
@@ -234,8 +235,8 @@ def _read_charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: t
             f"a column for each of {electrodes}, got {shape!r:.100}"
         )
     press_count, electrode_count = shape
-    if press_count > batch:
-        raise TooLarge(f"input {INPUT!r}: expected at most {batch} presses in one request, got {press_count}")
+    if press_count > max_presses:
+        raise TooLarge(f"input {INPUT!r}: expected at most {max_presses} presses in one request, got {press_count}")
     stated_size = tensor.parameters.binary_data_size
     if stated_size is None and not binary:
         return _from_values(tensor.data, shape, electrodes)
