@@ -15,7 +15,7 @@ import scipy  # scipy.interpolate is imported when it is used
 from scipy.sparse import csr_array, dia_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import splu
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap, Domain, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
@@ -369,7 +369,7 @@ def _fit_patch(
 
     Args:
         samples: Scaled charges.
-        electrode: Number of the electrode.
+        electrode: Index of the electrode.
         radius: Radius of the disk, mm.
         spacing: Largest distance between the knots, mm.
         coarse: Splines of all charges over the disk.
@@ -384,27 +384,46 @@ def _fit_patch(
     lower_left = corners.min(axis=0) - margin
     upper_right = corners.max(axis=0) + margin
     cells = np.clip(np.ceil((upper_right - lower_left) / spacing), MIN_CELLS, MAX_CELLS).astype(int)
-    x_knots, y_knots = (_knots(*axis) for axis in zip(lower_left, upper_right, cells, strict=True))
+    x_cells, y_cells = cells
+    x_knots = _knots(lower_left[0], upper_right[0], x_cells)
+    y_knots = _knots(lower_left[1], upper_right[1], y_cells)
 
-    # Fitted presses: a grid in the part of the rectangle within the disk, and points on the edge of the disk
-    line_counts = np.ceil(np.sqrt(PRESSES_PER_CELL) * cells).astype(int)
-    x_line, y_line = (np.linspace(*axis) for axis in zip(lower_left, upper_right, line_counts, strict=True))
-    x_grid, y_grid = np.meshgrid(x_line, y_line)
-    grid = np.stack([x_grid.ravel(), y_grid.ravel()], axis=1)
     edge_count = int(PRESSES_PER_EDGE_CELL * 2.0 * np.pi * radius / spacing)
-    edge_angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
-    edge = radius * (1.0 - 1e-12) * np.stack([np.cos(edge_angle), np.sin(edge_angle)], axis=1)
-    is_in_rectangle = ((edge > lower_left) & (edge < upper_right)).all(axis=1)
-    is_in_disk = np.hypot(*grid.T) < radius
-    position = np.concatenate([grid[is_in_disk], edge[is_in_rectangle]])
+    position = _patch_positions(lower_left, upper_right, cells, radius, edge_count)
     if not len(position):
         return []
 
-    is_needed = np.arange(len(sensor.electrodes)) == electrode
     # The patch approximates the error of the coarse spline.
+    is_needed = np.arange(len(sensor.electrodes)) == electrode
     residual = (samples.at(position, is_needed) - coarse(position))[:, :, electrode]
     table = _least_squares(position, residual, (x_knots, y_knots), fixed=2)
     return [Patch(electrode, lower_left, upper_right, table)]
+
+
+def _patch_positions(lower_left: Array, upper_right: Array, cells: Integers, radius: float, edge_count: int) -> Array:
+    """Return the positions of the fitted presses in a rectangle: a grid within the disk, and points on its edge.
+
+    Args:
+        lower_left: Corner (x, y) of the rectangle, shape (2,), mm.
+        upper_right: Opposite corner, shape (2,), mm.
+        cells: Numbers of cells of the spline along x and y, shape (2,).
+        radius: Radius of the disk, mm.
+        edge_count: Number of points on the whole edge of the disk.
+
+    Returns:
+        Positions (x, y), shape (n, 2), mm.
+    """
+    x_count, y_count = np.ceil(np.sqrt(PRESSES_PER_CELL) * cells).astype(int)
+    x_line = np.linspace(lower_left[0], upper_right[0], x_count)
+    y_line = np.linspace(lower_left[1], upper_right[1], y_count)
+    x_grid, y_grid = np.meshgrid(x_line, y_line)
+    grid = np.stack([x_grid.ravel(), y_grid.ravel()], axis=1)
+    is_in_disk = np.hypot(grid[:, 0], grid[:, 1]) < radius
+
+    edge_angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
+    edge = radius * (1.0 - 1e-12) * np.stack([np.cos(edge_angle), np.sin(edge_angle)], axis=1)
+    is_in_rectangle = ((edge > lower_left) & (edge < upper_right)).all(axis=1)
+    return np.concatenate([grid[is_in_disk], edge[is_in_rectangle]])
 
 
 def _knots(low: float, high: float, cells: int) -> Array:

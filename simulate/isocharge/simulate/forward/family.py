@@ -188,8 +188,8 @@ class Family:
     def unfold(self, solved: Array, mesh: Template) -> Array:
         """Compute the stress of all orientations from that of the solved orientations, by the symmetry of the probe.
 
-        Rotating a probe by one of its periods gives the same press in a rotated mesh. The stress of a further period is
-        therefore the stress of the solved period. Its elements and its components are rotated.
+        If a probe is rotated by one of its periods, the press is the same, but the mesh is rotated. The stress of each
+        further period is therefore that of the solved period, after a rotation of the elements and of the components.
 
         Args:
             solved: Scaled stress in a frame that rotates with the probe, shape
@@ -202,10 +202,11 @@ class Family:
         n_distance, n_rotation, n_force, _ = solved.shape
         solved_period = np.moveaxis(solved, 1, 2).reshape(n_distance, n_force, n_rotation, mesh.n_element, -1, 3)
         periods = []
-        for number in range(self.symmetry_order):
-            rotated_elements = mesh.rotated(number, self.symmetry_order)
-            angle = 2.0 * np.pi * number / self.symmetry_order
-            periods.append(rotate_stress(solved_period[..., rotated_elements, :, :], -angle))
+        for period_index in range(self.symmetry_order):
+            rotated_elements = mesh.rotated(period_index, self.symmetry_order)
+            angle = 2.0 * np.pi * period_index / self.symmetry_order
+            stress_of_elements = solved_period[..., rotated_elements, :, :]
+            periods.append(rotate_stress(stress_of_elements, -angle))
         return np.asarray(np.concatenate(periods, axis=2).reshape(-1, solved.shape[-1]))
 
 
@@ -245,6 +246,7 @@ def check_presses(domain: Domain, count: int) -> list[CheckPress]:
         log_force_fraction = (0.5 + 0.618 * index) % 1.0
         force = np.clip(np.exp(min_log + (max_log - min_log) * log_force_fraction), *domain.force_range)
         distance = float(domain.radius * relative_distance)
+        # The golden angle (2.4 rad) distributes the directions evenly. The rotation changes by another angle.
         presses.append(CheckPress(distance, angle=2.4 * index, force=float(force), rotation=0.7 * index))
     return presses
 

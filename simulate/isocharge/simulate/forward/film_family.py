@@ -216,7 +216,8 @@ class FilmFamily:
             the product of the scales of both, shape (n_mode, 1).
         """
         bits = bits_of(self.coefficients, self.modes, MAX_BITS, EXTRA_BITS)
-        coefficients, coefficient_scale = quantised(self.coefficients, (0, 1, 2, 3, 4), bits)
+        all_axes_but_mode = (0, 1, 2, 3, 4)
+        coefficients, coefficient_scale = quantised(self.coefficients, all_axes_but_mode, bits)
         modes, mode_scale = quantised(self.modes, 1, bits[:, None])
         imperfections = {} if self.imperfections is None else self.imperfections.to_arrays()
         return {

@@ -238,8 +238,8 @@ class ModeMap:
         is_odd = IS_ODD[list(self.field_numbers)]
         charges = self.fields.field_charges(contact, is_odd)  # shape (n, n_electrode, n_field)
         charges_of_kind: dict[str, tuple[Array, ...]] = {}
-        for column, number in enumerate(self.field_numbers):
-            kind = KINDS[number]
+        for column, field_number in enumerate(self.field_numbers):
+            kind = KINDS[field_number]
             charges_of_kind[kind] = (*charges_of_kind.get(kind, ()), charges[..., column])
         return charges_of_kind
 
@@ -354,7 +354,8 @@ class FilmModes:
 
     def to_arrays(self) -> dict[str, Any]:
         """Return the decomposition as arrays for a file. Coefficients and components are rounded to a few bits."""
-        coefficients, coefficient_scale = quantised(self.coefficients, (0, 1, 2, 3, 4), SCALE_BITS)
+        all_axes_but_mode = (0, 1, 2, 3, 4)
+        coefficients, coefficient_scale = quantised(self.coefficients, all_axes_but_mode, SCALE_BITS)
 
         # The components are divided by the size of the stress at each node, rounded to a power of two, which compresses
         # well.

@@ -114,7 +114,9 @@ class SideForceMap:
         contact = self.film.domain.check(contact, "side forces")
         distance = np.hypot(contact[:, 0], contact[:, 1])
         force = contact[:, 2]
-        relative_holding_force = self.fields.family.weights(distance, force, np.zeros(1)) @ self.holding
+        orientation = np.zeros(1)  # a circular probe has no orientation
+        weights = self.fields.family.weights(distance, force, orientation)
+        relative_holding_force = weights @ self.holding
         direction = contact[:, :2] / np.maximum(distance, 1e-12)[:, None]
         holding_force = (relative_holding_force * force)[:, None] * direction
         return limited(holding_force, coefficient * force)

@@ -69,11 +69,11 @@ def stress_series(forward_map: ForwardMap) -> StressSeries:
         shift, probe_ring = _automorphism(distance_mm / film.radius, forward_map.probe.reach / film.radius)
         inner_rings = probe_ring * np.sqrt(inner_fraction)
         outer_rings = probe_ring * (MAX_RING / probe_ring) ** outer_fraction
+        inner_points_mm = film.radius * _moved(inner_rings[:, None] * direction, shift)
+        outer_points_mm = film.radius * _moved(outer_rings[:, None] * direction, shift)
         for column, force_N in enumerate(forces_N):
-            for table, rings in ((inner, inner_rings), (outer, outer_rings)):
-                ring_points: Complexes = rings[:, None] * direction
-                points_mm = film.radius * (ring_points + shift) / (1.0 + shift * ring_points)
-                table[row, column] = np.log(_stress_sum(forward_map, distance_mm, force_N, points_mm))
+            inner[row, column] = np.log(_stress_sum(forward_map, distance_mm, force_N, inner_points_mm))
+            outer[row, column] = np.log(_stress_sum(forward_map, distance_mm, force_N, outer_points_mm))
     return StressSeries(
         film=film_to_dict(film),
         probe_radius_mm=forward_map.probe.reach,
@@ -105,6 +105,11 @@ def _automorphism(distance: float, probe_radius: float) -> tuple[float, float]:
     outer_edge = np.arctanh(distance + probe_radius)
     inner_edge = np.arctanh(distance - probe_radius)
     return float(np.tanh(0.5 * (outer_edge + inner_edge))), float(np.tanh(0.5 * (outer_edge - inner_edge)))
+
+
+def _moved(points: Complexes, c: float) -> Complexes:
+    """Return the images (z + c) / (1 + c z) of points z of the unit disk, any shape; see `_automorphism`."""
+    return np.asarray((points + c) / (1.0 + c * points))
 
 
 def _stress_sum(forward_map: ForwardMap, distance_mm: float, force_N: float, points_mm: Complexes) -> Array:

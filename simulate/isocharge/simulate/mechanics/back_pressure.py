@@ -56,12 +56,13 @@ class BackPressure:
         Args:
             deflection: W at the nodes, shape (n_node,).
         """
-        pressure = -self.groups.static_pressure
-        compression = self.groups.compression * self._volume(deflection)
+        compression = self.groups.compression * self._volume(deflection)  # V / V0
         if compression >= 1.0:
             return np.full_like(deflection, np.inf)
+        air_pressure = 0.0
         if compression != 0.0:
-            pressure += self.groups.ambient_pressure * compression / (1.0 - compression)
+            air_pressure = self.groups.ambient_pressure * compression / (1.0 - compression)
+        pressure = air_pressure - self.groups.static_pressure
         return pressure * self.weights
 
     def stiffness(self, deflection: Array) -> float:

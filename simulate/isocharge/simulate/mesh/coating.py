@@ -100,10 +100,10 @@ class Coating:
         radius = 0.5 * self.band_width
         disk_area = np.pi * radius**2
         shares = np.zeros((*points.shape, len(self.layers)))
-        for number, layer in enumerate(self.layers):
+        for layer_index, layer in enumerate(self.layers):
             for part in layer:
                 is_near = self._is_near(part, points)
-                shares[is_near, number] += area_in_disk(part, points[is_near], radius) / disk_area
+                shares[is_near, layer_index] += area_in_disk(part, points[is_near], radius) / disk_area
         return np.minimum(shares, 1.0)
 
     def _layer_count(self, points: Complexes) -> Integers:

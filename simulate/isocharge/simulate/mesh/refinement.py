@@ -121,13 +121,13 @@ class RefinedTemplate(Template):
         found_element = np.zeros_like(element)
         position = np.stack([xi, eta])  # shape (2, n_point)
         for size in np.unique(self.size, axis=0):
-            candidates = np.flatnonzero((self.size == size).all(axis=1))
             cell_size = size[:, None]
-            candidate_cells = np.rint((self.low[candidates].T + 1.0) / cell_size).astype(np.intp)
-            candidate_codes = self._cell_codes(self.parent[candidates], candidate_cells)
-            order = np.argsort(candidate_codes)  # the codes are sorted for the search below
-            candidates = candidates[order]
-            candidate_codes = candidate_codes[order]
+            elements_of_size = np.flatnonzero((self.size == size).all(axis=1))
+            element_cells = np.rint((self.low[elements_of_size].T + 1.0) / cell_size).astype(np.intp)
+            element_codes = self._cell_codes(self.parent[elements_of_size], element_cells)
+            order = np.argsort(element_codes)  # `searchsorted` needs sorted codes
+            candidates = elements_of_size[order]
+            candidate_codes = element_codes[order]
 
             point_cells = np.floor((position + 1.0) / cell_size).astype(np.intp)
             last_cell = np.rint(2.0 / cell_size).astype(np.intp) - 1

@@ -72,8 +72,8 @@ def chebyshev_nodes(count: int, low: float, high: float) -> Array:
     Returns:
         Nodes, ascending, shape (count,). The ends of the interval are not among the nodes.
     """
-    number = np.arange(count, 0, -1)
-    angle = (2.0 * number - 1.0) * np.pi / (2.0 * count)
+    descending = np.arange(count, 0, -1)  # the cosine decreases with the angle, so the nodes are ascending
+    angle = (2.0 * descending - 1.0) * np.pi / (2.0 * count)
     middle = 0.5 * (low + high)
     half_width = 0.5 * (high - low)
     return np.asarray(middle + half_width * np.cos(angle))
@@ -131,7 +131,9 @@ def derivative_matrix(order: int) -> Array:
     nodes = lobatto_nodes(order)
     weights = lobatto_weights(order)
     difference = nodes[:, None] - nodes[None, :]
-    np.fill_diagonal(difference, 1.0)
+    np.fill_diagonal(difference, 1.0)  # avoids a division by zero; the diagonal is replaced below
+
+    # The derivative of a constant is zero, so each row adds up to zero (Berrut and Trefethen 2004).
     matrix = weights[None, :] / weights[:, None] / difference
     np.fill_diagonal(matrix, 0.0)
     np.fill_diagonal(matrix, -matrix.sum(axis=1))

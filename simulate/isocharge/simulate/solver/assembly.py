@@ -87,13 +87,15 @@ class Assembly:
         row = np.broadcast_to(skeleton_numbers[:, :, None], shape)
         column = np.broadcast_to(skeleton_numbers[:, None, :], shape)
         is_free = (row >= 0) & (column >= 0)
-        # Entries are ordered by columns, as the compressed sparse column format stores them.
-        entry, position = np.unique(column[is_free] * size + row[is_free], return_inverse=True)
-        positions = np.full(shape, entry.size, dtype=np.intp)
+
+        # One code for each entry. The order of the codes is that of the compressed sparse column format.
+        entry_codes = column[is_free] * size + row[is_free]
+        codes, position = np.unique(entry_codes, return_inverse=True)
+        positions = np.full(shape, codes.size, dtype=np.intp)
         positions[is_free] = position
         self._entry_positions = positions.ravel()
-        self._indices = (entry % size).astype(np.int32)
-        entries_per_column = np.bincount(entry // size, minlength=size)
+        self._indices = (codes % size).astype(np.int32)
+        entries_per_column = np.bincount(codes // size, minlength=size)
         self._indptr = np.concatenate([[0], np.cumsum(entries_per_column)]).astype(np.int32)
 
     def _reorder(self) -> None:

@@ -94,11 +94,13 @@ def decay(mesh: PlacedMesh, slope: Array) -> float:
     nodal_slope = slope.transpose(0, 2, 1).reshape(len(slope), 2, n_node, n_node)
     coefficients = nodes_to_modes @ nodal_slope @ nodes_to_modes.T
 
-    # Power of each mode; the norm of the Legendre polynomial of degree n is 1 / (2 n + 1).
+    # Power of each mode, which is the square of its contribution to the slope; the norm of the Legendre polynomial of
+    # degree n is 1 / (2 n + 1).
     norm = 1.0 / (2.0 * np.arange(n_node) + 1.0)
     power = (coefficients**2 * np.outer(norm, norm)).sum(axis=1)
     total_power = power.sum(axis=(1, 2))
-    highest_power = total_power - power[:, :-1, :-1].sum(axis=(1, 2))
+    power_of_lower_modes = power[:, :-1, :-1].sum(axis=(1, 2))  # without the highest degree in xi or in eta
+    highest_power = total_power - power_of_lower_modes
     area = mesh.geometry.weights.sum(axis=1)
     weighted_share = area * np.sqrt(np.maximum(highest_power, 0.0) * total_power)
     return float(np.sum(weighted_share) / max(np.sum(area * total_power), 1e-300))

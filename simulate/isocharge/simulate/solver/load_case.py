@@ -343,7 +343,9 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     """
     film = case.film
     probe = case.probe
-    placement = place(film, probe, case.at, Resolution(2, 8, 1), 0.1).placement
+    # Any mesh under the press has the same conformal map, so a coarse mesh is sufficient here.
+    coarse_resolution = Resolution(order=2, around=8, rings=1)
+    placement = place(film, probe, case.at, coarse_resolution, layer=0.1).placement
     stretch = _stretch(placement)
     needed_radius = probe.farthest_distance(case.at) + CLEARANCE * probe.reach
     is_crowded = not probe.topology.fills_circle and needed_radius > film.radius
