@@ -36,7 +36,7 @@ class Series:
             Shape (n, 4, n_electrode): the value, then the three derivatives.
         """
         _, n_y, n_force, n_electrode = self.coefficients.shape
-        n_chunk = len(coordinates) // CHUNK_SIZE + 1
+        n_chunk = len(coordinates) // CHUNK_SIZE + 1  # at least one; no chunk is longer than CHUNK_SIZE
         evaluated_chunks = []
         for chunk in np.array_split(coordinates, n_chunk):
             position_terms, force_terms = chebyshev_terms(chunk, degree=n_y - 1, force_degree=n_force - 1)

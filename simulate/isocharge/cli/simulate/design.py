@@ -173,20 +173,20 @@ def refuse_search_options(*, electrodes: int | None, keep: str | None, goal: str
         )
 
 
-def _guard_table(found: GuardDesign) -> str:
+def _guard_table(guard_design: GuardDesign) -> str:
     """Return a table with the position of the guard electrode.
 
     The table also lists the share of presses that are not noticed and the limits of the position error, without and
     with this electrode.
     """
-    x, y = found.guard.centre
+    x, y = guard_design.guard.centre
     lines = [
-        f"{found.guard.name:<10} {x:9.3f} {y:9.3f} mm",
+        f"{guard_design.guard.name:<10} {x:9.3f} {y:9.3f} mm",
         "                 not noticed   position error limit, mm: worst      rms",
     ]
     for title, region, limits in (
-        ("without guard", found.region_before, found.limits_before),
-        ("with guard", found.region_after, found.limits_after),
+        ("without guard", guard_design.region_before, guard_design.limits_before),
+        ("with guard", guard_design.region_after, guard_design.limits_after),
     ):
         share = f"{100.0 * region.total_share:.1f} %"
         lines.append(f"{title:<15} {share:>12} {limits.worst:31.3f} {limits.rms:8.3f}")

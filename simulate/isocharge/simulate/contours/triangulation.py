@@ -156,6 +156,7 @@ class Triangulation:
         """
         n_press = len(charge)
         n_candidates = np.bincount(candidates.press, minlength=n_press)
+        # The candidates are ordered, so the best candidate of a press is in its first row.
         first_row = np.searchsorted(candidates.press, np.arange(n_press))
         second_row = np.minimum(first_row + 1, candidates.press.size)
         spread = np.append(candidates.spread, np.inf)  # the last value is for presses without candidates
@@ -279,7 +280,7 @@ class Triangulation:
         Args:
             charge: Charges of all presses, shape (n, n_electrode), pC.
             near: Candidates from which the search starts.
-            pair: Numbers of the two electrodes.
+            pair: Indices of the two electrodes.
 
         Returns:
             Positions, shape (n_candidate, 2), mm; NaN if the contours do not cross.
@@ -288,16 +289,17 @@ class Triangulation:
         crossing = np.full((len(near.press), 2), np.nan)
         active = np.arange(len(contact))
         for _ in range(STEPS):
-            distances, slopes = self._distances(contact[active], charge[near.press[active]], fixed=True)
+            distances, derivatives = self._distances(contact[active], charge[near.press[active]], fixed=True)
             pair_distances = distances[:, pair]
-            pair_slopes = slopes[:, pair]
+            pair_derivatives = derivatives[:, pair]  # shape (n_active, 2, 2)
             is_moving = np.abs(pair_distances).max(axis=1) >= CONVERGED_DISTANCE
             converged = active[~is_moving]
             crossing[converged] = contact[converged, :2]
             active = active[is_moving]
             if active.size == 0:
                 break
-            step = gauss_newton_step(pair_slopes[is_moving], pair_distances[is_moving])  # two equations: Newton's step
+            # For two equations with two unknowns, the Gauss-Newton step is the Newton step.
+            step = gauss_newton_step(pair_derivatives[is_moving], pair_distances[is_moving])
             contact[active] = self._moved(contact[active], step)
         return crossing
 

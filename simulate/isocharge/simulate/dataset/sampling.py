@@ -121,48 +121,49 @@ class Sweep:
         if self.sampling == "grid" and self.samples < len(probes):
             raise SceneError(f"samples: expected at least one for each of {len(probes)} probes, got {self.samples}")
         n_probe = len(probes)
-        parts = [self._presses_of_probe(number, n_probe, probe.period) for number, probe in enumerate(probes)]
+        parts = [self._presses_of_probe(index, n_probe, probe.period) for index, probe in enumerate(probes)]
         presses = SweepPresses(
             probe=np.concatenate([part.probe for part in parts]),
             contact=np.concatenate([part.contact for part in parts]),
             rotation=np.concatenate([part.rotation for part in parts]),
         )
         # Take the first press of each probe, then the second press of each probe, and so on.
-        number_within_probe = np.concatenate([np.arange(len(part)) for part in parts])
-        order = np.argsort(number_within_probe, kind="stable")
+        index_within_probe = np.concatenate([np.arange(len(part)) for part in parts])
+        order = np.argsort(index_within_probe, kind="stable")
         return presses[order]
 
-    def _presses_of_probe(self, number: int, n_probe: int, period: float) -> SweepPresses:
+    def _presses_of_probe(self, probe_index: int, n_probe: int, period: float) -> SweepPresses:
         """Return the presses of one probe.
 
         Args:
-            number: Number of the probe.
+            probe_index: Index of the probe.
             n_probe: Number of probes in the sweep.
             period: Smallest rotation that maps the probe onto itself, rad.
         """
         if self.sampling == "grid":
             position, force, rotation = self._grid(self.samples // n_probe, period)
         else:
-            count = len(range(number, self.samples, n_probe))  # every n_probe-th press of the sweep
-            distance_fraction, angle_fraction, force_fraction, rotation_fraction = self._unit_cube(count, number).T
+            count = len(range(probe_index, self.samples, n_probe))  # every n_probe-th press of the sweep
+            fractions = self._unit_cube(count, probe_index)  # uniform in [0, 1), with one column for each quantity
+            distance_fraction, angle_fraction, force_fraction, rotation_fraction = fractions.T
             distance = self.radius * np.sqrt(distance_fraction)  # uniform over the area of the disk
             position = distance * np.exp(1j * FULL_TURN * angle_fraction)
             force = self._force(force_fraction)
             rotation = FULL_TURN * rotation_fraction if self.orientation == "random" else np.zeros(count)
         contact = np.stack([position.real, position.imag, force], axis=1)
-        return SweepPresses(np.full(position.size, number), contact, rotation)
+        return SweepPresses(np.full(position.size, probe_index), contact, rotation)
 
-    def _unit_cube(self, count: int, number: int) -> Array:
+    def _unit_cube(self, count: int, probe_index: int) -> Array:
         """Draw points of the unit cube for the presses of one probe.
 
         Args:
             count: Number of presses.
-            number: Number of the probe. Each probe has its own sequence of random numbers.
+            probe_index: Index of the probe. Each probe has its own sequence of random numbers.
 
         Returns:
             Points (distance, angle, force, rotation), each coordinate from 0 to 1, shape (count, 4).
         """
-        rng = np.random.default_rng([self.seed, number])
+        rng = np.random.default_rng([self.seed, probe_index])
         if self.sampling == "random":
             return rng.random((count, 4))
         # A Sobol sequence is balanced if the number of points is a power of two.

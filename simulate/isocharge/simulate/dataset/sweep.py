@@ -183,22 +183,22 @@ def _finish_shards(
     """
     presses_of_shards = list(_split(presses, shard))
     entries: dict[int, dict[str, Any]] = {}
-    for number, shard_presses in enumerate(presses_of_shards):
-        data = run.load(shard_name(number), bytes, final=True)
+    for index, shard_presses in enumerate(presses_of_shards):
+        data = run.load(shard_name(index), bytes, final=True)
         if data is not None:
-            entries[number] = shard_entry(shard_name(number), len(shard_presses), data)
+            entries[index] = shard_entry(shard_name(index), len(shard_presses), data)
     finished_presses = sum(entry["samples"] for entry in entries.values())
-    missing_shards = [number for number in range(len(presses_of_shards)) if number not in entries]
+    missing_shards = [index for index in range(len(presses_of_shards)) if index not in entries]
     report("pressing", finished_presses, len(presses))
 
-    missing_samples = _samples(maps, (presses_of_shards[number] for number in missing_shards), executor)
-    for number, samples in zip(missing_shards, missing_samples, strict=True):
-        name, data = pack_shard(number, samples, maps[0].sensor)
+    missing_samples = _samples(maps, (presses_of_shards[index] for index in missing_shards), executor)
+    for index, samples in zip(missing_shards, missing_samples, strict=True):
+        name, data = pack_shard(index, samples, maps[0].sensor)
         run.save(name, data, final=True)
-        entries[number] = shard_entry(name, len(samples), data)
+        entries[index] = shard_entry(name, len(samples), data)
         finished_presses += len(samples)
         report("pressing", finished_presses, len(presses))
-    return [entries[number] for number in sorted(entries)]
+    return [entries[index] for index in sorted(entries)]
 
 
 def _split(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:

@@ -161,15 +161,16 @@ def search(
     candidate_charges = charge_map.charges(candidate_contacts)
     positions = unit_candidates[:, :2]
     is_neighbour = scipy.spatial.distance.cdist(positions, positions) < START_SEPARATION
-    start_rows = []
-    for first in range(0, max(len(charge), 1), CHUNK):
-        chunk = slice(first, first + CHUNK)
-        start_rows.append(_nearest_rows(charge[chunk], sigma[chunk], candidate_charges, is_neighbour, starts))
+    nearest_candidates = []
+    for chunk_start in range(0, max(len(charge), 1), CHUNK):  # without charges, there is one empty chunk
+        chunk = slice(chunk_start, chunk_start + CHUNK)
+        nearest_candidates.append(_nearest_rows(charge[chunk], sigma[chunk], candidate_charges, is_neighbour, starts))
 
     # One descent from the nearest candidate of each row of charges, one from the second nearest, and so on
-    rows_of_starts = np.concatenate(start_rows).T  # shape (starts, n)
+    candidates_of_descents = np.concatenate(nearest_candidates).T  # shape (starts, n)
     solutions = [
-        explain(charge_map, charge, sigma, candidate_contacts[rows], min_change=min_change) for rows in rows_of_starts
+        explain(charge_map, charge, sigma, candidate_contacts[index], min_change=min_change)
+        for index in candidates_of_descents
     ]
     contacts = np.stack([contact for contact, _ in solutions])  # shape (starts, n, 3)
     residuals = np.stack([residual for _, residual in solutions])  # shape (starts, n, n_electrode)
@@ -199,9 +200,8 @@ def _nearest_rows(
 ) -> Integers:
     """For each row of charges, find the candidates with the nearest charges.
 
-    Candidates that are neighbours of each other are not returned together.
-
-    A few searches for the smallest distance are faster than sorting all distances.
+    Candidates that are neighbours of each other are not returned together. A few searches for the
+    smallest distance are faster than sorting all distances.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC.
@@ -219,7 +219,9 @@ def _nearest_rows(
     powers = np.hstack([candidate_charges**2, candidate_charges])
     squared_distance = weights @ powers.T  # shape (n, n_candidate), without the constant
     nearest = np.empty((len(charge), count), dtype=np.intp)
-    for number in range(count):
-        nearest[:, number] = squared_distance.argmin(axis=1)
-        squared_distance[is_neighbour[nearest[:, number]]] = np.inf
+    for rank in range(count):
+        nearest_candidate = squared_distance.argmin(axis=1)
+        nearest[:, rank] = nearest_candidate
+        # Exclude this candidate and its neighbours from the following searches.
+        squared_distance[is_neighbour[nearest_candidate]] = np.inf
     return nearest

@@ -190,7 +190,7 @@ class _PressedFilm:
             table: Charge table.
             presses: Positions (x, y) of the presses, shape (n, 2), mm.
         """
-        position = presses @ np.array([1.0, 1j])
+        position = presses @ np.array([1.0, 1j])  # x + iy
         distance = np.abs(position)
         direction = np.exp(1j * np.angle(position))
 
@@ -227,13 +227,17 @@ class _PressedFilm:
         Returns:
             Rows, shape (n, m, 6).
         """
-        distance = np.abs(centres @ np.array([1.0, 1j]) - self.presses[:, None])
-        relative_distance = distance / (np.sqrt(0.5) * side + self.table.probe.radius)
-        rule_number = np.searchsorted([largest for largest, _ in GAUSS_RULES], relative_distance)
+        complex_centres = centres @ np.array([1.0, 1j])  # x + iy
+        distance = np.abs(complex_centres - self.presses[:, None])  # shape (n, m)
+        half_diagonal = np.sqrt(0.5) * side
+        relative_distance = distance / (half_diagonal + self.table.probe.radius)
+
+        # Choose the integration rule of each pair of a press and a square, and compute the pairs with the same rule.
+        chosen_rule = np.searchsorted([largest for largest, _ in GAUSS_RULES], relative_distance)
         rows = np.empty((*distance.shape, len(COLUMNS)))
-        for number, (_, points_per_side) in enumerate(GAUSS_RULES):
+        for rule_index, (_, points_per_side) in enumerate(GAUSS_RULES):
             unit_points, weights = gauss_square(points_per_side)
-            press_index, square_index = np.nonzero(rule_number == number)
+            press_index, square_index = np.nonzero(chosen_rule == rule_index)
             chunk_size = POINT_CHUNK // len(unit_points)
             for start in range(0, len(square_index), chunk_size):
                 press_chunk = press_index[start : start + chunk_size]
@@ -273,7 +277,7 @@ class _PressedFilm:
         """
         n_mean = len(press_index)
         direction = self.direction[press_index]
-        complex_points = points @ np.array([1.0, 1j])
+        complex_points = points @ np.array([1.0, 1j])  # x + iy
         points_in_press_frame = complex_points / direction[:, None]
         row, column = self._grid_coordinates(press_index, points_in_press_frame)
         rows, row_weights = _row_weights(row)

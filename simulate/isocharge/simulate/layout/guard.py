@@ -164,14 +164,18 @@ def design_guard(case: DesignCase, *, executor: Executor | None = None) -> Guard
     outer_map = whole_film_map(case.sensor, case.probe, DEFAULT_FORCE_RANGE, executor=executor)
     shares = _estimated_shares(case, inner_map, outer_map, sensors)
 
-    best = np.flatnonzero(shares <= shares.min() + SHARE_TOLERANCE)
-    limits = [PositionLimits.of(replace(inner_map, sensor=sensors[number]), case) for number in best]
-    order = np.argsort([limit.rms for limit in limits], kind="stable")[:MAX_CHECKED]
+    # Sort the sensors with nearly the smallest share by their position limits.
+    largest_share = shares.min() + SHARE_TOLERANCE
+    candidates = np.flatnonzero(shares <= largest_share)
+    limits = [PositionLimits.of(replace(inner_map, sensor=sensors[index]), case) for index in candidates]
+    order = np.argsort([limit.rms for limit in limits], kind="stable")
+
+    # The shares are estimates. Check the best sensors by a full search until one confirms its estimate.
     results: list[tuple[MirrorRegion, Sensor]] = []
-    for number in track(best[order].tolist(), "computing mirror regions"):
-        region = _mirror_region(case, inner_map, outer_map, sensors[number])
-        results.append((region, sensors[number]))
-        if region.total_share <= shares.min() + SHARE_TOLERANCE:
+    for index in track(candidates[order[:MAX_CHECKED]].tolist(), "computing mirror regions"):
+        region = _mirror_region(case, inner_map, outer_map, sensors[index])
+        results.append((region, sensors[index]))
+        if region.total_share <= largest_share:
             break
     region_after, sensor = min(results, key=lambda result: result[0].total_share)
     return GuardDesign(

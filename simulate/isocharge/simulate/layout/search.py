@@ -272,7 +272,7 @@ class Search:
         log_error = self._log_errors_of_rows(np.concatenate([new_rows, kept_rows], axis=1), selection)
         derivatives = []
         for coordinate in range(2 * n_new):
-            square = coordinate // 2
+            square = coordinate // 2  # x and y of a square are two successive coordinates
             changed_rows = new_rows.copy()
             changed_rows[:, square] = moved_rows[:, coordinate]
             all_changed_rows = np.concatenate([changed_rows, kept_rows], axis=1)

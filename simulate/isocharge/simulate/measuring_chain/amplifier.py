@@ -171,10 +171,14 @@ class Measurement:
 
     def __post_init__(self) -> None:
         """Draw the initial temperatures, and set all charges to their stationary values at these temperatures."""
-        # The temperature of the film has the standard deviation `temperature_rms`, and that of the air a larger one.
-        common, independent = self.amplifier.temperature_rms * self.rng.standard_normal(2)
+        amplifier = self.amplifier
+
+        # Draw correlated temperatures of the air and the film. The film has the standard deviation `temperature_rms`.
+        # The low-pass filter of the film reduces the standard deviation of the air by the factor `correlation`, which
+        # is also the correlation of the two stationary temperatures.
+        common, independent = amplifier.temperature_rms * self.rng.standard_normal(2)
         variance_ratio = self._variance_ratio
-        correlation = math.sqrt(variance_ratio)  # between the stationary temperatures of the film and the air
+        correlation = math.sqrt(variance_ratio)
         self._air_temperature = common / correlation
         self._film_temperature = correlation * common + math.sqrt(1.0 - variance_ratio) * independent
 
@@ -182,9 +186,11 @@ class Measurement:
         self._touch_charge = np.zeros_like(self.gain)
         self._relaxation = np.zeros((CREEP_TIMES.size + 1, 1, self.gain.size))
         self._output = np.zeros_like(self.gain)
-        if math.isfinite(self.amplifier.tau):
+        has_leak = math.isfinite(amplifier.tau)
+        if has_leak:
+            # In the stationary state, output = decay * output + bias / rate for each channel.
             decay = np.exp(-1.0 / (self.rate * self.tau))
-            self._output = self.bias / (1.0 - decay) / self.rate  # the bias current balances the leak
+            self._output = self.bias / (1.0 - decay) / self.rate
 
     def __call__(self, charge: Array, charge_per_K: Array | None = None) -> Array:
         """Simulate the readings of the next block of touch charges.
@@ -221,20 +227,21 @@ class Measurement:
         Returns:
             Charges with creep and thermoelastic effect, same shape, pC.
         """
-        chain = self.amplifier
-        if not chain.creep and not chain.thermoelastic:
+        amplifier = self.amplifier
+        if not amplifier.creep and not amplifier.thermoelastic:
             return charge
         changes = np.diff(charge, axis=0, prepend=self._touch_charge[np.newaxis])
         self._touch_charge = charge[-1]
 
-        time_constants = np.append(CREEP_TIMES, chain.film_time)
-        creep_amplitudes = np.full(CREEP_TIMES.size, 0.5 * chain.creep)
-        amplitudes = np.append(creep_amplitudes, chain.thermoelastic)
-        # With this factor, the charge is equal to the touch charge one second after the touch.
-        factor = 1.0 - 0.5 * chain.creep * np.exp(-1.0 / CREEP_TIMES).sum()
+        time_constants = np.append(CREEP_TIMES, amplifier.film_time)
+        creep_amplitudes = np.full(CREEP_TIMES.size, 0.5 * amplifier.creep)  # two terms per decade
+        amplitudes = np.append(creep_amplitudes, amplifier.thermoelastic)
+        # With this factor, the charge with creep is equal to the touch charge one second after the touch.
+        factor = 1.0 - 0.5 * amplifier.creep * np.exp(-1.0 / CREEP_TIMES).sum()
         relaxed: Array = factor * charge
         for index, (time_constant, amplitude) in enumerate(zip(time_constants, amplitudes, strict=True)):
             decay = math.exp(-1.0 / (self.rate * time_constant))
+            # exponential[n] = decay * exponential[n - 1] + amplitude * changes[n]
             exponential, self._relaxation[index] = scipy.signal.lfilter(
                 [amplitude], [1.0, -decay], changes, axis=0, zi=self._relaxation[index]
             )
@@ -257,25 +264,27 @@ class Measurement:
         Returns:
             Temperature, shape (n,), K.
         """
-        chain = self.amplifier
-        air_decay = math.exp(-1.0 / (self.rate * chain.temperature_time))
-        film_decay = math.exp(-1.0 / (self.rate * chain.film_time))
+        amplifier = self.amplifier
+        air_decay = math.exp(-1.0 / (self.rate * amplifier.temperature_time))
+        film_decay = math.exp(-1.0 / (self.rate * amplifier.film_time))
 
-        # Drift of the air. The innovations are scaled so that the temperature of the film has the standard deviation
-        # `temperature_rms`.
-        innovation_std = math.sqrt((1.0 - air_decay * air_decay) / self._variance_ratio) * chain.temperature_rms
+        # Drift of the air: drift[n] = air_decay * drift[n - 1] + innovations[n]. The innovations are scaled such that
+        # the temperature of the film has the standard deviation `temperature_rms`.
+        innovation_std = math.sqrt((1.0 - air_decay * air_decay) / self._variance_ratio) * amplifier.temperature_rms
         innovations = innovation_std * self.rng.standard_normal(time.size)
         air_start = [air_decay * self._air_temperature]
-        drift = scipy.signal.lfilter([1.0], [1.0, -air_decay], innovations, zi=air_start)[0]
+        drift, _ = scipy.signal.lfilter([1.0], [1.0, -air_decay], innovations, zi=air_start)
 
         # Trapezoidal change of the temperature of the air: ramp up, constant value, ramp down
-        time_since_step = time - chain.step_at
-        time_until_end = chain.step_for - time_since_step
-        relative_step = np.clip(np.minimum(time_since_step, time_until_end) / chain.step_time, 0.0, 1.0)
-        air = drift + chain.step * relative_step
+        time_since_step = time - amplifier.step_at
+        time_until_end = amplifier.step_for - time_since_step
+        relative_step = np.clip(np.minimum(time_since_step, time_until_end) / amplifier.step_time, 0.0, 1.0)
+        air = drift + amplifier.step * relative_step
 
+        # Low-pass filter of the film: film[n] = film_decay * film[n - 1] + (1 - film_decay) * air[n]
         film_start = [film_decay * self._film_temperature]
-        film: Array = scipy.signal.lfilter([1.0 - film_decay], [1.0, -film_decay], air, zi=film_start)[0]
+        film: Array
+        film, _ = scipy.signal.lfilter([1.0 - film_decay], [1.0, -film_decay], air, zi=film_start)
         self._air_temperature = float(drift[-1])
         self._film_temperature = float(film[-1])
         return film
@@ -293,11 +302,14 @@ class Measurement:
         self._film_charge = film_charge[-1]
         bias_charge = self.bias / self.rate  # charge of the bias current between two readings
         inputs = self.gain * changes + bias_charge
+
+        # Each channel has its own time constant: output[n] = decay * output[n - 1] + inputs[n]
         decays = np.exp(-1.0 / (self.rate * self.tau))
         output = np.empty_like(inputs)
         for channel, decay in enumerate(decays):
             start = [decay * self._output[channel]]
-            output[:, channel] = scipy.signal.lfilter([1.0], [1.0, -decay], inputs[:, channel], zi=start)[0]
+            channel_output, _ = scipy.signal.lfilter([1.0], [1.0, -decay], inputs[:, channel], zi=start)
+            output[:, channel] = channel_output
         self._output = output[-1]
         return output
 
