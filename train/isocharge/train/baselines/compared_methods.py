@@ -244,6 +244,7 @@ def polynomial_ridge(task: FittingTask) -> ComparedMethod:
         for degree in range(1, max(POLYNOMIAL_DEGREES) + 1)
         if comb(n_electrode + degree, degree) <= MAX_MONOMIALS
     ]
+    # Try the two largest degrees of the list that are allowed.
     degrees = [degree for degree in POLYNOMIAL_DEGREES if degree in allowed][-2:] or [max(allowed)]
     regressor = on_logarithms(
         task.domain,

@@ -23,8 +23,10 @@ MAX_ATTEMPTS = 3
 """Largest number of searches for one press."""
 
 RESTART_THRESHOLD = 12.0
-"""Sum of squared residuals above which another start is tried. Noise alone rarely exceeds it, with three or four
-charges."""
+"""Sum of squared residuals above which another start is tried.
+
+Noise alone rarely exceeds it, with three or four charges.
+"""
 
 BATCH = 512
 """Number of presses that are searched at once. The polynomials of a batch fit into the processor's cache."""
@@ -63,7 +65,7 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         if self.charge_map is not None:
             self.map_ = self.charge_map
         else:
-            names = tuple(str(number) for number in range(charge.shape[1]))
+            names = tuple(str(electrode_index) for electrode_index in range(charge.shape[1]))
             train, validation = split_by_position(presses, VALIDATION_FRACTION, self.seed)
             self.map_ = ChargeField.fit(self.domain, names, train, validation)
         # The search for a contact starts at the start with the most similar charges.
@@ -95,7 +97,8 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
             remaining = np.flatnonzero(square_sum > RESTART_THRESHOLD)
             if not remaining.size:
                 break
-            _, nearest = self.tree_.query(features[remaining], [attempt])
+            # The first attempt begins at the nearest start, the second at the next nearest start, and so on.
+            _, nearest = self.tree_.query(features[remaining], [attempt])  # indices of starts, shape (n, 1)
             start = self.starts_[nearest[:, 0]]
             solution, residual = explain(self.map_, charge[remaining], sigma[remaining], start)
             solution_square_sum = (residual**2).sum(axis=1)

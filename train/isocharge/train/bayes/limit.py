@@ -1,9 +1,10 @@
 """The Bayes limit, which is the error of the posterior mean. No estimator has a smaller mean squared error.
 
+The limit depends on the film, the probe, the noise and the range of presses.
+
+Example:
     problem = BayesProblem(load_sensor("three-25um-biaxial"), Circle(1.0), radius=8.0, force_range=(0.05, 2.0))
     print(bayes_limit(problem).position_rms_mm)
-
-The limit depends on the film, the probe, the noise and the range of presses.
 """
 
 from concurrent.futures import Executor

@@ -160,7 +160,7 @@ def _grid(count: int, step: float) -> Array:
 
 
 def _overlaps_disk(centre: Array, side: float, radius: float) -> Booleans:
-    """Return which squares with centres of shape (n, 2) overlap the disk around the origin, shape (n,)."""
+    """Return which squares overlap the disk around the origin, shape (n,). Centres have the shape (n, 2), mm."""
     nearest_point = np.maximum(np.abs(centre) - 0.5 * side, 0.0)  # of each square to the origin, up to signs
     return np.asarray(np.hypot(nearest_point[:, 0], nearest_point[:, 1]) < radius)
 
@@ -234,6 +234,7 @@ class Posterior:
     def _roots(self) -> _RootCells:
         """Cells of the coarsest division, with the charges at their centres and the largest slopes within each cell."""
         cells = Cells.roots(self.radius)
+        # The slopes are computed at 3 x 3 points of each cell.
         points = (cells.centre[:, None] + _grid(3, 0.5 * cells.side)).reshape(-1, 2)
         slopes = self.charges.scaled_gradients(onto_disk(points, self.radius))
         point_slope = np.linalg.norm(slopes, axis=-1).max(axis=1)

@@ -280,11 +280,9 @@ def _read_coefficients(
         ("coefficients", coefficients, LARGEST_COEFFICIENT),
         ("std", std, LARGEST_STD),
     ):
-        number = int(np.abs(values).argmax())
-        if abs(values[number]) > largest:
-            raise PressError(
-                f"{path}: discrepancy.{key}[{number}]: expected at most {largest:g}, got {values[number]:g}"
-            )
+        index = int(np.abs(values).argmax())
+        if abs(values[index]) > largest:
+            raise PressError(f"{path}: discrepancy.{key}[{index}]: expected at most {largest:g}, got {values[index]:g}")
     if not np.allclose(std[: parameter_std.size], parameter_std, rtol=1e-6, atol=1e-12):
         raise PressError(
             f"{path}: discrepancy.std: expected the standard deviations of the parameters, over those of the prior, in "

@@ -44,7 +44,7 @@ CLOSED_BACK_CAUTION = (
 
 
 def has_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> bool:
-    """Return whether films with a closed back explain the presses far better than films with a vented back.
+    """Return whether films with a closed back explain the presses much better than films with a vented back.
 
     Args:
         presses: The presses. Those without a place or a force are not used.

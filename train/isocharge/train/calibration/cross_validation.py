@@ -80,8 +80,8 @@ def cross_validate(
     contact = np.empty((len(presses), 3))
     std = np.empty((len(presses), 3))
     misfit = np.empty((len(presses), 1))
-    for number in range(FOLD_COUNT):
-        is_held_out = fold == number
+    for fold_index in range(FOLD_COUNT):
+        is_held_out = fold == fold_index
         is_fitted = _thinned(~is_held_out & ~posterior.bad)
         with threadpool_limits(1):  # many small matrices, for which a second thread only waits
             film = refit_film(
@@ -91,6 +91,7 @@ def cross_validate(
         contact[is_held_out], std[is_held_out], misfit[is_held_out] = answers
     force_std_N = presses.force_std * presses.contact[:, 2]
     measured_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, force_std_N])
+    # The difference between estimated and measured contacts has the errors of both.
     std = np.hypot(std, measured_std)
     return HeldOutAnswers(
         LabelledPresses(presses.contact[is_judged], presses.charge_pC[is_judged], measured=True),

@@ -280,7 +280,7 @@ def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterat
     charge = presses.charge_pC
     electrodes = presses.electrodes
     for order in _fitting_orders(presses, charges):
-        swapped = ", ".join(electrodes[number] for number in order)
+        swapped = ", ".join(electrodes[electrode_index] for electrode_index in order)
         sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {swapped}"
         yield Correction(sentence, contact, charge[:, np.argsort(order)])
     for description, matrix in AXES:

@@ -348,7 +348,7 @@ class FilmCharges:
     def _load_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
         """Compute the derivatives of ln(factor of modes and traces) with respect to pretension, ln E and ln h.
 
-        The factor depends on F / (E h a) and T / E only, as the charges do, so that two finite differences determine
+        Like the charges, the factor depends only on F / (E h a) and T / E. Two finite differences therefore determine
         all three derivatives.
 
         Args:

@@ -41,6 +41,7 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
     pretension = problem.prior.index("pretension")
     covariance = estimate.unknown_covariance
     by_pretension = covariance[:, pretension] / covariance[pretension, pretension]
+    # The covariance of the unknowns at a given pretension is that of all unknowns less the part due to the pretension.
     root = _root(covariance - np.outer(by_pretension, covariance[pretension]))
 
     sensitivity = result.sensitivity
@@ -49,6 +50,7 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
     _, sizes, combinations = np.linalg.svd(misfit.reshape(-1, len(covariance)) @ root, full_matrices=False)
     is_visible = sizes > LEAST_MISFIT * np.sqrt(len(misfit))
     visible = combinations[is_visible][:MAX_DIRECTIONS]
+    # Sum over the unknowns u, for each contact n, direction k and electrode e
     log_changes = np.einsum("neu,ku->nke", sensitivity.log_charge_jacobian[:, :, unknowns], visible @ root.T)
     mean_by_pretension = visible @ np.linalg.pinv(root) @ by_pretension
     return FilmDirections(

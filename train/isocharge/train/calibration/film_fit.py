@@ -1,8 +1,8 @@
 """Robust estimation of the film that explains measured presses.
 
-`FitProblem` solves the least-squares problem. A press whose residual is larger than noise can explain gets a lower
-weight (Student's t distribution, Lange et al. 1989), so that a single bad press does not change the film. Presses whose
-residuals are still too large are then left out and reported.
+`FitProblem` solves the least-squares problem. If the residual of a press is larger than noise explains, the press gets
+a lower weight (Student's t distribution, Lange et al. 1989). A single bad press therefore does not change the film.
+Presses whose residuals are still too large are then left out and reported.
 """
 
 from dataclasses import dataclass, field, replace
@@ -148,7 +148,8 @@ def fit_film(
     solved = problem.solve(data, is_kept, problem.mean, Hypothesis())
     if len(data) >= MIN_PRESSES_TO_JUDGE and _is_suspicious(solved.contacts.chi2, degrees_of_freedom):
         is_kept, start = _agreeing_presses(problem, data, solved, degrees_of_freedom)
-        solved = problem.solve(data[is_kept], is_kept[is_kept], start, Hypothesis())
+        kept = data[is_kept]
+        solved = problem.solve(kept, np.ones(len(kept)), start, Hypothesis())
     settled = problem.settle(data, is_kept, degrees_of_freedom, solved, Hypothesis())
 
     # If the film has imperfections, the presses that were left out may be good ones. The film is fitted to all presses

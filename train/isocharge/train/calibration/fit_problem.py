@@ -162,7 +162,10 @@ class FitProblem:
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the unknowns, each of shape (n_unknown,); infinite except for parameters."""
+        """Lower and upper bounds of the unknowns, each of shape (n_unknown,).
+
+        The bounds of parameters are in units of their prior standard deviations. All other unknowns are unbounded.
+        """
         lower = np.full(self.layout.count, -np.inf)
         upper = np.full(self.layout.count, np.inf)
         parameter_lower, parameter_upper = self.charges.prior.bounds
@@ -194,11 +197,14 @@ class FitProblem:
             The latest film is stored, because SciPy evaluates the residuals and the derivatives of each film
             separately.
             """
-            if latest and np.array_equal(latest[0][0], active_unknowns):
-                return latest[0][1]
+            start_of_contacts = None
+            if latest:
+                [(latest_unknowns, latest_film)] = latest
+                if np.array_equal(latest_unknowns, active_unknowns):
+                    return latest_film
+                start_of_contacts = latest_film.contacts.contact
             unknowns = self.mean.copy()
             unknowns[active] = active_unknowns
-            start_of_contacts = latest[0][1].contacts.contact if latest else None
             film = SolvedFilm(unknowns, self.adjusted_contacts(unknowns, data, start_of_contacts))
             latest[:] = [(active_unknowns.copy(), film)]
             return film
@@ -249,20 +255,27 @@ class FitProblem:
             hypothesis: Hypothesis of the first round.
         """
         if hypothesis != Hypothesis():
-            solved = self.solve(data[is_kept], is_kept[is_kept], solved.unknowns, hypothesis)
-        for remaining_rounds in reversed(range(MAX_ROUNDS)):
+            solved = self._solve_kept(data, is_kept, solved.unknowns, hypothesis)
+        for round_index in range(MAX_ROUNDS):
+            is_last_round = round_index == MAX_ROUNDS - 1
             mixture = self.mixture(data[is_kept], solved)
+            # Distance from the film at which the residuals are linearised to the estimate of the linear model.
             step = self.mean + mixture.mean - solved.unknowns
             is_step_small = np.abs(step[self.layout.parameters]).max() < MAX_LINEAR_STEP
             kept_next = is_kept
             if not is_kept.all():
                 kept_next = is_kept | self.agrees(data, solved, mixture, degrees_of_freedom)
             is_selection_stable = np.array_equal(kept_next, is_kept)
-            if remaining_rounds == 0 or (is_step_small and is_selection_stable):
+            if is_last_round or (is_step_small and is_selection_stable):
                 break
             is_kept = kept_next
-            solved = self.solve(data[is_kept], is_kept[is_kept], solved.unknowns, mixture.best)
+            solved = self._solve_kept(data, is_kept, solved.unknowns, mixture.best)
         return SettledFit(is_kept, solved, mixture)
+
+    def _solve_kept(self, data: PressData, is_kept: Booleans, start: Array, hypothesis: Hypothesis) -> SolvedFilm:
+        """Fit the film to the presses that are kept, all with the weight 1; see `solve`."""
+        kept = data[is_kept]
+        return self.solve(kept, np.ones(len(kept)), start, hypothesis)
 
     def agrees(self, data: PressData, solved: SolvedFilm, mixture: Mixture, degrees_of_freedom: Array) -> Booleans:
         """Return which presses agree with a film, given its uncertainty, shape (n,).
@@ -421,6 +434,7 @@ def _most_probable_within(bounds: tuple[Array, Array], mean: Array, covariance: 
         farthest = int(np.abs(excess).argmax())
         if abs(excess[farthest]) < BOUND_TOLERANCE:
             break
+        # Change of each unknown for a change of 1 of the unknown that is moved onto its bound.
         regression = covariance[:, farthest] / covariance[farthest, farthest]
         unknowns = unknowns - excess[farthest] * regression
         covariance = covariance - np.outer(regression, covariance[farthest])

@@ -245,7 +245,7 @@ def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> Calibr
             f"{path}: expected a calibration that contains the change of the film with temperature, got one without; "
             "calibrate with presses that have a column temperature_C and cover a few degrees"
         )
-    version = "/".join(path.parts[-3:-1])
+    version = "/".join(path.parts[-3:-1])  # folder of the model and number of the version, which contain the file
     moved = f"moved from {film.warming.at_C:.1f} C, {version}, to {to_C:.1f} C by the change in its calibration"
     return film_without_presses(replace(problem, earlier=film), film.at_temperature(to_C, problem.prior), moved)
 

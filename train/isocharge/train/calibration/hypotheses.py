@@ -41,7 +41,7 @@ NEGLIGIBLE_PROBABILITY = 1e-7
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A combination of effects that a session may have besides the parameters of the film.
+    """A combination of effects that the presses of a session may contain in addition to those of the film's parameters.
 
     Attributes:
         modes: Size of the modes relative to those of typical films, dimensionless.

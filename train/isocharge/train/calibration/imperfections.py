@@ -68,6 +68,7 @@ def trace_lines(sensor: Sensor) -> Array:
         Points (x, y), shape (n_electrode, n_line, 2, 2), mm.
     """
     end_radius = TRACE_END * sensor.film.radius
+    # Points and directions in the plane are complex numbers x + i y, with one row for each electrode.
     centre = np.array([complex(*electrode.centre) for electrode in sensor.electrodes])[:, None]
     areas = [area_of(np.array(electrode.corners)) for electrode in sensor.electrodes]
     pad_radius = np.sqrt(np.array(areas) / np.pi)[:, None]
@@ -94,6 +95,7 @@ def trace_charges(forward_map: ForwardMap, lines: Array, contact: Array) -> Arra
     n_electrode = len(lines)
     points = ReadoutPoints.along(forward_map.sensor, lines)
     charge_per_mm = forward_map.field_charges(contact, EVEN_FIELD, points)
+    # Shape (n, n_electrode of the trace, 1, n_line), which is multiplied by (n_electrode of the trace, n_electrode, 1)
     line_charge = TRACE_STD_MM * charge_per_mm.reshape(len(contact), n_electrode, 1, -1)
     is_own_electrode = np.eye(n_electrode)[:, :, None]
     return np.asarray((line_charge * is_own_electrode).reshape(len(contact), n_electrode, -1))

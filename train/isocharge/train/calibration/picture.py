@@ -28,25 +28,28 @@ NEIGHBOURS = 12
 def calibration_picture(result: CalibrationResult) -> Figure:
     """Draw maps of the remaining error, the quantities in units of their prior, and the residuals of the presses."""
     figure = new_figure(11.0, 8.8)
-    (before, after), (identified, residuals) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
-    then, now = (
-        ("before it was moved", "moved to another temperature")
-        if result.moved
-        else ("before the presses", f"after {len(result.presses)} presses")
-    )
-    _draw_error(before, result, result.error_left_before, then)
-    shades = _draw_error(after, result, result.error_left, now)
+    (before_axes, after_axes), (quantity_axes, residual_axes) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
+    if result.moved:
+        before_title = "before it was moved"
+        after_title = "moved to another temperature"
+    else:
+        before_title = "before the presses"
+        after_title = f"after {len(result.presses)} presses"
+    _draw_error(before_axes, result, result.error_left_before, before_title)
+    shades = _draw_error(after_axes, result, result.error_left, after_title)
     contact = result.posterior.contact
     bad = result.posterior.bad
-    after.plot(*contact[~bad, :2].T, "o", color="white", mec=INK, ms=6, label="presses")
+    after_axes.plot(*contact[~bad, :2].T, "o", color="white", mec=INK, ms=6, label="presses")
     if bad.any():
-        after.plot(*contact[bad, :2].T, "X", color=FELT, mec=INK, ms=9, label="left out")
+        after_axes.plot(*contact[bad, :2].T, "X", color=FELT, mec=INK, ms=9, label="left out")
     if len(contact):
-        after.legend(loc="upper right", fontsize=8)
+        after_axes.legend(loc="upper right", fontsize=8)
     label = "position error by the film (rms), mm"
-    figure.colorbar(shades, ax=[before, after], label=label, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g")
-    _draw_quantities(identified, result)
-    _draw_residuals(residuals, result)
+    figure.colorbar(
+        shades, ax=[before_axes, after_axes], label=label, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g"
+    )
+    _draw_quantities(quantity_axes, result)
+    _draw_residuals(residual_axes, result)
     figure.suptitle(f"calibration of {result.film[0].name}", fontsize=13)
     return figure
 

@@ -1,10 +1,11 @@
 """CSV file of a press session, with a second file that states on which sensor the presses are made.
 
-    presses.csv                  the measured presses; the whole file is replaced after each press
-    .presses.csv.session.json    sensor and probe of the session; locked by the process that takes presses
+The file `presses.csv` contains the measured presses, and is replaced as a whole after each press. The file is therefore
+complete at any time, so that an interrupted session can be continued.
 
-The file of presses is complete at any time, so that an interrupted session can be continued. The second file prevents
-a session from being continued with another sensor or probe, and prevents two processes from writing to the same file.
+The file `.presses.csv.session.json` contains the sensor and the probe of the session. It prevents a session from being
+continued with another sensor or probe. The process that takes presses locks this file, so that no other process writes
+to the file of presses.
 """
 
 import json

@@ -140,7 +140,7 @@ class FilmEstimate:
         """Return the estimate of the film at another temperature.
 
         Only the pretension changes, in proportion to the change of the temperature. If `warming` is None, the
-        temperature of the estimate is unknown, and the estimate is returned unchanged.
+        temperature of the estimate is unknown. The estimate is then returned unchanged.
 
         Args:
             at_C: The other temperature, degrees Celsius.

@@ -89,6 +89,13 @@ def read_answer(text: str) -> Answer:
     return Answer("take", contact)
 
 
+def _with_unknown(temperatures_C: Array | None) -> Array | None:
+    """Append an unknown temperature to those of earlier presses. None means that no temperatures are measured."""
+    if temperatures_C is None:
+        return None
+    return np.append(temperatures_C, np.nan)
+
+
 def _cell_value(cell: str) -> float:
     """Return the number in a cell; NaN if the value is unknown.
 
@@ -189,12 +196,6 @@ class PressSession:
         """
         self.check(contact)
         presses = self.presses
-        temperature_C = presses.temperature_C
-        if temperature_C is not None:
-            temperature_C = np.append(temperature_C, np.nan)
-        film_temperature_C = presses.film_temperature_C
-        if film_temperature_C is not None:
-            film_temperature_C = np.append(film_temperature_C, np.nan)
         self._change(
             replace(
                 presses,
@@ -202,8 +203,8 @@ class PressSession:
                 charge_pC=np.vstack([presses.charge_pC, charge]),
                 position_std_mm=np.append(presses.position_std_mm, self._stds["position_std_mm"]),
                 force_std=np.append(presses.force_std, self._stds["force_std"]),
-                temperature_C=temperature_C,
-                film_temperature_C=film_temperature_C,
+                temperature_C=_with_unknown(presses.temperature_C),
+                film_temperature_C=_with_unknown(presses.film_temperature_C),
                 lines=(*presses.lines, len(presses) + 1),
             )
         )

@@ -143,9 +143,12 @@ class SideForces:
         covariance = np.zeros((len(contact), 3, 3))
         if self._coefficient > 0.0:
             friction_charge = self.side_force_map.friction_charges(contact, self._coefficient)
+            # Contacts have the friction of the presses or none, and the model assumes half of it. The root-mean-square
+            # difference contains half of the friction and the uncertainty of the coefficient.
             relative_std = float(np.sqrt(0.25 + 0.5 * (self.friction.std / self._coefficient) ** 2))
             covariance += _outer(sensitivity.charge_gain, relative_std * friction_charge)
         if self.share > 0.0:
+            # A force in an unknown direction has half of its variance along each of the two axes.
             side_force_std = self.share * contact[:, 2, None] / np.sqrt(2.0)
             jacobian = self.side_force_map.jacobian(contact)
             for component in range(2):

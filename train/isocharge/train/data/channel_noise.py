@@ -169,6 +169,7 @@ class LocalPlanes:
         distance, neighbours = cKDTree(unit).query(unit, NEIGHBOURS + 1)
         neighbours = neighbours[:, 1:]  # the nearest point is the press itself
         offsets = unit[neighbours] - unit[:, None]
+        # The constant and the offsets of the neighbours, shape (n, NEIGHBOURS, 1 + number of coordinates)
         columns = np.concatenate([np.ones((*neighbours.shape, 1)), offsets], axis=2)
         solver = np.linalg.pinv(columns)
         coefficients = solver @ values[neighbours]
@@ -229,6 +230,7 @@ def _variance(value: Array, residual: Array) -> tuple[float, float]:
     columns = np.stack([np.ones_like(value), value**2], axis=1)
     mean_square = np.mean(residual**2)
     smallest_variance = 1e-12 * mean_square + 1e-30
+    # Both columns are scaled to the root mean square 1, because the squared charges may be very large or small.
     column_scale = np.sqrt(np.maximum((columns**2).sum(axis=0), 1e-30)) / np.sqrt(len(value))
     variances = np.array([mean_square, 0.0])
     for _ in range(ROUNDS):

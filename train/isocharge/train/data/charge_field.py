@@ -250,6 +250,7 @@ def fit_series(unit: Array, target: Array, degree: int, force_degree: int) -> Ar
     moment = np.zeros((n_term, target.shape[1]))
     for rows in np.array_split(np.arange(len(unit)), len(unit) // CHUNK_SIZE + 1):
         position_terms, force_terms = chebyshev_terms(unit[rows], degree, force_degree)
+        # Each column is the product of a polynomial in the position and a polynomial in the force.
         columns = (position_terms[:, :, None] * force_terms[:, None, :]).reshape(len(rows), -1)
         normal += columns.T @ columns
         moment += columns.T @ target[rows]
@@ -307,6 +308,7 @@ def invertible_domain(
     has_little_noise = field.error < MAX_ERROR_WITHOUT_NOISE
     fold_radius = _fold_radius(field, noise)
     if field.error > MAX_ERROR_OF_CERTAIN_FOLD:
+        # The fold may be an error of the fit, so it is only reported, and only if it lies well inside the domain.
         credible_ratio = CREDIBLE_FOLD_RATIO if has_little_noise else CREDIBLE_FOLD_RATIO_WITH_NOISE
         if fold_radius < credible_ratio * requested.radius:
             return requested, (_uncertain_fold_caution(fold_radius, requested.radius),)

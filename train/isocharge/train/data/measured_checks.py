@@ -159,11 +159,12 @@ def _check_independence(channels: Mapping[str, Array]) -> None:
             channels that contribute to its singular vector.
     """
     charge = np.column_stack(list(channels.values()))
-    charge = charge / usual_size(charge)
-    standardised = (charge - charge.mean(axis=0)) / charge.std(axis=0)
+    scaled_charge = charge / usual_size(charge)
+    standardised = (scaled_charge - scaled_charge.mean(axis=0)) / scaled_charge.std(axis=0)
     _, singular_values, directions = np.linalg.svd(standardised, full_matrices=False)
     if singular_values[-1] > LEAST_INDEPENDENCE * singular_values[0]:
         return
+    # The last singular vector contains the coefficients of a combination of the channels that is nearly zero.
     coefficients = np.abs(directions[-1])
     contributes = coefficients > LEAST_PARTICIPATION * coefficients.max()
     dependent = [shown(name) for name, is_dependent in zip(channels, contributes, strict=True) if is_dependent]

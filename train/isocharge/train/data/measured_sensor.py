@@ -213,10 +213,10 @@ def _single_boundary(triangles: Integers, n_place: int) -> list[int] | None:
     boundary = [first_place]
     place = neighbours[first_place][0]
     while place != first_place:
-        one, other = neighbours[place]
+        first_neighbour, second_neighbour = neighbours[place]
         previous_place = boundary[-1]
         boundary.append(place)
-        place = other if one == previous_place else one
+        place = second_neighbour if first_neighbour == previous_place else first_neighbour
     return boundary if len(boundary) == len(neighbours) else None
 
 

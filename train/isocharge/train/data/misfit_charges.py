@@ -249,7 +249,7 @@ def _moved_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Arr
 
 
 def _wrong_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Draw gains of which about half are wrong by 15 % (standard deviation), shape (n, n_electrode)."""
+    """Draw gains, shape (n, n_electrode), about half of which are wrong with a standard deviation of 15 %."""
     is_wrong = rng.random(shape) < 0.5
     return np.exp(0.15 * is_wrong * rng.standard_normal(shape))
 

@@ -137,9 +137,12 @@ def split_by_position(presses: LabelledPresses, share: float, seed: int) -> tupl
     Returns:
         The first and the second part.
     """
-    _, position_of_press = np.unique(np.round(presses.contact[:, :2], 6), axis=0, return_inverse=True)
+    # Positions are rounded to 1e-6 mm, so that numerical errors do not separate the presses at one position.
+    rounded_positions = np.round(presses.contact[:, :2], 6)
+    _, position_of_press = np.unique(rounded_positions, axis=0, return_inverse=True)
     position_order = np.random.default_rng(seed).permutation(position_of_press.max() + 1)
     second_count = max(1, round(share * position_order.size))
+    # Some versions of NumPy return `position_of_press` with two axes.
     is_in_second = np.isin(position_of_press.ravel(), position_order[:second_count])
     return presses[~is_in_second], presses[is_in_second]
 

@@ -172,6 +172,6 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
     }
     sketch = {name: files[name] for name in ("isocharge_model.h", "isocharge_model.c", *BOARD_SOURCES)}
     sketch["isocharge_device.h"] = SINGLE_PRECISION + files["isocharge_device.h"]
-    pins = ", ".join(f"A{number}" for number in range(len(metadata.electrodes)))
+    pins = ", ".join(f"A{pin_index}" for pin_index in range(len(metadata.electrodes)))
     sketch[f"{SKETCH}.ino"] = source_text("sketch.ino", pins=pins)
     return files | {f"arduino/{SKETCH}/{name}": text for name, text in sketch.items()}

@@ -60,7 +60,7 @@ class LayerSource:
         """
         n_input, n_output = self.weight.shape
         values, scale = round_to_int8(self.weight)
-        block_names = [f"{self.name}_weights_{number}" for number in range(len(self.blocks))]
+        block_names = [f"{self.name}_weights_{block_index}" for block_index in range(len(self.blocks))]
         named_blocks = list(zip(block_names, self.blocks, strict=True))
         arrays = [c_array(name, values[block]) for name, block in named_blocks]
         if scale is not None:
@@ -96,8 +96,10 @@ def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Bloc
         Blocks of each layer.
     """
     blocks: list[tuple[Block, ...]] = []
-    column = first_width
+    column = first_width  # number of outputs of the present layer that belong to the first perceptron
     for matrix in reversed(weights):
+        # The inputs of the second perceptron follow those of the first perceptron. They begin at the first row with a
+        # weight for the outputs of the second perceptron.
         is_used_by_second = matrix[:, column:].any(axis=1)
         row = int(is_used_by_second.argmax())
         is_block_diagonal = row > 0 and not matrix[row:, :column].any()

@@ -1,15 +1,15 @@
 """The files `isocharge_model.h`, `isocharge_model.c` and `self_test.c` of a model.
 
-The first layer gets the logarithm of one charge and the differences of the other logarithms from it. This is the same
-function of the charges, with less rounding. The charges of a film rise and fall together, and the position changes
-their ratios. A first layer therefore has large weights of both signs on logarithms that are nearly equal, and its sums
-nearly cancel:
+The first layer gets the logarithm of one charge and the differences of the other logarithms from it. The result is the
+same function of the charges, but with smaller rounding errors. The charges of a film rise and fall together, and the
+position changes their ratios. A first layer therefore has large weights of both signs on logarithms that are nearly
+equal, and its sums nearly cancel:
 
     sum_k w_k ln q_k = (sum_k w_k) ln q_0 + sum_k w_k ln(q_k / q_0).
 
-On the right-hand side the subtraction comes first. The difference of two charges within a factor of two is exact
-(Sterbenz 1974), and the logarithm of 1 + (q_k - q_0) / q_0 has all its digits, whereas the logarithm of a charge has
-lost some digits to its magnitude.
+On the right-hand side the subtraction comes first. The difference of two charges is exact if their ratio is at most two
+(Sterbenz 1974). The logarithm of 1 + (q_k - q_0) / q_0 therefore has all its digits. The logarithm of a charge is
+larger, so its last digits are lost in the sums.
 """
 
 from itertools import cycle, islice, pairwise

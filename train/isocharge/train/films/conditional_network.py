@@ -162,8 +162,8 @@ class ConditionalPerceptron(nn.Module):
         psi = evaluate_hidden_layers(context_layers, self.activation, context)
         phi = self.phi(psi).view(len(context), len(self.constant) + 1, N_BASES)
         layers = []
-        for number, (constant, bases, bias) in enumerate(zip(self.constant, self.bases, self.bias, strict=True)):
-            layers.append(Layer(_mix(constant, bases, phi[:, number]), bias(psi)[:, None]))
+        for layer_index, (constant, bases, bias) in enumerate(zip(self.constant, self.bases, self.bias, strict=True)):
+            layers.append(Layer(_mix(constant, bases, phi[:, layer_index]), bias(psi)[:, None]))
         skip = _mix(self.skip, self.skip_bases, phi[:, len(layers)])
         *hidden, last = layers
         return Perceptron(tuple(hidden), last, skip, self.activation)

@@ -131,13 +131,14 @@ def _press_films(
         domain: Contacts.
         presses: Number of presses on each film.
         seed: Seed of the presses.
-        job: Number of the first film, and parameters of the films.
+        job: Index of the first film among all films, and parameters of the films, shape (n_film, n_parameter).
 
     Returns:
         Contacts and then responses of the electrodes, shape (n_film, presses, 1 + n_electrode, 3).
     """
-    start, parameters = job
-    rng = np.random.default_rng([seed, 1, start])
+    first_film, parameters = job
+    # The numbers after the seed make this sequence independent of those of the films and of other jobs.
+    rng = np.random.default_rng([seed, 1, first_film])
     contacts = np.stack([draw_contacts(rng, domain, presses) for _ in parameters])
     responses = [_response(prior, family, *film) for film in zip(parameters, contacts, strict=True)]
     return np.concatenate([contacts[:, :, None], np.stack(responses)], axis=2).astype(np.float32)

@@ -181,6 +181,7 @@ class FilmsModel:
         sensor, probe = self.prior.film(parameters)
         rng = np.random.default_rng(SEED)
         n_train = N_CORRELATION_PRESSES if correlation else N_REGRESSION_PRESSES
+        # The number of drawn contacts is fixed, so that the contacts for training do not depend on `n_test`.
         drawn_contact = draw_contacts(rng, self.domain, N_TEST_PRESSES + N_CORRELATION_PRESSES)
         test_contact = drawn_contact[N_TEST_PRESSES - n_test : N_TEST_PRESSES]
         train_contact = drawn_contact[N_TEST_PRESSES : N_TEST_PRESSES + n_train]

@@ -209,6 +209,7 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
     network = _network_of(model.graph, where)
     expected = list(_plain_nodes(_whole_model(network).graph))
     given = list(_plain_nodes(model.graph))
+    # Compare the nodes before their number, because the first different node is the more helpful message.
     for expected_node, given_node in zip(expected, given, strict=False):
         if expected_node != given_node:
             _refuse(where, f"expected the node {expected_node}, got the node {given_node}")
@@ -230,6 +231,8 @@ def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
     operators = [node.op_type for node in graph.node]
     activation = _activation_of(operators, where)
     constants = _constants_in_order(graph, where)
+    # `write_graph` uses the constants of the features first, then those of the hidden layers, the skip layer, and the
+    # bias and the weights of the last layer.
     try:
         features = _take_features(constants, is_signed=operators[:1] == ["Max"])
         hidden = [Layer(next(constants), next(constants)) for _ in range(operators.count(activation.onnx_operator))]
@@ -251,7 +254,7 @@ def _activation_of(operators: Sequence[str], where: str) -> Activation:
     """
     by_operator = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
     first_layer = operators.index("Gemm") if "Gemm" in operators else len(operators)
-    following = operators[first_layer + 1 : first_layer + 2]
+    following = operators[first_layer + 1 : first_layer + 2]  # one operator, or none at the end of the graph
     for operator in following:
         if operator in by_operator:
             return by_operator[operator]

@@ -1,5 +1,6 @@
 """Measured fraction of presses outside the working area for which a model gives a wrong answer without a flag."""
 
+import math
 from textwrap import fill
 
 import numpy as np
@@ -71,13 +72,15 @@ def unnoticed_section(unnoticed: UnnoticedPresses | None) -> str:
     text = f"## Presses outside the working area\n\n{sentence}\n"
     if unnoticed.total_share < MIN_NAMED_SHARE:
         return text + "\n"
-    step = -(-len(unnoticed.share) // MAX_CARD_ROWS)
     edges = unnoticed.ring_edges_mm
-    areas = np.diff(edges**2)
+    ring_areas = np.diff(edges**2)  # in units of pi
+    ring_count = len(ring_areas)
+    rings_per_row = math.ceil(ring_count / MAX_CARD_ROWS)
     rows = []
-    for start in range(0, len(areas), step):
-        rings = slice(start, start + step)
-        share = np.average(unnoticed.ring_shares[rings], weights=areas[rings])
-        last_edge = edges[min(start + step, len(areas))]
-        rows.append(f"| {edges[start]:.3g} to {last_edge:.3g} mm | {percent_text(float(share))} |\n")
+    for first_ring in range(0, ring_count, rings_per_row):
+        end_ring = min(first_ring + rings_per_row, ring_count)
+        rings = slice(first_ring, end_ring)
+        row_share = np.average(unnoticed.ring_shares[rings], weights=ring_areas[rings])
+        distances = f"{edges[first_ring]:.3g} to {edges[end_ring]:.3g} mm"
+        rows.append(f"| {distances} | {percent_text(float(row_share))} |\n")
     return f"{text}\n| distance from the centre | wrong without a flag |\n|---|---|\n{''.join(rows)}\n"

@@ -1,6 +1,7 @@
 """The report on speed against error. Every method is tested on the same presses and compared with theoretical limits.
 
-The report of the released model of a sensor on the presses of a dataset is written by these lines:
+Example:
+    The function `write_report` needs a dataset and the released model of its sensor.
 
     from isocharge.train.report import write_report
 

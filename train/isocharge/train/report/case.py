@@ -188,7 +188,7 @@ def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
         has_several_angles = bool(np.ptp(angles_deg) > 0.0)
         if not has_several_angles:
             probe = probe.rotated(float(np.deg2rad(angles_deg[0])))
-        elif probe.period > 0.0:
+        elif probe.period > 0.0:  # the angle of an axisymmetric probe, whose period is 0, has no effect
             is_rotated = True
         probes.append(probe)
     return tuple(probes), is_rotated

@@ -104,7 +104,7 @@ def measure_methods(
     methods = [fitted.method for fitted in fitted_methods]
     single_contenders = [Contender(method.name, 1, _single_press_call(method, test)) for method in methods]
     batch_contenders = [_batch_contender(method, test, settings.batch) for method in methods]
-    total_seconds = 2 * len(methods) * settings.seconds
+    total_seconds = 2 * len(methods) * settings.seconds  # for single presses and for batches
     timings = take_turns([*single_contenders, *batch_contenders], total_seconds)
     single_timings = timings[: len(methods)]
     batch_timings = timings[len(methods) :]

@@ -63,8 +63,9 @@ def cost_plot(records: Sequence[MethodRecord], cost: Cost, limits: Mapping[str, 
     Args:
         records: Records of the methods.
         cost: Name of the cost.
-        limits: Theoretical limits of the position error, mm, by name. A limit is drawn as a horizontal line. It is left
-            out if it is larger than all errors, as the limit for unbiased estimators can be.
+        limits: Theoretical limits of the position error, mm, by name. A limit is drawn as a horizontal line.
+            The limit for unbiased estimators can be larger than the errors of all methods without the true force. It is
+            then left out.
 
     Returns:
         Figure with logarithmic axes and the Pareto front.

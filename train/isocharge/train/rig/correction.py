@@ -140,8 +140,9 @@ def fit_correction(residuals: Residuals) -> Correction:
 
     # Average over the hypotheses about the size of the correction, with their probabilities as weights.
     hypotheses = [Hypothesis(discrepancy=size) for size in SIZES]
+    model_without_force_scatter = {0.0: LinearModel(normal, moment, square)}
     mixture = mix_hypotheses(
-        {0.0: LinearModel(normal, moment, square)},
+        model_without_force_scatter,
         lambda hypothesis: hypothesis.discrepancy**2 * np.eye(n_coefficient),
         hypotheses,
     )
