@@ -66,6 +66,8 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
     fitted_Hz: list[float] = []
     if usable_times_s[-1] > SHORTEST_S:
         fitted_Hz = [hum_Hz for hum_Hz in MAINS_HZ if rate_Hz > SAMPLES_PER_PERIOD * hum_Hz]
+
+    # The columns are a constant, a slope, and a cosine and a sine for each frequency of the hum.
     columns = [np.ones_like(usable_times_s), usable_times_s]
     for hum_Hz in fitted_Hz:
         phase = 2.0 * np.pi * hum_Hz * usable_times_s

@@ -93,6 +93,7 @@ def _order_sentence(expected: Mapping[str, str], found: Mapping[str, str]) -> st
 
     if len(electrodes) > 2:
         for places in range(1, len(electrodes)):
+            # This is the order of the electrodes if every channel is connected `places` electrodes too far.
             turned_electrodes = electrodes[places:] + electrodes[:places]
             if assumed_electrodes == turned_electrodes:
                 return f"the channels are turned by {places} of {len(electrodes)} places"

@@ -79,6 +79,7 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     step_direction = steps[rest_blocks] / max(step_size, 1e-30)
     component = levels @ step_direction  # shape (blocks,)
 
+    # A step is the difference between two blocks with one block between them. The press begins in the middle block.
     begin = rest_blocks + 1
     settled = begin + round(SETTLE_S / BLOCK_S)
     end = _end_of_press(component, settled, step_size)

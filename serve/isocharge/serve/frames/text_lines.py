@@ -77,6 +77,7 @@ def parse_line(data: bytes) -> Line:
     text = data.decode("utf-8").strip()
     if not text or text[0] == "#":
         return NO_READING
+    # The first character is tested before the separators, because JSON and Teleplot lines also contain colons.
     if text[0] in "{[":
         return _json(text)
     if text[0] == ">":

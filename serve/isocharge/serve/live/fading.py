@@ -125,6 +125,7 @@ def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
     if creep_fit.squared_residual > MIN_RESIDUAL_RATIO * leak_fit.squared_residual:
         return Fading(tau_s=-1.0 / leak_fit.slope)
 
+    # Creep with a step is tested before creep alone, and is only reported if it fits clearly better than both lines.
     max_squared_residual = min(leak_fit.squared_residual, creep_fit.squared_residual) / MIN_RESIDUAL_RATIO
     creep_and_step = _fit_creep_and_step(held_s, size_pC, max_squared_residual)
     if creep_and_step is not None:

@@ -260,6 +260,6 @@ def replay(
                     due_s = chunk.timestamp + delay_s
                     time.sleep(max(0.0, due_s - time.time()))
                 used_count = len(latencies_us)  # a recording has one latency for each record that was used
-                for number, record in enumerate(stream.feed(chunk)):
-                    if number < used_count:
+                for index, record in enumerate(stream.feed(chunk)):
+                    if index < used_count:
                         yield record

@@ -300,9 +300,12 @@ class Validity:
 
         The result is 0 if the origin is outside the working area.
         """
-        zero = np.zeros(1)
-        if not inside_polygon(zero, zero, self.corners_mm)[0]:
+        origin_x_mm = np.zeros(1)  # `inside_polygon` takes arrays of points, here of one point
+        origin_y_mm = np.zeros(1)
+        is_origin_inside = inside_polygon(origin_x_mm, origin_y_mm, self.corners_mm)[0]
+        if not is_origin_inside:
             return 0.0
+
         # The nearest point of each edge is the projection of the origin onto the edge, limited to the ends of the edge.
         start = self.corners_mm  # shape (edges, 2)
         edge = np.roll(start, -1, axis=0) - start

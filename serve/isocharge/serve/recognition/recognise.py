@@ -146,10 +146,10 @@ def _field_tables(parts: Sequence[Part]) -> list[dict[str, Any]]:
     roles: list[str] = []
     for part in parts:
         roles.append(part.role)
-        number = roles.count(part.role)
+        role_count = roles.count(part.role)  # number of parts with this role so far, including this part
         if part.role == "channel":
-            fields.append({"name": f"ch{number}", "type": part.kind})
-        elif part.role != "pad" and number == 1:
+            fields.append({"name": f"ch{role_count}", "type": part.kind})
+        elif part.role != "pad" and role_count == 1:
             field: dict[str, Any] = {"name": part.name, "type": part.kind}
             if part.scale != 1.0:
                 field["scale"] = part.scale
@@ -213,14 +213,19 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], rate_Hz: float) -> dict[
     """
     last_frame = frames[-1]
     meanings = _meanings(frames, rate_Hz)
+
+    # A header has given names to the columns of a CSV. All names are copied, and those of counter and clock replaced.
     if layout.notation is Notation.csv and layout.names:
         columns = list(layout.names)
         for position, meaning in meanings.items():
             column, _ = layout.columns.channels[position]
             columns[column] = meaning
         return {"columns": columns}
+
+    # If each line contains the names, or no column is a counter or a clock, the names of the columns are not needed.
     if last_frame.names or not meanings:
         return {meaning: last_frame.names[position] for position, meaning in meanings.items()}
+
     column_names = []
     channel_count = 0
     for position in range(len(last_frame.values)):

@@ -285,6 +285,7 @@ class FilmFilter:
         changed_probability = LEVEL_CHANGE_PROBABILITY / level_count * pretension_probability
 
         # After a change of the level, the offset is new, and the other unknowns are averaged over the previous levels.
+        # The mean then has the shape (n_pretension, n_unknown). The covariance depends on the new level.
         level_weight = self._probability / pretension_probability
         changed_mean = (level_weight[..., None] * self._mean).sum(axis=0)
         changed_mean[:, offset] = 0.0
@@ -295,11 +296,12 @@ class FilmFilter:
         changed_covariance[:, :, offset, offset] = self._level_std[:, None] ** 2
 
         self._probability = unchanged_probability + changed_probability
-        changed_share = changed_probability / self._probability
-        mean_share = changed_share[..., None]
-        self._mean = (1.0 - mean_share) * self._mean + mean_share * changed_mean
-        covariance_share = changed_share[..., None, None]
-        self._covariance = (1.0 - covariance_share) * self._covariance + covariance_share * changed_covariance
+        # The probability of a change is broadcast over the axis of the mean and over the two axes of the covariance.
+        changed_weight = changed_probability / self._probability
+        mean_weight = changed_weight[..., None]
+        self._mean = (1.0 - mean_weight) * self._mean + mean_weight * changed_mean
+        covariance_weight = changed_weight[..., None, None]
+        self._covariance = (1.0 - covariance_weight) * self._covariance + covariance_weight * changed_covariance
 
     def _change_pretension(self, elapsed_s: float) -> None:
         """Account for a drift of the pretension, and for a jump to any pretension, which has a small probability.
@@ -336,8 +338,10 @@ class FilmFilter:
 
         self._probability = moments[..., 0]
         normalised = moments / self._probability[..., None]
-        self._mean = normalised[..., 1 : 1 + size]
-        self._covariance = normalised[..., 1 + size :].reshape(level_count, grid_size, size, size)
+        mean_columns = slice(1, 1 + size)
+        covariance_columns = slice(1 + size, None)
+        self._mean = normalised[..., mean_columns]
+        self._covariance = normalised[..., covariance_columns].reshape(level_count, grid_size, size, size)
 
     def update(self, charge_pC: Array, log_changes: Array) -> TouchResiduals:
         """Update the distribution by a touch.

@@ -313,7 +313,8 @@ class FilmFollower:
             peak: Frame with the largest force of the touch.
             clock_s: Time of the touch on a clock that does not jump, s.
         """
-        (log_changes,) = self._directions.log_changes(np.array([peak.contact[:3]]))
+        contacts = np.array([peak.contact[:3]])  # one contact (x, y, force), shape (1, 3)
+        log_changes = self._directions.log_changes(contacts)[0]
         self._filter.predict(clock_s)
         residuals = self._filter.update(peak.charge_pC, log_changes)
         self._touch_count += 1

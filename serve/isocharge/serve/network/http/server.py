@@ -74,15 +74,15 @@ class HttpServer:
         loop = asyncio.get_running_loop()
         is_main_thread = threading.current_thread() is threading.main_thread()
         signals = SIGNALS if is_main_thread else ()  # other threads cannot handle signals
-        for number in signals:
-            loop.add_signal_handler(number, self.stop)
+        for signal_number in signals:
+            loop.add_signal_handler(signal_number, self.stop)
         accepting = loop.create_task(self._accept(loop))
         while not self._is_stopped:
             await asyncio.sleep(TICK_SECONDS)
             close_overdue(self._connections, loop.time())
 
-        for number in signals:
-            loop.remove_signal_handler(number)  # a second Ctrl-C does not wait
+        for signal_number in signals:
+            loop.remove_signal_handler(signal_number)  # a second Ctrl-C does not wait
         for task in (accepting, *self._handshakes):
             task.cancel()
         await asyncio.gather(accepting, *self._handshakes, return_exceptions=True)
@@ -114,6 +114,7 @@ class HttpServer:
                 await asyncio.sleep(TICK_SECONDS)
                 continue
             is_full = len(self._connections) + len(self._handshakes) >= self._limits.connections
+            # A client that has not finished its handshake gives way to the new client.
             if is_full and self._tls is not None and self._handshakes:
                 oldest_handshake = next(iter(self._handshakes))
                 oldest_handshake.cancel()

@@ -237,6 +237,8 @@ def _read_charges(
     press_count, electrode_count = shape
     if press_count > max_presses:
         raise TooLarge(f"input {INPUT!r}: expected at most {max_presses} presses in one request, got {press_count}")
+
+    # The charges are either values in the JSON text, or bytes after this text whose number the request states.
     stated_size = tensor.parameters.binary_data_size
     if stated_size is None and not binary:
         return _from_values(tensor.data, shape, electrodes)
@@ -387,7 +389,7 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
     Raises:
         ModelError: If onnxruntime fails to run the graph.
     """
-    if FLAGS in names:
+    if FLAGS in names:  # the flags are computed from all other outputs
         outputs, unchecked, alarms = infer(loaded, charge_pC, loaded.outputs)
         outputs[FLAGS] = _flags(loaded, outputs)
         return {name: outputs[name] for name in names}, unchecked, alarms
