@@ -103,7 +103,8 @@ def finite_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int |
     array = arrays[name]
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name}: expected real numbers, got an array of {array.dtype}")
-    has_expected_shape = array.ndim == len(shape) and all(
+    has_expected_dimensions = array.ndim == len(shape)
+    has_expected_shape = has_expected_dimensions and all(
         length > 0 and expected in (None, length) for length, expected in zip(array.shape, shape, strict=True)
     )
     if not has_expected_shape:

@@ -61,6 +61,7 @@ def second_thread() -> Iterator[Executor]:
     is_stopped = threading.Event()
 
     def report_until_stopped(title: str, done: int, total: int, note: str) -> None:
+        """Pass the progress on to the listener, or end the running call if the block has raised an exception."""
         if is_stopped.is_set():
             raise CancelledError
         if listener:

@@ -174,6 +174,7 @@ class _StoringExecutor(Executor):
         else:
             computed = self._executor.submit(function, *args, **kwargs)
             computed.add_done_callback(lambda _: self._store(part, computed, stored))
+            # If the caller cancels the future that it holds, the computation is cancelled as well.
             stored.add_done_callback(lambda _: computed.cancel())
         return stored
 
@@ -187,7 +188,8 @@ class _StoringExecutor(Executor):
         """
         if computed.cancelled():
             stored.cancel()
-        if not stored.set_running_or_notify_cancel():
+        is_cancelled = not stored.set_running_or_notify_cancel()  # also if the caller has cancelled it
+        if is_cancelled:
             return
         try:
             result = computed.result()
@@ -264,7 +266,8 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
     draft = ResumableRun(target)
     parents = [parent for parent in target.parents if not parent.exists()]
     try:
-        with _claim(draft, json.loads(json.dumps(identity)), fresh):
+        identity_as_saved = json.loads(json.dumps(identity))  # with lists in place of tuples, as in the saved file
+        with _claim(draft, identity_as_saved, fresh):
             try:
                 draft.prepare()
                 yield draft

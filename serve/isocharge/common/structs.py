@@ -152,6 +152,8 @@ def parse_json(text: str | bytes, where: str, error: type[InputError], kind: typ
         return msgspec.json.decode(text, type=kind)
     except (ValueError, RecursionError) as decoding_error:
         cause = decoding_error
+
+    # Either the text is not JSON, or it is JSON with a content of another type.
     try:
         content = msgspec.json.decode(text)
     except (ValueError, RecursionError):
@@ -261,10 +263,10 @@ def _mistakes_in_parts(value: object, expected_type: Any, path: str) -> Iterator
     elif isinstance(value, list | tuple) and get_origin(expected_type) in (list, tuple):
         item_types = [item_type for item_type in get_args(expected_type) if item_type is not Ellipsis]
         if len(item_types) == 1:
-            item_types = item_types * len(value)
+            item_types = item_types * len(value)  # all items have the same type
         if len(item_types) == len(value):
-            for number, item in enumerate(value[:MAX_EXAMINED_ITEMS]):
-                yield from _mistakes(item, item_types[number], f"{path}[{number}]")
+            for index, item in enumerate(value[:MAX_EXAMINED_ITEMS]):
+                yield from _mistakes(item, item_types[index], f"{path}[{index}]")
 
 
 def _mistakes_in_keys(table: Mapping[str, Any], struct: type[Struct], path: str) -> Iterator[str]:

@@ -23,6 +23,7 @@ def version_attribute(module: str) -> Callable[[str], str]:
     """
 
     def look_up(name: str) -> str:
+        """Return the version for `__version__`, and raise AttributeError for any other name."""
         if name == "__version__":
             return package_version()
         raise AttributeError(f"module {module!r} has no attribute {name!r}")

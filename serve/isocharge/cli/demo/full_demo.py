@@ -236,7 +236,9 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], mode
     model = load_model(find_model(str(model_folder)))
     predictor = Predictor(model.folder)
     charges = press_charges(predictor, model.golden.charge_pC)
-    (latency,) = take_turns(in_process_contenders(predictor, charges)[1:2], LATENCY_S)
+    contenders = in_process_contenders(predictor, charges)
+    one_press_as_list = contenders[1]
+    (latency,) = take_turns([one_press_as_list], LATENCY_S)
     size_KiB = (model.folder / "model.onnx").stat().st_size / 1024
     rows = [
         ("position error, with noise", _position_words(tested)),
@@ -271,8 +273,8 @@ def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array
 
     width_ratios = [1.0] * electrode_count + [1.25]
     *map_axes, error_axes = bottom.subplots(1, electrode_count + 1, width_ratios=width_ratios)
-    for number, (axes, name) in enumerate(zip(map_axes, forward_map.electrodes, strict=True)):
-        draw_charge_map(axes, forward_map, number)
+    for electrode_index, (axes, name) in enumerate(zip(map_axes, forward_map.electrodes, strict=True)):
+        draw_charge_map(axes, forward_map, electrode_index)
         title = f"isocharge contours of {name} at 1 N, pC"
         draw_layout(axes, forward_map.sensor, forward_map.domain.radius, title, highlight=name)
     true_force = tested[:, 2]
@@ -296,6 +298,8 @@ def _draw_live_paths(axes: Any, forward_map: ForwardMap, followed: Array) -> Non
         frames = press_number == number
         axes.plot(*true_xy[frames].T, color=PRESSED, lw=3.0, solid_capstyle="round")
         axes.plot(*estimated_xy[frames].T, color=FELT, lw=0.7)
+
+    # The legend contains only the two lines of the first press.
     true_line, estimated_line = axes.lines[:2]
     true_line.set_label("pressed")
     estimated_line.set_label("estimated")

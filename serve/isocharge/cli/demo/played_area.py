@@ -23,6 +23,8 @@ def played_radius_mm(sensor: str) -> float:
         model = load_model(find_model(sensor))
     except ModelError:
         return DEFAULT_RADIUS
+
+    # The radius is the smallest distance of an edge of the working area from the centre.
     corners = np.array(model.metadata.working_area_mm)
     edges = np.roll(corners, -1, axis=0) - corners
     edge_distance = np.abs(corners[:, 0] * edges[:, 1] - corners[:, 1] * edges[:, 0]) / np.hypot(*edges.T)

@@ -244,6 +244,7 @@ def answering(link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str
     """
 
     def answer_requests() -> None:
+        """Carry out requests until the link is closed, and show each error on the page."""
         while (request := link.wait_for_request()) is not None:
             try:
                 _carry_out(request, link, live, header)

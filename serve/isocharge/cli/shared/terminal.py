@@ -43,11 +43,11 @@ def open_closed_streams() -> None:
     Without this replacement, the next file that is opened would get the file descriptor of stdout, and printed text
     would be written into that file.
     """
-    for number in (0, 1, 2):
+    for descriptor in (0, 1, 2):
         try:
-            os.fstat(number)
+            os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # gets the lowest free file descriptor, which is `number`
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free file descriptor, which is `descriptor`
     if sys.stdin is None:
         sys.stdin = open(0, closefd=False)  # noqa: SIM115
     if sys.stdout is None:

@@ -91,11 +91,11 @@ class NumberColumns:
             error: If a value breaks a rule. The message names the first such row, the column, the rule and the value.
         """
         violations = [rules[name].violations(column) for name, column in self.values.items()]
-        rows_and_columns = np.argwhere(np.column_stack(violations))
+        rows_and_columns = np.argwhere(np.column_stack(violations))  # ordered by rows
         if not rows_and_columns.size:
             return
-        row, column_number = rows_and_columns[0]
-        name = list(self.values)[column_number]
+        row, column_index = rows_and_columns[0]
+        name = list(self.values)[column_index]
         value = _value_text(float(self.values[name][row]))
         raise error(
             f"{where}{self.row_noun} {self.row_numbers[row]}, column {shown(name)}: expected "

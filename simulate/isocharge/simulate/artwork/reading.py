@@ -54,11 +54,15 @@ def read_artwork(path: str | Path, layer: str = "ELECTRODES", back: str = "") ->
         raise SensorError(f"{path}: expected a DXF file: {error}") from error
     scale = conversion_factor(InsertUnits(document.units or InsertUnits.Millimeters), InsertUnits.Millimeters)
     groups = _touching_groups(_polygons(document, layer, scale, path))
+
+    # All electrodes share the polygons of the back.
     back_corners: tuple[Corners, ...] = ()
     if back:
         back_corners = tuple(polygon.corners for polygon in _polygons(document, back, scale, path))
+
     electrodes = []
-    for name, (first_polygon, *other_polygons) in zip(_names(document, groups, scale), groups, strict=False):
+    names = _names(document, groups, scale)  # there may be more names than groups
+    for name, (first_polygon, *other_polygons) in zip(names, groups, strict=False):
         more = tuple(polygon.corners for polygon in other_polygons)
         electrodes.append(Electrode(name, first_polygon.corners, more=more, back=back_corners))
     return tuple(electrodes)

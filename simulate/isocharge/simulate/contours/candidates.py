@@ -218,7 +218,7 @@ class SeedGrid:
             max_count: Largest number of nodes for each press.
 
         Returns:
-            Numbers of the presses and numbers of the nodes, each of shape (m,).
+            Indices of the presses and indices of the nodes, each of shape (m,).
         """
         n_press = len(distance)
         flat_grid = np.full((n_press, self.side**2), np.inf)

@@ -216,10 +216,10 @@ class Triangulation:
         Returns:
             Two starting points for each meeting.
         """
-        any_charge = 0.0  # the slopes do not depend on the charge
-        _, slopes = self._distances(closest.contact, any_charge, fixed=fixed)
-        right_singular_vectors = np.linalg.svd(slopes)[2]
-        weakest_direction = right_singular_vectors[:, -1]
+        any_charge = 0.0  # the derivatives do not depend on the charge
+        _, derivatives = self._distances(closest.contact, any_charge, fixed=fixed)
+        _, _, right_singular_vectors = np.linalg.svd(derivatives)
+        weakest_direction = right_singular_vectors[:, -1]  # of the smallest singular value, shape (n, n_unknown)
         step = SECOND_START_DISTANCE * self.tolerance * weakest_direction
         backward = Candidates.begin(closest.press, self._moved(closest.contact, -step))
         forward = Candidates.begin(closest.press, self._moved(closest.contact, step))
@@ -238,9 +238,10 @@ class Triangulation:
         contact = seeds.contact
         best = seeds
         for _ in range(STEPS):
-            distance, slopes = self._distances(contact, charge[seeds.press], fixed=fixed)
-            best = best.improved(contact, np.sqrt(np.mean(distance**2, axis=1)))
-            contact = self._moved(contact, gauss_newton_step(slopes, distance))
+            distance, derivatives = self._distances(contact, charge[seeds.press], fixed=fixed)
+            rms_distance = np.sqrt(np.mean(distance**2, axis=1))
+            best = best.improved(contact, rms_distance)
+            contact = self._moved(contact, gauss_newton_step(derivatives, distance))
         return best[best.spread <= self.tolerance].distinct(MIN_DISTANCE)
 
     def _cross(self, charge: Array, candidates: Candidates) -> Candidates:
@@ -270,7 +271,7 @@ class Triangulation:
             position_sum[is_meeting] += mean[is_meeting]
             spread[is_meeting] = np.maximum(spread[is_meeting], distance[is_meeting])
             n_meeting += is_meeting
-        position = position_sum / np.maximum(n_meeting, 1)[:, None]
+        position = position_sum / np.maximum(n_meeting, 1)[:, None]  # mean over the triples that meet
         contact = np.column_stack([position, candidates.contact[:, 2]])
         return Candidates(candidates.press, contact, spread)[n_meeting > 0].distinct(MIN_DISTANCE)
 

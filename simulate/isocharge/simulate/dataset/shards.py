@@ -108,8 +108,8 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
     """
     with new_folder(folder) as partial:
         entries = []
-        for number, samples in enumerate(shards):
-            name, data = pack_shard(number, samples, sensor)
+        for index, samples in enumerate(shards):
+            name, data = pack_shard(index, samples, sensor)
             write_whole(partial / name, data)
             entries.append(shard_entry(name, len(samples), data))
         write_manifest(partial, folder.name, sensor, entries, about)

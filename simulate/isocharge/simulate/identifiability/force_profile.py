@@ -47,7 +47,7 @@ class ForceProfile:
         if max_log > min_log:
             log_forces = np.linspace(min_log, max_log, EXPONENT_NODES)
         else:
-            log_forces = np.array([min_log - 1e-3, min_log + 1e-3])
+            log_forces = np.array([min_log - 1e-3, min_log + 1e-3])  # a difference quotient about the single force
         log_sum = np.log(weights(log_forces).sum(axis=1))
         exponent = np.gradient(log_sum, log_forces)
         return cls(weights, (min_log, max_log), log_forces, exponent)

@@ -133,36 +133,36 @@ class Dialogue:
             # A press before the tare would be lost, and each later press would be taken for the one before it.
             self._wait_for(Phase.waiting)
             self._screen.say("The tare is measured. Let the machine begin.")
-            for number, contact in enumerate(contacts[first_row:], start=first_row + 1):
-                self._follow_press(number, contact)
+            for row_number, contact in enumerate(contacts[first_row:], start=first_row + 1):
+                self._follow_press(row_number, contact)
         except SessionEnd as end:
             raise InputError(
                 "the port ended before the last press of the list; run the same command again for the remaining presses"
             ) from end
 
-    def _follow_press(self, number: int, contact: Array) -> None:
+    def _follow_press(self, row_number: int, contact: Array) -> None:
         """Wait for the press of one row of a machine's list, and record it.
 
         A refused press is omitted, because the machine has already moved to the next row.
 
         Args:
-            number: Number of the row.
+            row_number: Number of the row in the list, from 1.
             contact: Contact (x, y, F) of the row, shape (3,), mm and N.
 
         Raises:
             PortLost: If the connection to the board was lost during the press.
         """
-        self._screen.say(f"{number}. {describe_press(contact)}")
+        self._screen.say(f"{row_number}. {describe_press(contact)}")
         event = self._wait_for(Phase.taken, Phase.refused)
         if event.press is not None:
             self._screen.show_steady(event.press)
             self._take(event.press, contact)
         elif event.reason == AWAY:
             raise PortLost(
-                f"{AWAY}; run the same command again, and let the machine continue with row {number} of its list"
+                f"{AWAY}; run the same command again, and let the machine continue with row {row_number} of its list"
             )
         else:
-            self._screen.say(f"   row {number} is left out: {event.reason}")
+            self._screen.say(f"   row {row_number} is left out: {event.reason}")
 
     def _wait_for(self, *phases: Phase) -> WatchResult:
         """Wait for the next reading in one of the given phases. Earlier readings only update the displayed phase."""
@@ -241,7 +241,10 @@ class Dialogue:
             if press is None:
                 self._screen.say("   press first: the question comes when the press is steady")
                 return False
-            return self._take(press, proposed if isinstance(answer.contact, str) else answer.contact)
+            contact = proposed if isinstance(answer.contact, str) else answer.contact  # the text means "as proposed"
+            return self._take(press, contact)
+
+        # The remaining command removes a press: the steady press that is not taken yet, or an earlier press.
         if answer.number == "last" and press is not None:
             self._screen.say("   this press is not taken")
             return True
