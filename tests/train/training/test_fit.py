@@ -18,10 +18,10 @@ from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fit import fit_identity, train_network
 from isocharge.train.training.losses import (
     STD_EXPONENT,
-    correlation_loss,
     distillation_loss,
     focused_squared_distance,
     likelihood_loss,
+    robust_correlation_loss,
     warm_up_loss,
     weighted_likelihood_loss,
 )
@@ -218,7 +218,7 @@ def test_the_loss_of_the_correlations_is_a_likelihood_and_leaves_the_deviations_
     ]
     standard = norm.logpdf(deviation.detach().numpy()[:, 0])
     expected = np.mean(standard - np.array(densities) - np.log(2.0 * np.pi))
-    loss = correlation_loss(angles, deviation)
+    loss = robust_correlation_loss(angles, deviation)
     assert loss.item() == pytest.approx(expected, rel=1e-9)
     assert not loss.requires_grad
 
@@ -226,7 +226,7 @@ def test_the_loss_of_the_correlations_is_a_likelihood_and_leaves_the_deviations_
 def test_the_loss_of_the_correlations_has_small_gradients_where_errors_are_nearly_proportional():
     """Opposite errors of five standard deviations under a correlation of nearly one; a square would give 1e7."""
     angles = torch.tensor([[1.54, 0.0, 0.0]], requires_grad=True)
-    correlation_loss(angles, torch.tensor([[5.0, 5.0, 0.0]])).backward()
+    robust_correlation_loss(angles, torch.tensor([[5.0, 5.0, 0.0]])).backward()
     assert torch.all(torch.isfinite(angles.grad))
     assert angles.grad.abs().max() < 1e3
 

@@ -70,6 +70,15 @@ class LabelledPresses:
         """Return the presses whose distance from the centre is at most `radius`, mm."""
         return self[np.hypot(self.contact[:, 0], self.contact[:, 1]) <= radius]
 
+    def repeated(self, min_count: int) -> "LabelledPresses":
+        """Return the presses in their order, from the first one again after the last one, until there are enough.
+
+        Args:
+            min_count: Number of presses to return. If there are more presses, each of them is returned once.
+        """
+        count = max(min_count, len(self))
+        return self[np.arange(count) % len(self)]
+
     def noisy(self, noise: Noise, seed: int) -> Array:
         """Return the charges with added noise, shape (n, n_electrode), pC."""
         return noise.add(self.charge, np.random.default_rng(seed))

@@ -73,6 +73,9 @@ ANGLE_SUMS = np.array([[1, 0, 1, 1, 1, 1, 1, 1], [0, 1, -1, 1, -1, -1, 1, 1], [0
 def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: NoiseModel, seed: int) -> FoldedNetwork:
     """Add correlations to a network.
 
+    The network estimates the contacts of presses with noise. The angles of the correlations are fitted to its errors.
+    They depend only on hidden units that influence the contact, and on the input features.
+
     Args:
         network: The trained network.
         presses: Presses on which the network was trained.
@@ -83,7 +86,7 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
         The network with additional answers, the angles of the correlations.
     """
     layers = network.layers
-    examples = presses[np.arange(max(N_EXAMPLES, len(presses))) % len(presses)]
+    examples = presses.repeated(N_EXAMPLES)
     features = network.features.evaluate(examples.noisy(noise, seed))
     hidden_output = evaluate_hidden_layers(layers.hidden, layers.activation, features)
     contact, std, *_ = network.outputs_from_answers(evaluate_output_layer(layers, hidden_output, features))
@@ -144,14 +147,15 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
 def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Array:
     """Minimise a loss by the L-BFGS method, which is started again if a line search fails.
 
-    If the method does not converge, a warning is logged.
+    The search ends if the gradient is below the tolerance, or after `MAX_ITERATIONS`. If it ends because the line
+    searches of all starts have failed, a warning is logged.
 
     Args:
         loss: Function that returns the loss and its gradient at a position.
         start: Position at which the search starts, shape (n,).
 
     Returns:
-        Position with the smallest loss, shape (n,).
+        Position at which the search ended, shape (n,).
     """
     tolerance = FIRST_STEP * GRADIENT_TOLERANCE
     options = {"ftol": 0.0, "gtol": tolerance, "maxcor": N_UPDATES}
@@ -183,10 +187,11 @@ def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tup
     cos_a, cos_b, cos_c = np.cos(angles)
     sin_a, sin_b, sin_c = np.copysign(np.maximum(np.abs(sine), MIN_SINE), sine)
 
-    # The Cholesky factor is inverted row by row: first, second and third have unit covariance.
-    first, second, third = deviation
-    second = (second - cos_a * first) / sin_a
-    third = (third - cos_b * first - sin_b * cos_c * second) / (sin_b * sin_c)
+    # The Cholesky factor is inverted row by row: the covariance of the whitened errors is the identity matrix.
+    x_deviation, y_deviation, force_deviation = deviation
+    first = x_deviation
+    second = (y_deviation - cos_a * first) / sin_a
+    third = (force_deviation - cos_b * first - sin_b * cos_c * second) / (sin_b * sin_c)
     loss = np.log(np.abs(sin_a * sin_b * sin_c)) + 0.5 * (second**2 + third**2)
 
     cot_a = cos_a / sin_a

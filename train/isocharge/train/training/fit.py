@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib import metadata
 
-import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
@@ -21,19 +20,20 @@ from isocharge.common.errors import ConfigError
 from isocharge.common.progress import second_thread
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve.model.charge_series import FILE as CHARGES_FILE
-from isocharge.simulate import Dataset
+from isocharge.simulate import Dataset, Sensor
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import LabelledPresses
-from isocharge.train.training.config import FitConfig, TrainingConfig
+from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.fitted import Fitted
+from isocharge.train.training.fitted import Fitted, Provenance
+from isocharge.train.training.folded_network import FoldedNetwork
 from isocharge.train.training.losses import (
     CORRELATION_WEIGHT,
-    correlation_loss,
     distillation_loss,
+    robust_correlation_loss,
     validation_score,
     warm_up_loss,
     weighted_likelihood_loss,
@@ -84,38 +84,57 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
     settings = (config or FitConfig()).checked()
     trained = train_network(data, settings, run=run)
     split = trained.split
-    noise = settings.training.noise_model
-    with threads_and_seed(settings.training.threads, settings.training.seed):
-        network = fold_network(trained.network)
-        if not split.train.measured:
-            repeated = split.train[np.arange(max(N_STD_PRESSES, len(split.train))) % len(split.train)]
-            network = fit_std(network, repeated.noisy(noise, settings.training.seed + 1), repeated.contact)
-        network = with_correlation(network, split.train, noise, settings.training.seed)
-
-    made_with: dict[str, object] = {"config": settings.to_dict(), "torch": torch.__version__}
-    if split.cautions:
-        made_with["cautions"] = list(split.cautions)
-    if data.teacher is not None:
-        made_with["teacher"] = data.teacher.label
-    files = dict(data.provenance.files)
-    if split.folded_charges is not None:
-        files[CHARGES_FILE] = split.folded_charges.to_bytes()
-
-    measured = data.presses.within(split.domain.radius)
+    good_presses = data.presses.within(split.domain.radius) if data.presses.measured else split.test
     return Fitted(
-        network=network,
+        network=_fold_and_calibrate(trained, settings.training),
         sensor=data.sensor,
         probes=data.probes,
         domain=split.domain,
-        noise=noise,
+        noise=settings.training.noise_model,
         test=split.test if data.test is None else data.test,
-        good=measured if data.presses.measured else split.test,
+        good=good_presses,
         sha256=data.sha256,
-        provenance=replace(data.provenance, made_with=made_with | dict(data.provenance.made_with), files=files),
+        provenance=_provenance(data, split, settings),
         requested_domain=data.domain,
         cautions=split.cautions,
         outside=trained.outside,
     )
+
+
+def _fold_and_calibrate(trained: "TrainedNetwork", config: TrainingConfig) -> FoldedNetwork:
+    """Fold a trained network, and fit its standard deviations and its correlations to its errors.
+
+    The standard deviations are only fitted to simulated presses, whose noise is known.
+
+    Args:
+        trained: The network in PyTorch and its presses.
+        config: Noise, seed and number of threads.
+    """
+    train = trained.split.train
+    noise = config.noise_model
+    with threads_and_seed(config.threads, config.seed):
+        network = fold_network(trained.network)
+        if not train.measured:
+            presses = train.repeated(N_STD_PRESSES)
+            network = fit_std(network, presses.noisy(noise, config.seed + 1), presses.contact)
+        return with_correlation(network, train, noise, config.seed)
+
+
+def _provenance(data: TrainingData, split: Split, config: FitConfig) -> Provenance:
+    """Return the provenance of the training data with the settings of the training.
+
+    If the map folds, the charges of all presses are added as a file.
+    """
+    made_with: dict[str, object] = {"config": config.to_dict(), "torch": torch.__version__}
+    if split.cautions:
+        made_with["cautions"] = list(split.cautions)
+    if data.teacher is not None:
+        made_with["teacher"] = data.teacher.label
+    made_with.update(data.provenance.made_with)
+    files = dict(data.provenance.files)
+    if split.folded_charges is not None:
+        files[CHARGES_FILE] = split.folded_charges.to_bytes()
+    return replace(data.provenance, made_with=made_with, files=files)
 
 
 def fit_identity(data: TrainingData, config: FitConfig) -> dict[str, object]:
@@ -144,6 +163,9 @@ class TrainedNetwork:
 def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | None = None) -> TrainedNetwork:
     """Train the contact perceptron and, at the same time in a second thread, the misfit perceptron.
 
+    The second thread first simulates the whole film, while this thread splits the presses. It then trains the misfit
+    perceptron on examples from the working area and from the rest of the film.
+
     Args:
         data: Presses, and possibly a teacher.
         config: Sizes, steps, noise and seed.
@@ -154,14 +176,8 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
         DatasetError: If a network cannot be trained on the presses.
         TrainingError: If the loss is not finite.
     """
-    names = data.sensor.electrode_names
-    expected = config.network.electrodes
+    _check_electrodes(config.network, data.sensor)
     training = config.training
-    if expected and expected != len(names):
-        raise ConfigError(
-            f"network.electrodes: the configuration is for {expected} electrodes, the dataset of "
-            f"{data.sensor.name!r} has {len(names)} ({', '.join(names)}); use another dataset or leave the key out"
-        )
     with threads_and_seed(training.threads, training.seed), second_thread() as executor:
         whole_film = None
         if not data.presses.measured:
@@ -187,6 +203,16 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
         train_perceptron(contact, network.contact, config, run)
         outside = misfit_training.result()
     return TrainedNetwork(network.eval(), split, outside)
+
+
+def _check_electrodes(config: NetworkConfig, sensor: Sensor) -> None:
+    """Raise a `ConfigError` if a configuration requires another number of electrodes than the sensor has."""
+    names = sensor.electrode_names
+    if config.electrodes not in (0, len(names)):
+        raise ConfigError(
+            f"network.electrodes: the configuration is for {config.electrodes} electrodes, the dataset of "
+            f"{sensor.name!r} has {len(names)} ({', '.join(names)}); use another dataset or leave the key out"
+        )
 
 
 @contextmanager
@@ -246,7 +272,7 @@ def contact_stage(
 ) -> TrainingStage:
     """Return the training of the contact perceptron on charges with fresh noise.
 
-    The linear part of the perceptron is fitted at once.
+    Before the training, the linear part of the perceptron is fitted by least squares.
 
     Args:
         network: The network, whose contact perceptron is trained.
@@ -267,21 +293,27 @@ def contact_stage(
     network.contact.fit_linear_part(network.inputs(noisy_charge), target)
 
     def loss(step: int, random: torch.Generator) -> Tensor:
-        """Return the loss of a random batch with new noise. It is the warm-up loss in the first steps."""
+        """Return the loss of a random batch with new noise.
+
+        The first steps use the warm-up loss. The later steps use the loss of mean and standard deviations plus the loss
+        of the correlations.
+        """
         rows = torch.randint(len(charge), (batch,), generator=random)
         noisy = with_fresh_noise(charge[rows], noise, random)
+        contact = target[rows]
         mean, log_std, angles = network.posterior_with_angles(noisy)
         is_warm_up = step < warm_up_steps
-        deviation = (target[rows] - mean) * torch.exp(-log_std)
-        angle_loss = CORRELATION_WEIGHT * correlation_loss(angles, deviation)
         if teacher is None:
             if is_warm_up:
-                return warm_up_loss(mean, log_std, target[rows])
-            return weighted_likelihood_loss(mean, log_std, target[rows]) + angle_loss
-        teacher_mean, teacher_log_std = teacher.posterior(noisy, domain)
-        if is_warm_up:
-            return warm_up_loss(mean, log_std, teacher_mean)
-        return distillation_loss(mean, log_std, teacher_mean, teacher_log_std) + angle_loss
+                return warm_up_loss(mean, log_std, contact)
+            posterior_loss = weighted_likelihood_loss(mean, log_std, contact)
+        else:
+            teacher_mean, teacher_log_std = teacher.posterior(noisy, domain)
+            if is_warm_up:
+                return warm_up_loss(mean, log_std, teacher_mean)
+            posterior_loss = distillation_loss(mean, log_std, teacher_mean, teacher_log_std)
+        deviation = (contact - mean) * torch.exp(-log_std)
+        return posterior_loss + CORRELATION_WEIGHT * robust_correlation_loss(angles, deviation)
 
     def score() -> tuple[float, str]:
         """Return the loss on the validation presses, and a text with the errors."""

@@ -7,6 +7,7 @@ from torch import Tensor
 from isocharge.common.statistics import rms
 from isocharge.simulate import Domain
 from isocharge.train.data.channel_noise import Noise
+from isocharge.train.training.correlation import MAX_DEVIATION
 
 WARM_UP_MEAN_WEIGHT = 30.0
 """Weight of the squared errors of the mean in the warm-up loss."""
@@ -14,24 +15,22 @@ WARM_UP_MEAN_WEIGHT = 30.0
 WARM_UP_STD_WEIGHT = 0.1
 """Weight of the standard deviations in the warm-up loss."""
 
-
-MIN_SINE = 0.03
-"""Smallest sine of an angle of the correlations in the training of the hidden layers."""
-
-MAX_DEVIATION = 5.0
-"""Largest error, in standard deviations, that the loss of the correlations distinguishes."""
+STD_EXPONENT = 0.75
+"""Exponent of the variances by which the squared errors of the mean are weighted: 0 gives the likelihood, 1 gives least
+squares."""
 
 CORRELATION_WEIGHT = 0.3
 """Weight of the loss of the correlations. A weight of 1 gives the same ellipses, and position errors that are 0.5 %
 larger."""
 
-MAX_NORMAL_DEVIATION = 3.0
-"""Whitened error above which the loss of the correlations grows with its logarithm instead of its square. Where two
-errors are nearly proportional to each other, a square would cause gradients with which a training diverges."""
+MIN_TRAINING_SINE = 0.03
+"""Smallest sine of an angle of the correlations in the training of the hidden layers. Smaller sines count as this
+value."""
 
-STD_EXPONENT = 0.75
-"""Exponent of the variances by which the squared errors of the mean are weighted: 0 gives the likelihood, 1 gives least
-squares."""
+MAX_NORMAL_ERROR = 3.0
+"""Whitened error above which the loss of the correlations grows with the logarithm of the error instead of its square.
+Where two errors are nearly proportional to each other, a square would cause gradients with which a training
+diverges."""
 
 
 def with_fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor:
@@ -84,8 +83,9 @@ def weighted_likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> T
 
     The gradient of a Gaussian likelihood with respect to the mean is divided by the variance. Where a network
     overestimates the standard deviation, it therefore learns the mean slowly (Seitzer et al. 2022, arXiv 2203.09168).
-    Here the squared errors of the mean are multiplied by the estimated standard deviation to the power of
-    `2 * STD_EXPONENT`. The standard deviations have the gradient of the likelihood.
+    Here the squared errors of the mean in the likelihood are multiplied by the estimated standard deviation to the
+    power of `2 * STD_EXPONENT`. The mean of these weights over the presses is 1. The standard deviations have the
+    gradient of the likelihood.
 
     Args:
         mean: Estimated unit coordinates, shape (n, 3).
@@ -94,24 +94,28 @@ def weighted_likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> T
     """
     squares = (mean - target) ** 2
     fixed_log_std = log_std.detach()
-    mean_weight = torch.exp((2.0 * STD_EXPONENT - 2.0) * fixed_log_std)
-    mean_weight = mean_weight / torch.exp(2.0 * STD_EXPONENT * fixed_log_std).mean(dim=0)
+    mean_of_weights = torch.exp(2.0 * STD_EXPONENT * fixed_log_std).mean(dim=0)
+    weight_over_variance = torch.exp((2.0 * STD_EXPONENT - 2.0) * fixed_log_std) / mean_of_weights
+    mean_loss = 0.5 * weight_over_variance * squares
     std_loss = log_std + 0.5 * squares.detach() * torch.exp(-2.0 * log_std)
-    return (std_loss + 0.5 * mean_weight * squares).sum(dim=1).mean()
+    return (std_loss + mean_loss).sum(dim=1).mean()
 
 
-def correlation_loss(angles: Tensor, deviation: Tensor) -> Tensor:
-    """Compute the negative logarithm of a likelihood of errors with unit variances, without its constant.
+def robust_correlation_loss(angles: Tensor, deviation: Tensor) -> Tensor:
+    """Compute the negative logarithm of a likelihood of correlated errors with unit variances, without its constant.
 
-    The likelihood is Gaussian for whitened errors up to `MAX_NORMAL_DEVIATION`, and has longer tails beyond. The angles
-    are those of `isocharge.train.training.correlation` minus a right angle, so that angles of zero give no correlation.
-    The gradient does not reach the errors: mean and standard deviations are trained as without correlations.
+    The loss trains the hidden layers to represent the correlations. The likelihood is Gaussian for whitened errors up
+    to `MAX_NORMAL_ERROR`. Larger errors have a likelihood with longer tails, so that single presses do not dominate the
+    gradient. No gradient flows into the errors. This loss therefore does not train the outputs for mean and standard
+    deviation.
 
     Args:
-        angles: Angles of the correlations minus a right angle, shape (n, 3), rad.
+        angles: Angles a, b and c of `isocharge.train.training.correlation` minus a right angle, shape (n, 3), rad.
+            Three zeros give no correlations.
         deviation: Errors of the unit coordinates over their standard deviations, shape (n, 3).
     """
-    sin_a, sin_b, sin_c = torch.cos(angles).clamp(min=MIN_SINE).unbind(dim=1)
+    # With x = a - pi / 2: sin a = cos x and cos a = -sin x.
+    sin_a, sin_b, sin_c = torch.cos(angles).clamp(min=MIN_TRAINING_SINE).unbind(dim=1)
     cos_a, cos_b, cos_c = torch.sin(-angles).unbind(dim=1)
     first, second, third = deviation.detach().clamp(-MAX_DEVIATION, MAX_DEVIATION).unbind(dim=1)
 
@@ -123,11 +127,14 @@ def correlation_loss(angles: Tensor, deviation: Tensor) -> Tensor:
 
 
 def _long_tailed_square(values: Tensor) -> Tensor:
-    """Return the squares of values; beyond `MAX_NORMAL_DEVIATION`, a logarithm that continues them smoothly."""
+    """Return the squares of values up to `MAX_NORMAL_ERROR`, and a logarithm of larger values.
+
+    The logarithm has the same value and the same slope as the square at `MAX_NORMAL_ERROR`.
+    """
     squares = values**2
-    limit = MAX_NORMAL_DEVIATION**2
-    tail = limit * (1.0 + torch.log(squares.clamp(min=limit) / limit))
-    return torch.where(squares < limit, squares, tail)
+    largest_square = MAX_NORMAL_ERROR**2
+    tail = largest_square * (1.0 + torch.log(squares.clamp(min=largest_square) / largest_square))
+    return torch.where(squares < largest_square, squares, tail)
 
 
 def distillation_loss(mean: Tensor, log_std: Tensor, teacher_mean: Tensor, teacher_log_std: Tensor) -> Tensor:
@@ -153,10 +160,10 @@ def mean_squared_distance(vector: Tensor, target: Tensor) -> Tensor:
 
 
 def focused_squared_distance(vector: Tensor, target: Tensor, focus: float) -> Tensor:
-    """Compute the mean of the squared distances between vectors, in which long targets count less.
+    """Compute a weighted mean of the squared distances between vectors, in which long targets have small weights.
 
-    The weight is proportional to 1 / (1 + |target|^2 / focus^2). The network is then accurate where the misfit is
-    near the threshold of the flag. The exact value of a large misfit matters little.
+    The weight is proportional to 1 / (1 + |target|^2 / focus^2). With these weights, the network becomes most accurate
+    for misfits up to the threshold of the flag `misfit`. The exact value of a larger misfit matters little.
 
     Args:
         vector: Estimated vectors, shape (n, n_electrode).
@@ -176,7 +183,7 @@ def validation_score(mean: Tensor, log_std: Tensor, target: Tensor, domain: Doma
         log_std: Logarithms of their standard deviations, shape (n, 3).
         target: True unit coordinates, shape (n, 3).
         domain: Scale of the unit coordinates.
-        samples: What the validation data are, for the text.
+        samples: Noun for the validation data in the text, for example "presses".
     """
     loss = likelihood_loss(mean, log_std, target).item()
     x_mm, y_mm, log_force = ((mean - target).double().numpy() * domain.scale).T
