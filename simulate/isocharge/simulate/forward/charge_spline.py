@@ -1,11 +1,11 @@
 """Spline approximation of a forward map, which computes charges and their derivatives about two hundred times faster.
 
 The charges are divided by the squared amplitude of `mechanics.scaling`, which removes most of their dependence on the
-force. For each of a few forces, the scaled charges are approximated by a cubic spline in (x, y), which is fitted by
-least squares to presses on the disk. Near an electrode, its charge changes considerably over the length of the probe.
-Around each electrode, a second spline with finer knots therefore corrects the charge of this electrode. Between the
-forces, the charges are interpolated by Lagrange polynomials in ln F. A forward map interpolates its stress fields in
-the same way, so the interpolation in the force adds no error.
+force. For each of a few forces, the scaled charges are approximated by a cubic spline in (x, y). The spline is fitted
+by least squares to presses on the disk. Near an electrode, its charge changes considerably over the length of the
+probe. Around each electrode, a second spline with finer knots therefore corrects the charge of this electrode. Between
+the forces, the charges are interpolated by Lagrange polynomials in ln F. A forward map interpolates its stress fields
+in the same way, so the interpolation in the force adds no error.
 """
 
 from dataclasses import dataclass, replace
@@ -427,7 +427,7 @@ def _patch_positions(lower_left: Array, upper_right: Array, cells: Integers, rad
 
 
 def _knots(low: float, high: float, cells: int) -> Array:
-    """Return the knots of a cubic spline on an interval that is divided into equal cells, shape (cells + 7,)."""
+    """Return the knots of a cubic spline on an interval with equal cells, shape (cells + 7,)."""
     return np.concatenate([[low] * 3, np.linspace(low, high, cells + 1), [high] * 3])
 
 

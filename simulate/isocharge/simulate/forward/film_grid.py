@@ -66,7 +66,7 @@ class FilmGrid:
         return cls(**nodes)
 
     def weights(self, axis: str, value: float) -> Array:
-        """Compute the weights of the nodes of an axis for the interpolation to a value on this axis, shape (n_node,).
+        """Compute the interpolation weights of the nodes of an axis at a value on this axis, shape (n_node,).
 
         Args:
             axis: One of `AXES`.

@@ -1,4 +1,4 @@
-"""Change of the charges by the imperfections of a film, to first order, for every film of a family and any contact.
+"""First-order change of the charges that imperfections of a film cause, for every film of a family and any contact.
 
 The tension or the stiffness of a film may depend on the direction. The clamp may be oval, and the piezoelectric axes
 may be rotated. Poisson's ratio may differ from the assumed value, and the wires may have crosstalk. Each of these

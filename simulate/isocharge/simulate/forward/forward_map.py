@@ -231,8 +231,8 @@ class ForwardMap:
     def relative_error(self, check: CheckPress, direct: Array) -> float:
         """Compute the largest relative difference between the charges of one press and those of a direct solve.
 
-        The error of a charge is divided by the charge, or by `CHARGE_FLOOR` times the largest charge of the press if
-        this product is larger.
+        The difference is divided by the charge. A charge below `CHARGE_FLOOR` times the largest charge of the press is
+        replaced by this product.
 
         Args:
             check: The press.
@@ -247,8 +247,8 @@ class ForwardMap:
     def field_charges(self, contact: Array, is_odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
         """Compute the charges of several stress fields that the table contains, for a circular probe.
 
-        The fields are small corrections, so the coarse integration rule is used for all electrodes, and the pressure on
-        the electrodes and the crosstalk are omitted.
+        The fields are small corrections, so the coarse integration rule is used for all electrodes. The pressure on the
+        electrodes and the crosstalk are omitted.
 
         Args:
             contact: Presses (x, y, F) in the domain, shape (n, 3), mm and N.

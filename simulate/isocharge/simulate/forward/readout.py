@@ -1,14 +1,14 @@
 """Charge collected by an electrode on a stretched piezoelectric film.
 
 The charge amplifiers hold the electrodes at virtual ground, so the electric field vanishes. An electrode of area A
-collects only the polarisation caused by the in-plane stress (Mirbagheri et al. 2007, eq. 2):
+collects only the polarisation caused by the in-plane stress (Mirbagheri et al., 2007, equation 2):
 
-    Q = A * mean(d31 * s11 + d32 * s22)
+    Q = A * mean(d31 * s11 + d32 * s22).
 
-where s is the mid-surface stress in the axes of the film and axis 1 is the drawn direction x. The area readout computes
+Here s is the mid-surface stress in the axes of the film, and axis 1 is the drawn direction x. The area readout computes
 the mean over the electrode. The edge readout computes the mean of s11 over the left and right edges, and the mean of
-s22 over the lower and upper edges, as in eq. 3 of the paper. The touch charge is the charge under load minus the charge
-without load, so a uniform pretension cancels.
+s22 over the lower and upper edges, as in equation 3 of the paper. The touch charge is the charge under load minus the
+charge without load, so a uniform pretension cancels.
 """
 
 from dataclasses import dataclass
@@ -180,8 +180,8 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     """Compute the charge that the contact pressure induces on the electrodes. The charge per area is d33 * mean(s33).
 
     The back of the film is free. Through the thickness, s33 changes from minus the contact pressure at the probe to
-    zero at the back, so the mean of s33 is minus half of the pressure. Only the part of an electrode under the
-    footprint contributes. The negative d33 of PVDF results in a positive charge.
+    zero at the back. The mean of s33 is therefore minus half of the contact pressure. Only the part of an electrode
+    under the footprint contributes. The negative d33 of PVDF results in a positive charge.
 
     Args:
         sensor: The sensor.
@@ -266,7 +266,7 @@ def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
 
 
 def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
-    """Return the integration points of the edge readout (Mirbagheri et al. 2007, eq. 3).
+    """Return the integration points of the edge readout (Mirbagheri et al., 2007, equation 3).
 
     The mean of s11 is over the left and right edges, and the mean of s22 is over the lower and upper edges.
 

@@ -1,4 +1,4 @@
-"""Change of the charges by a side force of the probe, and by the friction of a probe on a vertical stage.
+"""Changes of the charges that a side force of the probe, or the friction of a probe on a vertical stage, causes.
 
 A side force (Fx, Fy) of the probe on the film changes the charges to first order by
 

@@ -1,6 +1,6 @@
 """Chebyshev series of the stress of a film under a round probe, for the playground.
 
-The module is also a command, which writes the file of the built-in film of 25 um:
+The module is also a command. It writes the file of the built-in film of 25 um:
 
     python -m isocharge.simulate.forward.stress_series FILE.json
 """

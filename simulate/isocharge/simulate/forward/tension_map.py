@@ -1,4 +1,4 @@
-"""Change of the charges by a change of the pretension, and by the temperature of the film.
+"""Changes of the charges that a change of the pretension or of the temperature of the film causes.
 
 A change of the pretension by (T11, T22, T12) changes the charges to first order by
 

@@ -1,7 +1,8 @@
 """A coarse forward map that covers nearly the whole film, for presses far outside the working area.
 
-The map is used, for example, to find all presses on the film that have the charges of a given press. This search needs
-charges with an error of a few percent up to the clamp. An accurate forward map up to the clamp would take minutes.
+The map is used, for example, to find all presses on the film that cause the same charges as a given press. This search
+needs charges with an error of a few percent up to the clamp. An accurate forward map up to the clamp would take
+minutes.
 """
 
 from concurrent.futures import Executor

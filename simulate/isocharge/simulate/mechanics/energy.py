@@ -1,10 +1,9 @@
 """Potential energy of the film under a load, with its first and second derivatives.
 
-    Pi = stretching energy + bending energy
-         - load * mean of W over the footprint - side load . mean of (U1, U2) over the footprint
-         + energy of the pressure on the whole film (`mechanics.back_pressure`)
+    Pi = stretching energy + bending energy + pressure energy - load * mean(W) - dot(side load, mean(U1, U2)).
 
-The means are weighted with the pressure of the probe.
+The means are taken over the footprint and weighted with the pressure of the probe. The module `mechanics.back_pressure`
+computes the pressure energy, which belongs to the pressure on the whole film.
 
 The energy is a function of the scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3). Lengths are in units
 of the film radius a. With the amplitude A of `isocharge.simulate.mechanics.scaling`, the displacements and the
@@ -12,10 +11,10 @@ Green-Lagrange strain are
 
     w = a A W,   u = a A^2 U,   E = A^2 [ sym grad U + grad W (x) grad W / 2 + A^2 (grad U)^T grad U / 2 ].
 
-The expression in brackets is the scaled strain E', which is of order one for every force. The stress is that of St.
-Venant-Kirchhoff elasticity in plane stress, S = E_young A^2 (C : E' + tau I). Energies are in units of
-E_young h a^2 A^4. If the film is anisotropic, a matrix is added to C and a deviator to tau I (`scaling.Anisotropy`).
-The bending stiffness of an anisotropic film is that of the isotropic film.
+The expression in brackets is the scaled strain E', which is of order one for every force. The stress is that of
+Saint-Venant-Kirchhoff elasticity in plane stress, S = E_young A^2 (C : E' + tau I). Energies are in units of E_young h
+a^2 A^4. If the film is anisotropic, a matrix is added to C and a deviator to tau I (`scaling.Anisotropy`). The bending
+stiffness of an anisotropic film is that of the isotropic film.
 """
 
 from dataclasses import replace
@@ -147,7 +146,7 @@ class Membrane:
     """Stretching energy of the geometrically nonlinear membrane.
 
     The energy is integral( E' : C : E' / 2 + tau (tr E' - div U) ). The integral of div U over a clamped film is zero.
-    The term div U is subtracted because its rounding errors would dominate the other terms if the pretension is large.
+    The term div U is subtracted, because its rounding errors would dominate the other terms for a large pretension.
     With F_ia = d_ia + A^2 U_i,a for i = 1, 2 and F_3a = W,a, the variation of E' is sym(F_ia v_i,b) for all three
     components of a test displacement v. The strain and the stress are derived by Bonet and Wood (2008, ch. 3 and 6),
     and the scaling by Schwerin (1929).
@@ -288,8 +287,8 @@ class Membrane:
     def _moduli(self, stretch: Array, i: int, j: int) -> Array:
         """Compute the material part of d(traction_ia)/d(slope_jb) for a pair of displacement components.
 
-        With the derivative B_i of the strain (E11, E22, 2 E12) with respect to the slopes of component i, the result is
-        B_i C B_j'. For the isotropic elasticity matrix C, the product is written out.
+        The result is the product B_i C B_j', where B_i is the derivative of the strain (E11, E22, 2 E12) with respect
+        to the slopes of component i. For the isotropic elasticity matrix C, the product is written out.
 
         Args:
             stretch: F, shape (n_element, n_point, 2, 3).
@@ -328,11 +327,11 @@ class Bending:
 
     The elements are continuous, but their slopes are not. The Laplacian m = lap W is therefore defined weakly by
 
-        integral( m phi ) = -integral( grad W . grad phi )   for every basis function phi.
+        integral( m phi ) = -integral( dot(grad W, grad phi) )   for every basis function phi.
 
     Since the basis functions on the rim are included, this definition also clamps the slope at the rim (Ciarlet and
-    Raviart 1974). The integral on the left is lumped on the Gauss-Lobatto nodes, so m = -M^-1 L W with a diagonal
-    matrix M. The energy is then beta / 2 W L^T M^-1 L W.
+    Raviart 1974). The integral on the left is lumped on the Gauss-Lobatto nodes. The result is m = -M^-1 L W with a
+    diagonal matrix M. The energy is then beta / 2 W L^T M^-1 L W.
 
     The matrix of this energy couples elements that do not touch. The linear solves therefore have an additional unknown
     mu = sqrt(beta) M^-1 (L - s M) W, where s is a shift:

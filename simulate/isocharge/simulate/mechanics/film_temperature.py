@@ -7,7 +7,7 @@ along each axis of the film changes by
 
 and the pretension changes by the stress of this strain, with the plane-stress stiffness of the film. A drawn film
 expands more across the drawn direction than along this direction, so its tension becomes uneven. The temperature of a
-thin film follows that of the air within seconds, and the temperature of a ring within many minutes.
+thin film follows that of the air within seconds. The temperature of a ring follows within many minutes.
 """
 
 from dataclasses import replace

@@ -145,7 +145,7 @@ class DimensionlessGroups:
 
     @property
     def total_load(self) -> float:
-        """Sum of the force of the probe and the magnitude of the force of the static pressure, over E h a A^3."""
+        """Force of the probe plus the magnitude of the force of the static pressure, in units of E h a A^3."""
         return self.load + np.pi * abs(self.static_pressure)
 
     @property

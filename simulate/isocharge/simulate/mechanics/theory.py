@@ -5,7 +5,7 @@ the rim and near the probe, and for the stress at the surface of the film. The d
 bending length l = sqrt(D / N), with the bending stiffness D and the tension force N per length. If the pretension and
 the induced tension are small, bending carries the load. The second term is *stretching*, the effect of the induced
 stress on the deflection. Without stretching the film is linear, and the charges are computed from the linear deflection
-in a second step. The pretension is always included.
+in a second step. The pretension is always included. The terms determine the name of the theory::
 
     stretching  bending   theory
     no          yes       linear plate, pre-tensioned linear plate
@@ -96,9 +96,9 @@ def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
     """Estimate the relative change of a charge by bending at the footprint, for a film with pretension.
 
     The change is proportional to the squared ratio of the bending length to the reach of the footprint. The tension at
-    the footprint is the sum of the pretension and of the stress S = E W'^2 / 2 of a membrane without pretension, whose
-    slope at the footprint is W'. The slope follows from the equilibrium 2 pi R h S W' = F of the stress with the load,
-    which means W'^3 = F / (pi R h E). If the induced stress dominates, bending hardly changes the charges.
+    the footprint is the sum of the pretension and of the stress S of a membrane without pretension. With the slope W'
+    of this membrane at the footprint, the stress is S = E W'^2 / 2. The equilibrium of the stress with the load is 2 pi
+    R h S W' = F, so W'^3 = F / (pi R h E). If the induced stress dominates, bending hardly changes the charges.
 
     Args:
         film: The film.

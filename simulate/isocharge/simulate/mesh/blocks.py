@@ -8,8 +8,8 @@ The innermost circle of the mesh encloses the footprint. The mesh consists of th
        film resists bending.
 
 A polygonal footprint is its own core polygon. A circular footprint has a virtual square as its core polygon, and its
-boundary is the innermost circle. Any other curved footprint has a core polygon, one layer of blocks up to its boundary,
-and a second layer up to the innermost circle. Each block can be subdivided.
+boundary is the innermost circle. Any other curved footprint has a core polygon and two layers of blocks. The first
+layer ends at the boundary of the footprint, and the second layer at the innermost circle. Each block can be subdivided.
 
 A press by a circular probe is symmetric about the line from the centre of the film to the probe. If the film is
 symmetric as well, only the upper half is meshed. `Placement` computes the positions of the elements, and `Template`
@@ -62,7 +62,8 @@ class Blocks:
 
     An element has the local coordinates xi, which points outwards, and eta, which points anticlockwise. Both lie in
     [-1, 1]. The (order + 1)^2 nodes of an element are ordered by eta and then by xi. The elements are ordered from the
-    inside out: the quadrilaterals of the core polygon, the layers up to the innermost circle, the rings.
+    inside out. The quadrilaterals of the core polygon come first, then the layers up to the innermost circle, and then
+    the rings.
 
     Attributes:
         resolution: Fineness of the mesh.

@@ -1,9 +1,9 @@
 """Stiffness of a film with a coat on some of its parts. The edges of the coat need not follow the elements.
 
-Displacement and traction are continuous across an edge of the coat with the normal n, but the strain jumps by
-sym(a x n) = N a. Within a band along the edge, the bare film and the coated film are treated as a laminate with this
-normal, which is the method of composite voxels (Kabel, Merkert and Schneider 2015). The phase i of the laminate has the
-stiffness C_i and the volume share f_i. If E is the mean strain, the strain of a phase is
+Displacement and traction are continuous across an edge of the coat. The strain jumps by sym(a x n) = N a, where n is
+the normal of the edge. Within a band along the edge, the bare film and the coated film are treated as a laminate with
+this normal. This is the method of composite voxels (Kabel, Merkert and Schneider 2015). The phase i of the laminate has
+the stiffness C_i and the volume share f_i. If E is the mean strain, the strain of a phase is
 
     E_i = E + N M_i^-1 (T E - N^T C_i E),   M_i = N^T C_i N,   T = (sum f_i M_i^-1)^-1 sum f_i M_i^-1 N^T C_i,
 
@@ -44,8 +44,8 @@ class Coating:
     def near(self, points: Complexes) -> Booleans:
         """Return for each point whether it may lie on the coat or near the coat. The result is only a fast estimate.
 
-        It is true for all points on the coat and in the band, for some points near the coat, and false for distant
-        points.
+        It is true for all points on the coat and in the band, and also for some points near the coat. It is false for
+        distant points.
 
         Args:
             points: Film points x + iy, any shape, in film radii.
@@ -166,7 +166,7 @@ class Coating:
 
 
 class _Laminate(NamedTuple):
-    """Laminates of the bare film and of the film with one, two, ... layers of the coat.
+    """Laminates of the bare film and of the film with one or more layers of the coat.
 
     Attributes:
         shares: Volume shares of the phases, shape (..., n_phase).

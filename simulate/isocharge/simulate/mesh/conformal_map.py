@@ -67,8 +67,9 @@ def distance_coordinate(distance: Array | float) -> Any:
 def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]:
     """Compute a circle on the film that encloses each footprint with a gap.
 
-    The centre of the circle is the centroid of the footprint, unless the circle would be too close to the rim. In this
-    case, the centre is shifted towards the centre of the film as far as necessary. The shift is found by bisection.
+    The centre of the circle is the centroid of the footprint, unless the circle would be too close to the rim. If it
+    would be too close, its centre is shifted towards the centre of the film as far as necessary. The shift is found by
+    bisection.
 
     Args:
         outline: Points along the boundary of each footprint, shape (..., n), in film radii.
@@ -118,7 +119,7 @@ def sector_angles(
 
     The sides begin where rays from the centroid of the footprint meet the circle. The directions of the rays are a
     compromise between the directions of the stops and equal angles. If the gap between the footprint and the circle is
-    narrow, the rays pass close to the stops, because elements would fold otherwise.
+    narrow, the rays pass close to the stops. Otherwise elements would fold.
 
     Args:
         blocks: The elements.

@@ -4,8 +4,8 @@ The disk automorphism
 
     Z = (z + c) / (1 + c z),   0 <= c < 1,
 
-is a conformal map of the unit disk onto itself. It maps rings about the origin of the template plane (z) onto the film
-(Z, in film radii, with the probe on the positive x axis), and circles onto circles. With
+is a conformal map of the unit disk onto itself. It maps points z of the template plane to film points Z, in film radii,
+with the probe on the positive x axis. The images of circles are circles. With
 
     al = (atanh(p + R) + atanh(p - R)) / 2,   be = (atanh(p + R) - atanh(p - R)) / 2,   c = tanh al,   rho = tanh be
 
@@ -128,7 +128,7 @@ class Placement:
         return self._with_arrays(lambda values: np.asarray(values)[None])
 
     def _with_arrays(self, function: Callable[[Any], Any]) -> "Placement":
-        """Return a copy in which every array is replaced by the result of a function of that array."""
+        """Return a copy in which a function is applied to every array."""
         arrays: dict[str, Any] = {
             field.name: function(getattr(self, field.name)) for field in fields(self) if field.name != "probe"
         }
@@ -210,7 +210,7 @@ class Placement:
         return points.reshape(-1, radial.size)
 
     def _node_circle_angles(self, blocks: Blocks) -> Array:
-        """Return the angles (rad) on the innermost circle of the nodes of each sector, shape (n_sector, n_local)."""
+        """Return the angles (rad) on the innermost circle for the nodes of each sector, shape (n_sector, n_local)."""
         _, angular = _unit_coordinates(blocks)
         first_side = self.circle_angles[:-1, None]
         last_side = self.circle_angles[1:, None]
@@ -226,7 +226,7 @@ def widest_smooth_layer(mesh: Blocks, probe: Probe, distance: float, film_radius
     """Return the largest width of the thin rings for which the mesh is a smooth function of the position of the press.
 
     `ring_edges` limits the depth of wider thin rings if the press is near the rim. The positions of the nodes would
-    then have a kink as functions of the distance, and polynomials in the distance would interpolate the fields badly.
+    then have a kink as functions of the distance. Polynomials in the distance would interpolate the fields badly.
 
     Args:
         mesh: Template of the mesh.

@@ -2,7 +2,7 @@
 
 Points outside the innermost circle are located by closed formulas, and points inside by Newton's method. The module
 `placement` describes the positions of the elements. Each element has two local coordinates from 0 to 1. The radial
-coordinate increases from the inner to the outer side, and the angular coordinate anticlockwise along the sector.
+coordinate increases from the inner to the outer side. The angular coordinate increases anticlockwise along the sector.
 """
 
 from typing import NamedTuple
@@ -153,10 +153,10 @@ def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
 def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
     """Locate points inside the innermost circle. There is one point for each placement.
 
-    The signed distance of a point from a side of an element is positive if the point lies on the side of the element.
-    Each point is assigned to the element for which the smallest of its distances from the four sides is largest. Curved
-    sides have an infinite distance, so that they are ignored. Elements that cannot contain the point get a negative
-    infinite distance.
+    The signed distance of a point from a side of an element is positive if both the point and the element lie on the
+    same side of the straight line through this side. Each point is assigned to the element for which the smallest of
+    its distances from the four sides is largest. Curved sides have an infinite distance, so that they are ignored.
+    Elements that cannot contain the point get a negative infinite distance.
 
     Args:
         placement: One placement for each point.
@@ -206,9 +206,9 @@ def _correct_sectors(
 ) -> None:
     """Assign points that lie outside of the found element to another sector of the same layer.
 
-    The straight sides of two sectors may cross outside of the elements, so that a point may lie between the extended
-    sides of a sector that does not contain the point. This occurs for elongated probes near the rim. The neighbouring
-    sectors on both sides are tried, then the next neighbours, and so on.
+    The straight sides of two sectors may cross outside of the elements. A point may then lie between the extended sides
+    of a sector that does not contain the point. This occurs for elongated probes near the rim. The neighbouring sectors
+    on both sides are tried, then the next neighbours, and so on.
 
     Args:
         placement: One placement for each point.

@@ -1,9 +1,9 @@
 """Local refinement of the mesh along the edges of a coat.
 
-An element is split into halves or quarters of equal size in its local coordinates, so the refined mesh can represent
-every field of the original mesh. If a small element is adjacent to a larger element, the nodes of the small element on
-the common side are hanging nodes. The polynomial of the larger element determines the values at the hanging nodes
-(Ainsworth and Senior 1997), so fields are continuous.
+An element is split into halves or quarters of equal size in its local coordinates. The refined mesh can therefore
+represent every field of the original mesh. If a small element is adjacent to a larger element, the nodes of the small
+element on the common side are hanging nodes. The polynomial of the larger element determines the values at the hanging
+nodes (Ainsworth and Senior 1997). The fields are therefore continuous.
 """
 
 from dataclasses import replace
@@ -108,7 +108,7 @@ class RefinedTemplate(Template):
         """Convert positions in the original elements into positions in the elements; see `Template.within`.
 
         All elements of one size are cells of a regular grid in their original element. Each cell has a unique code. For
-        each size, the code of the cell that contains a point is searched among the codes of the elements of this size.
+        each size, the code of the cell that contains a point is compared with the codes of the elements of this size.
 
         Args:
             element: Index of the original element of each point, shape (n,).
@@ -197,9 +197,9 @@ class RefinedTemplate(Template):
     def _hanging_node_sources(self, points: Complexes) -> dict[int, tuple[Integers, Array]]:
         """Find the hanging nodes, and the nodes that determine their values.
 
-        A side of an element may be adjacent to 2, 4, 8, ... smaller elements. For each of these numbers, the positions
-        that the nodes of the smaller elements have on the side are computed. A node at such a position is a hanging
-        node, unless it is a node of the larger element.
+        A side of an element may be adjacent to 2, 4, 8 or more smaller elements. For each of these numbers, the
+        positions that the nodes of the smaller elements have on the side are computed. A node at such a position is a
+        hanging node, unless it is a node of the larger element.
 
         Args:
             points: Film points of the nodes of all elements under the sample press, shape (n_element * n_local,).

@@ -2,7 +2,7 @@
 
 Each problem is to minimise |r(u)|^2 over u in D = unit disk x [-1, 1]. The residual r has a few components, and J is
 the matrix of its derivatives. A damped Gauss-Newton step solves (J'J + damping trace(J'J) / 3) du = -J'r (Levenberg
-1944). The bounds of D are treated by an active set: if u lies on an edge and the negative gradient points out of D, the
+1944). The bounds of D are treated by an active set. If u lies on an edge and the negative gradient points out of D, the
 step follows the edge. On the edge of the disk, the curvature of the circle is added to the second derivatives. A search
 along the circle therefore also converges within a few steps, even if the minimum without bounds lies far outside of D.
 """

@@ -93,11 +93,11 @@ def to_corners(z: Complexes) -> Array:
 
 
 def min_edge_cross_product(corners: Complexes, points: Complexes) -> Array:
-    """Compute the smallest cross product of an edge of a convex polygon with the vector from the edge to a point.
+    """Compute the smallest cross product over all edges of a convex polygon.
 
-    The cross product is the length of the edge times the signed distance of the point from the line through the edge.
-    The sign is positive if the point lies on the left of the edge. The smallest cross product is therefore positive for
-    points within the polygon.
+    The factors of each cross product are an edge and the vector from its start to the point. The cross product is the
+    length of the edge times the signed distance of the point from the line through the edge. It is positive if the
+    point lies on the left of the edge. The smallest cross product is therefore positive for points within the polygon.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n,).
@@ -240,7 +240,7 @@ def _four_corners(corners: Complexes) -> Complexes:
 
 
 def _gauss_line_for(side: float, count: int, length: float) -> tuple[Array, Array]:
-    """Return the Gauss rule on [0, 1] whose number of points is sufficient for a side of a polygon.
+    """Return the Gauss rule on [0, 1] with a number of points that suits the length of a side.
 
     Args:
         side: Length of the side.

@@ -102,7 +102,7 @@ def _region(polygons: Sequence[Complexes]) -> shapely.Geometry:
 
 
 def _strip_ends(polygons: Sequence[Complexes]) -> Array:
-    """Return the y coordinates of all corners and of all crossings of edges, ascending and without repetition, mm."""
+    """Return the y coordinates (mm) of all corners and of all crossings of edges, sorted and without repetition."""
     outlines = [shapely.LinearRing(to_corners(corners)) for corners in polygons]
     lines = shapely.union_all(outlines)  # has a point at each crossing
     y = np.unique(shapely.get_coordinates(lines)[:, 1])

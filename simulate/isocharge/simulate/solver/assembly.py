@@ -1,8 +1,8 @@
 """Solution of the linear system of a mesh by static condensation of the elements and a sparse direct solver.
 
 A node in the interior of an element belongs to no other element. The unknowns of such nodes are eliminated element by
-element with dense matrices, so only the unknowns of the skeleton (the sides of the elements) are factorised together.
-At order 4 this reduces the number of unknowns by a factor of 2.3. The numbering and the sparsity pattern depend on the
+element with dense matrices. Only the unknowns of the skeleton (the sides of the elements) are factorised together. At
+order 4 this reduces the number of unknowns by a factor of 2.3. The numbering and the sparsity pattern depend on the
 template only and are computed once.
 
 The unknowns of a node are U1, U2, W and, with bending, the auxiliary unknown of `mechanics.energy`. The first three are

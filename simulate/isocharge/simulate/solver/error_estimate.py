@@ -1,11 +1,11 @@
 """Estimates of the errors that the mesh and the theory cause in a charge, and warnings about omitted effects.
 
 In the inner part of the film, the error of the mesh is estimated from the shapes of the elements and the decay of their
-polynomial modes. This estimate is not reliable near the rim and for large footprints that are not circular, because the
-coarse elements may be far from the elements with the largest stress. In these cases, and if the required accuracy is
-better than the default, the press is solved on meshes of increasing order until two meshes agree. Each order reduces
-the error by a factor of three to ten, so the difference between two meshes is an upper bound of the error of the finer
-mesh.
+polynomial modes. This estimate is not reliable near the rim, nor for large footprints that are not circular. In these
+cases, the coarse elements may be far from the elements with the largest stress. The press is then solved on meshes of
+increasing order until two meshes agree. The same method is used if the required accuracy is better than the default.
+Each order reduces the error by a factor of three to ten, so the difference between two meshes is an upper bound of the
+error of the finer mesh.
 """
 
 from typing import Any

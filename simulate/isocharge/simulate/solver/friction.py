@@ -2,15 +2,15 @@
 
 If a probe presses beside the centre, the film between the probe and the near rim is steeper than the rest of the film.
 The steeper part would stretch more than the rest if the material point under the probe did not move outwards. A stage
-that moves exactly vertically does not follow this displacement, so the film slips outwards under the probe, and
+that moves exactly vertically does not follow this displacement. The film therefore slips outwards under the probe, and
 friction pulls the film inwards. A probe that hangs freely follows the displacement and has no side force.
 
-The model is Coulomb friction during one monotonic press (Johnson 1985, sec. 7.1). The holding force is the side force
-that keeps the material point in place. If the holding force is smaller than the coefficient of friction times the
-force, the film sticks to the probe, and the side force is the holding force. Otherwise the film slips, and the side
-force is the coefficient times the force, in the direction opposite to the slip. The side force is distributed over the
-footprint like the pressure. When the probe is lifted again, the slip and the side force change their sign, which this
-model does not describe.
+The model is Coulomb friction during one monotonic press (Johnson 1985, section 7.1). The holding force is the side
+force that keeps the material point in place. The largest friction is the coefficient of friction times the force. If
+the holding force is smaller than the largest friction, the film sticks to the probe, and the side force is the holding
+force. Otherwise the film slips, and the side force is the largest friction in the direction opposite to the slip. The
+side force is distributed over the footprint like the pressure. When the probe is lifted again, the slip and the side
+force change their sign. The model does not describe this case.
 """
 
 import numpy as np

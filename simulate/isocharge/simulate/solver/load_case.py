@@ -96,7 +96,7 @@ class SolveSettings:
 
 
 def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float) -> None:
-    """Raise an error if a press cannot exist or exceeds the range of St. Venant-Kirchhoff elasticity.
+    """Raise an error if a press cannot exist or exceeds the range of Saint-Venant-Kirchhoff elasticity.
 
     Args:
         film: The film.
@@ -244,7 +244,7 @@ class LoadCase:
 def place_coated(
     film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float, *, whole: bool = False
 ) -> PlacedMesh:
-    """Place a mesh under a press, as `place` does, and refine it along the edges of the coat if the film has one.
+    """Place a mesh under a press, as `place` does. If the film has a coat, refine the mesh along the edges of the coat.
 
     Args:
         film: The film.
@@ -278,8 +278,8 @@ def place_coated(
 def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None) -> float:
     """Choose the width of the thin rings, in film radii.
 
-    The width is six bending lengths. If the starting equilibrium has the same mesh and a similar width, its width is
-    reused, so that its field can be the first iterate.
+    The width is six bending lengths. If the starting equilibrium has the same mesh and a similar width, this width is
+    reused. The field of the equilibrium can then be the first iterate.
 
     Args:
         film: The film.
@@ -366,8 +366,8 @@ def _thin_rings(placement: Placement, layer: float) -> int:
     """Return the number of thin rings at the rim.
 
     Each ring is a third as wide as the previous ring. In the template plane, the boundary layer of bending has its
-    largest width next to the probe, and its smallest width on the far side of the film, where the conformal map
-    compresses the layer. The widths of the rings cover the range between both.
+    largest width next to the probe. It has its smallest width on the far side of the film, where the conformal map
+    compresses it. The widths of the rings cover the range between these two widths.
 
     Args:
         placement: Placement of the mesh under the press.

@@ -162,8 +162,9 @@ def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
 def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
     """Compute the residual without the forces of the induced stress.
 
-    These forces are cubic in the field, so the residuals at two amplitudes separate them from the linear forces: with
-    r(a) = k a + c a^3, the linear part is k = (8 r(a) - r(2 a)) / (6 a).
+    The forces of the induced stress are cubic in the field, and the other forces are linear. At the amplitude a, they
+    therefore change the residual by r(a) = k a + c a^3. Two amplitudes determine the linear part k = (8 r(a) - r(2 a))
+    / (6 a).
 
     Args:
         elastic: The discrete film.
@@ -251,7 +252,7 @@ class _Iterate:
 
     @cached_property
     def relative_residual(self) -> float:
-        """Larger one of the relative transverse residual and the relative in-plane residual."""
+        """Maximum of the relative transverse residual and the relative in-plane residual."""
         residual = self.residual * self.free
         load = self.elastic.load_scale
         in_plane_force = max(self.elastic.in_plane_scale(self.field), 1e-300)
@@ -280,7 +281,9 @@ def _stalled(step_sizes: list[float]) -> bool:
 
 
 def _energy_norm(elastic: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
-    """Compute the size of a step: the square root of the ratio of its energy to the work of the load.
+    """Compute the size of a step.
+
+    The size is the square root of a ratio: the energy of the step, divided by the work of the load.
 
     Args:
         elastic: The discrete film.
@@ -344,8 +347,8 @@ def _chord_steps(iterate: _Iterate, factor: TangentFactor, residual_before: floa
 def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
     """Return a step that is a descent direction of the energy.
 
-    If the given step is not a descent direction, a tension is added to the tangent, and the tension is doubled until
-    the new step is a descent direction.
+    If the given step is not a descent direction, a tension is added to the tangent. The tension is doubled until the
+    new step is a descent direction.
 
     Args:
         iterate: Present iterate.

@@ -1,4 +1,7 @@
-"""Solver of a press: the choice of the mesh, the solve with the selected theory, and load steps if a solve fails."""
+"""Solver of a press.
+
+The solver chooses the mesh and solves with the selected theory. If this solve fails, the load is applied in steps.
+"""
 
 from dataclasses import replace
 from time import process_time
@@ -121,9 +124,9 @@ def needed_resolution(
 def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equilibrium:
     """Solve on meshes of increasing order until the charges of two meshes agree within half of the accuracy.
 
-    The order is increased at most `MAX_EXTRA_ORDERS` times. If no equilibrium is found on a further mesh, the result is
-    the equilibrium on the finer one of the two previous meshes, and its error is the difference between these two
-    meshes. If two meshes have different equilibria, the status of the result is "failed".
+    The order is increased at most `MAX_EXTRA_ORDERS` times. If no equilibrium is found on a further mesh, the two
+    previous meshes are used. The result is the equilibrium on the finer one of them, and its error is the difference
+    between both. If two meshes have different equilibria, the status of the result is "failed".
 
     Args:
         case: The press and its accuracy.

@@ -8,9 +8,9 @@ displacement by
 which costs one additional back substitution. Let alpha be the angle between an axis of the imperfection and the
 direction of the press. For an imperfection with two axes, the change is the sum of two fields with the factors cos(2
 alpha) and sin(2 alpha). With respect to a reflection in this direction, the first field is even and the second field is
-odd. Both fields are solved on the meshed half of the film, with different fixed displacement components on the line of
-symmetry. The derivative dR/dm and the change of the stress are central differences of the residual and of the stress of
-a press.
+odd. Both fields are solved on the meshed half of the film. They have different fixed displacement components on the
+line of symmetry. The derivative dR/dm and the change of the stress are central differences of the residual and of the
+stress of a press.
 """
 
 from collections.abc import Callable, Sequence
@@ -161,7 +161,7 @@ IS_ODD = np.array([field.odd for fields in FIELDS.values() for field in fields])
 
 
 def stress_changes(solved: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute the change of the scaled stress at the nodes by each of `FIELDS`, with the press on the x axis.
+    """Compute the change of the scaled stress at the nodes that each of `FIELDS` causes, for a press on the x axis.
 
     The change is computed at fixed points of the film. If the rim becomes oval, the nodes move, so the effect of their
     displacement is subtracted.

@@ -1,11 +1,11 @@
 """Factorisation of the tangent of an equilibrium, with the stiffness of trapped air.
 
-The air behind the film resists a deflection W that compresses it. The stiffness of the air is c v v', where v are the
-weights with which the deflections of the nodes contribute to the volume. This matrix couples all nodes and has the rank
-one. The system (K + c v v') x = b is therefore solved with the factorisation of the sparse matrix K (Sherman and
-Morrison 1950):
+The air behind the film resists a deflection W that compresses it. The stiffness of the air is c v v'. The vector v
+contains the weights with which the deflections of the nodes contribute to the volume. The matrix c v v' couples all
+nodes, and its rank is one. The system (K + c v v') x = b is therefore solved with the factorisation of the sparse
+matrix K (Sherman and Morrison 1950):
 
-    x = K^-1 b - y c (v . K^-1 b) / (1 + c v . y),   y = K^-1 v.
+    x = K^-1 b - y c (v' K^-1 b) / (1 + c v' y),   y = K^-1 v.
 
 Fields that are odd about the line of symmetry do not change the volume, so their matrix is K.
 """
