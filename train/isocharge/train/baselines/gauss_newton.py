@@ -1,8 +1,9 @@
 """Maximum a posteriori estimate of a contact by the Gauss-Newton method on a charge map.
 
-The residuals are (Q - Q(c)) / sigma(Q). The prior is uniform over the disk and over the logarithm of the force, so it
-only constrains the contact. The search starts at the press with the nearest charges. If the residuals of the solution
-are too large, it starts again at the press with the next nearest charges.
+The residuals are (Q - Q(c)) / sigma(Q), where Q are the measured charges and Q(c) those of a contact c. The prior is
+uniform over the disk and over the logarithm of the force, so it only constrains the contact. The search starts at the
+press with the nearest charges. If the residuals of the solution are too large, it starts again at the press with the
+next nearest charges.
 """
 
 import numpy as np
@@ -36,7 +37,7 @@ VALIDATION_FRACTION = 0.1
 
 
 class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """Regressor that searches the contact whose charges fit best.
+    """Regressor that searches for the contact whose charges agree best with the measured charges.
 
     Args:
         domain: Contacts that can occur.

@@ -2,13 +2,13 @@
 
 Linear band: up to 0.5 N the charges are taken as proportional to the force, Q = F s(x, y), with one slope s for each
 electrode. The slopes are interpolated between the presses by a polynomial of the position and tabulated on a fine grid.
-The ratios of the charges give the nearest grid point. About this point, Q = F (s + ds/dx dx + ds/dy dy) is linear in F,
-F dx and F dy and is solved. On a slack film the charges are proportional to F^(2/3) instead, and the errors of this
-method show the consequence.
+The ratios of the charges give the nearest grid point. Near this point, the equation Q = F (s + ds/dx dx + ds/dy dy) is
+linear in F, F dx and F dy. It is solved for these three unknowns. On a slack film the charges are proportional to
+F^(2/3) instead, and the errors of this method show the consequence.
 
-Lookup table: an entry is a contact with the mean features of its presses, and with the affine map that fits the presses
-in its neighbourhood best. Large neighbourhoods average the noise, and small ones follow the curvature of the map;
-validation chooses the size.
+Lookup table: an entry consists of a contact, the mean features of its presses, and an affine map. The affine map is
+fitted to the presses in the neighbourhood of the contact. Large neighbourhoods average the noise, and small ones follow
+the curvature of the map; validation chooses the size.
 """
 
 import numpy as np

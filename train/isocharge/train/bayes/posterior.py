@@ -199,7 +199,7 @@ class Posterior:
         check_radius(self.radius, self.charges.domain.radius, "charge table")
 
     def mean_and_std(self, charge: Array, executor: Executor | None = None) -> tuple[Array, Array]:
-        """Compute mean and standard deviation of the posterior.
+        """Compute the mean and the standard deviation of the posterior.
 
         The mean of the force is E[1/F] / E[1/F^2], the estimate with the smallest mean squared relative error.
 
@@ -269,8 +269,8 @@ class Posterior:
     def _integration_cells(self, charge: Array) -> Iterator[Cells]:
         """Yield cells that cover the posterior and are small compared with its width.
 
-        All cells of a press have the same side. In each round, the cells of the presses whose cells are small enough
-        are yielded, and the cells of the other presses are divided into four.
+        All cells of a press have the same side. If the cells of a press are small enough, they are yielded. Otherwise,
+        each of them is divided into four for the next round.
 
         Args:
             charge: Charges with noise, shape (n_press, n_electrode), pC.
@@ -319,7 +319,7 @@ class Posterior:
     def _chi2_and_slope(
         self, terms: Array, log_force: Array, charge: Array, largest_slope: Array
     ) -> tuple[Array, Array]:
-        """Compute chi-squared at the centres of cells, and a bound of its change with the position.
+        """Compute chi-squared at the centres of cells, and the largest slope of its square root in each cell.
 
         Args:
             terms: Terms of the charges, shape (n, n_term, n_electrode).
@@ -339,7 +339,7 @@ class Posterior:
         return chi2, np.linalg.norm(slope, axis=1)
 
     def _inverse_std(self, cells: Cells, terms: Array, log_force: Array) -> Array:
-        """Compute the inverse of the smallest standard deviation of the position with unknown force.
+        """Compute the inverse of the smallest standard deviation of the position if the force is unknown.
 
         Args:
             cells: Cells at whose centres the contact is assumed.
@@ -390,7 +390,7 @@ class Posterior:
 
 
 def _moments(press: Integers, position: Array, log_force: Array, log_weight: Array) -> Array:
-    """Compute mean and standard deviation of (x, y, F) of every press.
+    """Compute the mean and the standard deviation of (x, y, F) for every press.
 
     Args:
         press: Number of the press of each position, ascending, shape (n_position,).

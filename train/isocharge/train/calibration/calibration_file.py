@@ -6,7 +6,7 @@ and correlations then refer to the parameters and the coefficients. If temperatu
 contains the change of the pretension with temperature.
 
 An unknown whose standard deviation is zero is written with correlations of zero to all others. Older versions wrote
-null there, because zero over zero is not a number; the reader takes null for zero in these places.
+null for these correlations, because zero divided by zero is not a number. The reader replaces such a null by zero.
 """
 
 from pathlib import Path

@@ -12,8 +12,8 @@ contains the prior of a contact. By the prior, the contact lies in the working a
 errors are therefore finite where the charge map folds.
 
 The information that a press adds about the film depends on the contact, but hardly on the measured charges. The best
-next press can therefore be chosen before it is made. Presses are chosen one after the other, each as the best one given
-the previous ones (a greedy A-optimal design, Pukelsheim 1993).
+next press can therefore be chosen before it is made. Presses are chosen one after the other. Each of them is the best
+press given the previous presses (a greedy A-optimal design, Pukelsheim 1993).
 """
 
 from dataclasses import dataclass

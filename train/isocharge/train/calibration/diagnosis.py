@@ -2,8 +2,8 @@
 
 The mistakes that are considered are swapped columns, rotated or mirrored axes, and other units. The presses are
 corrected for each mistake in turn and compared with a few films. An error message names the mistakes whose correction
-makes the presses agree with a film. The data themselves are never changed. Positions off the film, dead channels and
-channels with the wrong sign are found before, by separate checks.
+makes the presses agree with a film. The data themselves are never changed. Separate checks find positions off the film,
+dead channels and channels with the wrong sign before this search.
 """
 
 from collections.abc import Iterator
@@ -235,7 +235,8 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
 def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected: Array) -> float:
     """Compute the difference between measured charges and those of the most similar of several films.
 
-    The difference is the mean squared logarithm of measured over expected charges, in units of the spread of the films.
+    The difference is the mean squared logarithm of the ratio of measured to expected charges. Its unit is the spread of
+    the films.
 
     Args:
         charges: The films of the calibration. If many contacts lie outside their domain, the misfit is infinite.

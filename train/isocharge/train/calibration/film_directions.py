@@ -4,9 +4,9 @@ The result is written as `film_directions.npz`; see `serve.model.film_directions
 
 At a given pretension, the other unknowns of a film have the covariance C = R R'. Let M be the derivative of the misfit
 vectors with respect to the unknowns, in units of the noise. The right singular vectors of M R are combinations of the
-unknowns that are independent before any touch, and whose effects on the misfits of touches are orthogonal (the
-likelihood-informed directions of Cui et al. 2014). Touches hardly identify a combination with a small singular value.
-Such a combination is left out.
+unknowns. These combinations are independent before any touch, and their effects on the misfits of touches are
+orthogonal (the likelihood-informed directions of Cui et al. 2014). Touches hardly identify a combination with a small
+singular value. Such a combination is left out.
 """
 
 import numpy as np
@@ -62,7 +62,7 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
 
 
 def _root(covariance: Array) -> Array:
-    """Return a matrix R with R R' equal to a covariance that may be singular, shape (n, m), m <= n."""
+    """Return a matrix R, shape (n, m) with m <= n, whose product R R' is a covariance that may be singular."""
     variances, axes = np.linalg.eigh(covariance)
     is_uncertain = variances > LEAST_VARIANCE * variances[-1]
     return np.asarray(axes[:, is_uncertain] * np.sqrt(variances[is_uncertain]))

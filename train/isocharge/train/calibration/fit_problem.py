@@ -1,11 +1,10 @@
 """Least-squares problem of a calibration, whose solution is the film that explains presses best.
 
-The unknowns minimise
+The unknowns p minimise the sum of two parts. The first part contains the squared residuals of the charges and of the
+rig, for each press at the contact where they are smallest. The second part is the prior, |(p - mean) / std|^2.
 
-    sum over presses of  min over its contact of |residuals of charges and rig|^2   +   |(p - mean) / std|^2,
-
-by SciPy's trust-region method. The contacts are eliminated in every step (variable projection, Golub and Pereyra 1973),
-so that only the unknowns of the film remain.
+The problem is solved by SciPy's trust-region method. The contacts are eliminated in every step (variable projection,
+Golub and Pereyra 1973), so that only the unknowns of the film remain.
 """
 
 from dataclasses import dataclass

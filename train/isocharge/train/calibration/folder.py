@@ -11,8 +11,8 @@
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the files of the last version
 
 A further calibration in the same folder becomes its next version. A server loads this version when it reloads its
-models. Programs only read the version folders. The copies above them are for people. They are written again from the
-last version before each calibration, so that they are also correct if a process was killed.
+models. Programs only read the version folders. The copies above them are for people. Before each calibration, the
+copies are written again from the last version, because an earlier process may have been killed before it wrote them.
 """
 
 import json

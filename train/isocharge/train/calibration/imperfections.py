@@ -143,8 +143,8 @@ def tension_unevenness(pretension: float, tension_stds: Array, coefficients: Arr
 def log_unevenness(log_tension_derivative: Array) -> Array:
     """Compute the derivative of ln Q with respect to the unevenness of the tension.
 
-    It is x (1 - (1 - x / 2)^SLACKENING) with x = -d ln Q / d ln T. The effect of the tension is smaller if the press
-    itself stretches the film.
+    The derivative is x (1 - (1 - x / 2)^SLACKENING) with x = -d ln Q / d ln T. The effect of the tension is smaller if
+    the press itself stretches the film.
 
     Args:
         log_tension_derivative: d ln Q / d ln T, shape (n, n_electrode).

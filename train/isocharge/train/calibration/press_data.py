@@ -172,7 +172,7 @@ def temperatures(presses: MeasuredPresses) -> Array:
 
 
 def _film_excess(presses: MeasuredPresses) -> Array:
-    """Return the temperature of the film above that of its ring, less the mean of this difference, shape (n,), K."""
+    """Return the temperature difference between film and ring minus its mean over the presses, shape (n,), K."""
     if presses.film_temperature_C is None or not presses.knows_film_temperature:
         return np.zeros(len(presses))
     excess = _without_gaps(presses.film_temperature_C) - temperatures(presses)

@@ -178,7 +178,8 @@ class PressSession:
 
     @property
     def enough(self) -> bool:
-        """Whether the uncertainty of the film causes a small enough position error in comparison with the noise."""
+        """Whether the position error that the uncertainty of the film causes is small enough compared with that of
+        noise."""
         if self.result is None or len(self) < FEW:
             return False
         noise_mm = self.result.sensitivity.noise_error.position_mm

@@ -1,9 +1,10 @@
 """C source of a layer of a network: a function with constant arrays.
 
-A layer computes y = f(x W + c). Its weights have the shape (inputs, outputs), and a few rows at a time are added to all
-outputs. The inner loop runs over neighbouring outputs with a constant count, so compilers vectorise it from -O2 on
-without changing the order of any sum. If two perceptrons run side by side, the weights are two blocks, and the zeros
-beside the blocks are left out. Weights that training rounded to 8 bits take one byte each.
+A layer computes y = f(x W + c). The weights W have the shape (inputs, outputs). The products with a few rows of W at a
+time are added to all outputs. The inner loop runs over neighbouring outputs, and its number of iterations is constant.
+Compilers therefore vectorise the loop from -O2 on without changing the order of any sum. If two perceptrons run side by
+side, the weights are two blocks, and the zeros beside the blocks are left out. Weights that training rounded to 8 bits
+take one byte each.
 """
 
 from collections.abc import Sequence
@@ -115,7 +116,7 @@ def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Bloc
 
 
 def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
-    """Return weights as 8-bit integers with a scale for each column, if they are multiples of it.
+    """Convert weights to 8-bit integers with a scale for each column, if all weights are multiples of the scale.
 
     Args:
         values: Weights, shape (inputs, outputs).

@@ -143,7 +143,7 @@ def self_test(golden: Golden) -> str:
 
 
 def _features_source(features: ChargeFeatures) -> str:
-    """Return the function `features` from the charges to the inputs of the first layer."""
+    """Return the C function `features`, which computes the inputs of the first layer from the charges."""
     factor = _singles(1.0 / features.typical_pC)
     if features.mean is None:
         return source_text(

@@ -61,7 +61,7 @@ class FilmInputs:
 
     @classmethod
     def fit(cls, scaling: FilmScaling, presses: FilmPresses) -> "FilmInputs":
-        """Fit mean and whitening to charges without noise of many films.
+        """Fit the mean and the whitening matrix to noise-free charges of many films.
 
         Args:
             scaling: Exact scales and contexts of films.

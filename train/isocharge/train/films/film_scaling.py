@@ -26,7 +26,7 @@ N_FILMS = 4096
 
 
 class ContextStatistics(NamedTuple):
-    """Mean and standard deviation of the context over the films, shape (n_context,) each."""
+    """Mean and standard deviation of the context over the films, each of shape (n_context,)."""
 
     mean: Array
     std: Array

@@ -320,7 +320,7 @@ def _check_shapes(features: ChargeFeatures, perceptron: Perceptron[Array], where
 
 @dataclass(frozen=True)
 class _PlainNode:
-    """A node without arbitrary names: two nodes that compute the same from the same inputs are equal.
+    """A node without arbitrary names. Two nodes are equal if they compute the same from the same inputs.
 
     Attributes:
         operator: The operator.
@@ -362,7 +362,7 @@ def _plain_nodes(graph: onnx.GraphProto) -> Iterator[_PlainNode]:
 
 
 def _plain_constant(values: NDArray[Any]) -> tuple[object, ...]:
-    """Return number type, shape and numbers of a constant."""
+    """Return the number type, the shape and the numbers of a constant."""
     return values.dtype.str, values.shape, values.tolist()
 
 

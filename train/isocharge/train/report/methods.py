@@ -121,7 +121,7 @@ def _test_inputs(method: ComparedMethod, test: LabelledPresses) -> Array:
 
 
 def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callable[[], object]:
-    """Return a function that predicts one press, and the next press at each call.
+    """Return a function that predicts one press. Each call predicts the next press.
 
     ONNX networks are called in the same way as by `Predictor`, with arrays that are bound only once.
 
