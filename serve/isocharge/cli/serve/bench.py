@@ -48,7 +48,7 @@ def bench_command(
 
 
 def _lines(model: Model, timings: list[Timing], errors: dict[str, float]) -> Iterator[str]:
-    """Yield the lines of the report: the machine, a table of the timings, and a table of the errors of the model.
+    """Yield the lines of the report on the machine, the timings and the errors of the model.
 
     Args:
         model: The model.

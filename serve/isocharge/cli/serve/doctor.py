@@ -178,8 +178,10 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
 
 
 def port_lines() -> Iterator[str]:
-    """Yield a line for each serial port of this machine, with its description and the frames received within one
-    second."""
+    """Yield a line for each serial port of this machine.
+
+    The line describes the port and the frames received within one second.
+    """
     for port in sorted(list_ports.comports()):
         try:
             examination = examine(port.device, seconds=1.0)

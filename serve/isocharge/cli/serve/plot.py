@@ -225,7 +225,7 @@ def recording_picture(
 
 
 def _draw_with_std(axes: Any, groups: _Groups, traces: dict[str, Array], name: str, colour: str) -> None:
-    """Draw a quantity over time, with a band of two standard deviations."""
+    """Draw a quantity over time, and a band of two standard deviations around it."""
     values = traces[name]
     spread = 2.0 * traces[name.replace("_", "_std_")]
     groups.draw_band(axes, values - spread, values + spread, color=colour, alpha=0.25, lw=0.0)
@@ -241,7 +241,7 @@ def _draw_charges(axes: Any, groups: _Groups, traces: dict[str, Array]) -> None:
 
 
 def _draw_flags(axes: Any, groups: _Groups, traces: dict[str, Array], words: list[str]) -> None:
-    """Draw the times at which flags are set, with one row of bars for each flag.
+    """Draw the times at which flags are set. Each flag has one row of bars.
 
     A single record is drawn as a short bar, so that it is visible.
 
@@ -345,6 +345,6 @@ def _draw_contacts(
 
 
 def _every_nth(values: Any, max_count: int) -> Any:
-    """Return every n-th row of an array, with the smallest n for which there are at most `max_count` rows."""
+    """Return every n-th row of an array. The function uses the smallest n for which at most `max_count` rows remain."""
     step = max(1, -(-len(values) // max_count))
     return values[::step]

@@ -1,4 +1,4 @@
-"""Check which channel belongs to which electrode, by a press near each electrode in turn.
+"""Check which channel belongs to which electrode. The user presses near each electrode in turn.
 
 The electrode next to a press collects the largest charge. The change of a channel under one press is compared with its
 changes under the other presses. The gains of the channels therefore need not be known or equal.

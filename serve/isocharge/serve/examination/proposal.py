@@ -138,7 +138,7 @@ def _recognise_frames(received: ReceivedData) -> dict[str, Any] | None:
 def unit_of(capture: Capture) -> str:
     """Return the unit of the values of a board whose gain is unknown: "pC", "counts" or "V".
 
-    The rules are applied in this order:
+    The rules are applied in the following order.
 
     - Binary frames of isocharge, channels whose names end in `_pC`, and small values that never change are in pC.
     - Whole numbers are counts.

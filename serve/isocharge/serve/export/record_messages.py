@@ -1,13 +1,13 @@
 """Conversion of prediction records to ROS 2 messages in CDR: the wrench of the press, its pose, and the record as text.
 
-The name of the coordinate frame of the messages is the `frame_id` of the record, which is the name of the sensor. The
-section Coordinates of README.md defines the origin and the axes x and y of this frame. ROS requires right-handed
-frames, so z points towards the probe, against the direction of the push.
+The coordinate frame of the messages has the name in the field `frame_id` of the record, which is the name of the
+sensor. The section Coordinates of README.md defines the origin and the axes x and y of this frame. ROS requires
+right-handed frames, so z points towards the probe, against the direction of the push.
 
 The wrench is the load of the probe on the film. A press of F at (x, y) has the force (0, 0, -F) and the torque (-y F, x
-F, 0) about the origin. The pose is the point of contact in the plane of the unloaded film, without rotation, with the
-standard deviations of the model. If contacts are tracked, the wrench and the pose describe the tracked contact, as on
-the live page. The record also contains the contact of the single frame.
+F, 0) about the origin. The pose is the point of contact in the plane of the unloaded film. It has no rotation, and its
+covariance contains the standard deviations of the model. If contacts are tracked, the wrench and the pose describe the
+tracked contact, as on the live page. The record also contains the contact of the single frame.
 
 A ROS message consists of a header and numbers of double precision. The messages are encoded here, because
 `mcap-ros2-support` provides its encoder only as a part of its own writer, which cannot write JSON and takes 15 times as

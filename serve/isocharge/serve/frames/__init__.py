@@ -2,6 +2,6 @@
 
 May import: flags.
 
-Each format has a parser class derived from `frame.Parser` and a section class in `formats`, by which a device file
-names it.
+Each format has a parser class derived from `frame.Parser`, and a section class in `formats`. A device file names the
+format by the tag of the section class.
 """

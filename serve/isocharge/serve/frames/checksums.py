@@ -1,4 +1,4 @@
-"""Checksums of frames, with the names that catalogues and manuals use.
+"""Checksums of frames. They have the names that catalogues and manuals use.
 
 A cyclic redundancy check (CRC) has the parameters of Williams's model ("A painless guide to CRC error detection
 algorithms", 1993). Names and values are those of Cook's catalogue of parametrised CRC algorithms, where

@@ -1,6 +1,6 @@
 """Stages that compute the contact of a record from a reading of the charges.
 
-The stages process each frame in this order:
+The stages process each frame in the following order.
 
 - `PredictionStage` predicts the contact with the model, and adds the flags of the model.
 - `FilmStage` follows the pretension of the film from touch to touch (section `[follow]` of the device file).
@@ -242,7 +242,8 @@ class ChargeScaleStage(ContactStage):
     def _shift(self, frame: ContactFrame, contact: Contact) -> tuple[float, float, float] | None:
         """Return the changes of x and y (mm) and of the force (N) that one standard deviation of the scale causes.
 
-        For a contact of the mixture, only the force is assumed to depend on the scale, with the largest exponent.
+        For a contact of the mixture, only the force is assumed to depend on the scale. The largest exponent is used for
+        this dependence.
 
         Args:
             frame: The frame.

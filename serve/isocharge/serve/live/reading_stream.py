@@ -146,14 +146,14 @@ def electrode_of(name: str) -> str:
 
 
 class TimedReading(NamedTuple):
-    """A frame after the signal chain, with its time."""
+    """A frame after the signal chain, and its time."""
 
     reading: Reading
     time: ReadingTime
 
 
 class ReadingStream:
-    """The path from chunks to readings, with its state. An object belongs to one thread.
+    """The path from chunks to readings. The object stores the state of the path. An object belongs to one thread.
 
     Attributes:
         parser: Parser of the frames, with its counters.

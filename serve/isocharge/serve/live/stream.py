@@ -107,7 +107,7 @@ def stream(
 
 
 class TouchStream:
-    """The path from chunks to records, with its state. An object belongs to one thread.
+    """The path from chunks to records. The object stores the state of the path. An object belongs to one thread.
 
     Attributes:
         parser: Parser of the frames, with its counters.
@@ -348,7 +348,10 @@ class TouchStream:
         return {name: q if math.isfinite(q) else None for name, q in zip(self._electrodes, values, strict=True)}
 
     def _misfit(self, charge_pC: Array) -> Reals:
-        """Return the misfits, shape (n,), of charges of shape (n, electrodes), pC, with the current model."""
+        """Return the misfits of charges with the current model.
+
+        The charges (pC) have the shape (n, electrodes), and the misfits have the shape (n,).
+        """
         return self.answering_predictor.predict_batch(charge_pC).misfit
 
 

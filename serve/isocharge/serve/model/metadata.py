@@ -190,7 +190,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         return str(self.sensor["name"])
 
     def to_props(self) -> dict[str, str]:
-        """Return the ONNX `metadata_props`: the value of each field as JSON, without the fields that are None.
+        """Return the ONNX `metadata_props`, which contain the values of all fields except None as JSON.
 
         Raises:
             ModelError: If a value, such as NaN, cannot be expressed in JSON.

@@ -1,4 +1,4 @@
-"""The folder of a model: writing a version, reading a version, and finding a model by its name or path.
+"""The folder of a model. The functions write a version, read a version, and find a model by its name or path.
 
     <name>/config.pbtxt            configuration for Triton
     <name>/<version>/model.onnx    graph from charge_pC to contact, contact_std, contact_correlation and misfit,
@@ -119,7 +119,7 @@ def model_names(root: Path) -> list[str]:
 
 
 def _released_models() -> Path:
-    """Return the folder of the released models: in the installed package, or at the top of a source checkout."""
+    """Return the folder of the released models in the installed package or at the top of a source checkout."""
     module = Path(__file__).resolve()
     packaged = module.parents[1] / "released"
     return packaged if packaged.is_dir() else module.parents[4] / "models"

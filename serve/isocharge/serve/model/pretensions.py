@@ -6,7 +6,7 @@
     <constant>           values of the constant of the graph with this name, at each of these pretensions
 
 Between these pretensions, the weights are interpolated by a polynomial. All pretensions use the same graph,
-`model.onnx`, with other constants. A prediction therefore takes the same time at every pretension.
+`model.onnx`. Only the constants of the graph differ. A prediction therefore takes the same time at every pretension.
 """
 
 import io
@@ -154,7 +154,7 @@ class Pretensions:
         return replace(self, node_MPa=node_MPa, weights=weights)
 
     def constants(self, pretension_MPa: float) -> dict[str, Singles]:
-        """Return the constants of the graph at one pretension within `range_MPa`, by their names."""
+        """Return a dictionary of the constants of the graph at one pretension within `range_MPa`."""
         single = self.at(np.array([pretension_MPa]))
         return {name: rows[0] for name, rows in single.weights.items()}
 

@@ -4,7 +4,7 @@ Every page in a browser can send requests to every address that the browser can 
 form or a `fetch` with `mode: "no-cors"` cannot read the response, but the server executes the request. With DNS
 rebinding, an attacker changes the address of a name to this machine after the page was loaded. The browser then treats
 the page as a page of this server, and the page can also read the responses. Pages cannot change the following headers,
-by which such requests are recognised:
+by which such requests are recognised.
 
 - `Host` is the name that the browser has requested. After DNS rebinding, this name is neither an IP address nor a name
   of this server.

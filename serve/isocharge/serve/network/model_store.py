@@ -115,7 +115,7 @@ class ModelStore:
         return loaded
 
     def _not_found_message(self, name: str, version: str) -> str:
-        """Return the message for a model that is not loaded, with the loaded versions and the reasons for refusals.
+        """Return the message for a model that is not loaded. It lists the loaded versions and the reasons for refusals.
 
         Args:
             name: Name of the model.

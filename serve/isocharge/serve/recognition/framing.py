@@ -268,7 +268,7 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
 
 
 def _named(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> Iterator[Check]:
-    """Yield the named checksums that fit, with the position of the first byte that they cover.
+    """Yield the named checksums that fit, and the position of the first byte that each of them covers.
 
     Args:
         frames: The frames, which are of one length.

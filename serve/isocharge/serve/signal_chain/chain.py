@@ -1,6 +1,6 @@
 """The signal chain, which computes touch charges from the numbers of a board and detects touches.
 
-`Chain` has the settings of all stages. `SignalChain` has the stages that these settings request, in this order:
+`Chain` contains the settings of all stages. `SignalChain` has the requested stages in the following order.
 
 - `Gain` converts the unit of the device to pC, with the offset, the sign and the gain of each channel.
 - `Limit` marks frames with a charge at the limit of the converter.

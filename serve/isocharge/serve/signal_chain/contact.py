@@ -1,4 +1,4 @@
-"""Detection of a touch by the total charge, with hysteresis.
+"""Detection of a touch by the total charge. The detection has a hysteresis.
 
 A touch begins when the total charge rises out of the noise. A touch ends when the total charge falls below a share of
 the peak of this press. With an absolute threshold, a touch would never end after the charge at rest has drifted above

@@ -26,7 +26,7 @@ from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
 
 
 class LeakRule(Rule, frozen=True, kw_only=True):
-    """Settings of the estimate of the inflow; a part of the section `[leak]` of a device file.
+    """Settings for estimating the inflow. They are a part of the section `[leak]` of a device file.
 
     Attributes:
         learn: Whether the inflow b is estimated.

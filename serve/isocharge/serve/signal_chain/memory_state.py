@@ -1,4 +1,7 @@
-"""State of the memory of a film: the meaning of its rows, and their propagation in time; see `memory`."""
+"""State of the memory of a film (see `memory`).
+
+The module defines the rows of the state and their propagation in time.
+"""
 
 from functools import lru_cache
 

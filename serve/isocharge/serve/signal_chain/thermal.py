@@ -34,7 +34,7 @@ Misfit = Callable[[Array], Reals]
 
 
 class ThermalRule(Rule, frozen=True, kw_only=True):
-    """Settings of the estimate of warming; a part of the section `[common_mode]` of a device file.
+    """Settings for estimating the warming. They are a part of the section `[common_mode]` of a device file.
 
     Attributes:
         every_s: Time between two estimates, s.

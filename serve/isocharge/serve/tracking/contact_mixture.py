@@ -7,7 +7,7 @@ The state of a component is the position, the logarithm of the force, the rates 
 the electrode gains. The distribution of the state is a sum of Gaussians (Alspach and Sorenson 1972). Each component is
 updated with the measured charges by an iterated extended Kalman filter (Bell and Cathey 1993).
 
-Components are added in four cases:
+Components are added in four cases.
 
 - When a touch begins, components are placed all over the film. Components that do not explain the charges are removed.
 - If the most probable component extends across a fold, two components are added, one towards each side.
@@ -193,7 +193,8 @@ class ContactMixture:
     def _search(self, measurement: Measurement) -> Components | None:
         """Search the whole film for contacts that explain the charges.
 
-        Components are placed on a spiral that covers the film, with large variances, and updated with the charges.
+        Components with large variances are placed on a spiral that covers the film, and are then updated with the
+        charges.
 
         Returns:
             The components that explain the charges; None if there are none.

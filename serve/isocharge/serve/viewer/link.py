@@ -111,7 +111,7 @@ class PageEnd(LinkEnd):
     _incomplete: bytes = b""
 
     def receive_samples(self, size: int) -> bytes:
-        """Return the samples that have arrived, without waiting.
+        """Return the samples that have already arrived. The method does not wait.
 
         Args:
             size: Size of a sample, bytes. An incomplete sample is kept for the next call.
@@ -130,7 +130,7 @@ class PageEnd(LinkEnd):
         return data[:complete_bytes]
 
     def receive_messages(self) -> list[Message]:
-        """Return the messages that have arrived, without waiting."""
+        """Return the messages that have already arrived. The method does not wait."""
         messages: list[Message] = []
         with suppress(OSError):  # BlockingIOError means that no further message has arrived
             while data := self.messages.recv(MAX_MESSAGE_BYTES, socket.MSG_DONTWAIT):

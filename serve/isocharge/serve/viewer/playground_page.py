@@ -71,7 +71,7 @@ def playground_html(models: tuple[str, ...] = MODELS) -> str:
 
 
 def _page_data(series: StressSeries, models: tuple[str, ...]) -> dict[str, Any]:
-    """Return the data of the page: the stress of the film, the models and the meanings of their flags."""
+    """Return the data of the page, which are the stress of the film, the models and the meanings of their flags."""
     return {
         "stress": series.to_json(),
         "models": [_describe_model(model, series) for model in models],

@@ -1,4 +1,6 @@
-"""Virtual sensor: a pseudo-terminal that sends the frames of a board, with scripted or random presses and faults.
+"""Virtual sensor, which is a pseudo-terminal that sends the frames of a board.
+
+Presses and faults are scripted or random.
 
 May import: frames.
 """

@@ -1,4 +1,7 @@
-"""Scripts of a virtual sensor: position and force of the press in each frame, and faults of the transmission."""
+"""Scripts of a virtual sensor.
+
+A script contains the position and force of the press in each frame, and faults of the transmission.
+"""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -174,7 +177,7 @@ def wander(
     radius_mm: float = DEFAULT_RADIUS,
     force_range_N: tuple[float, float] = DEFAULT_PLAYED_FORCE_RANGE,
 ) -> Script:
-    """Create a script of random presses that move over the film, with pauses between them.
+    """Create a script of random presses that move over the film. There are pauses between the presses.
 
     The position and the logarithm of the force vary smoothly within a press. The forces stay within the given range,
     because a forward map is only valid in a range of forces.

@@ -1,4 +1,6 @@
-"""Answers to the calls of `inference.GRPCInferenceService`, with the models, limits and token of the HTTP server.
+"""Answers to the calls of `inference.GRPCInferenceService`.
+
+The service has the same models, limits and token as the HTTP server.
 
 All methods are declared as streams of messages from the client. The token and the limits can therefore be checked
 before the first message arrives. If the largest number of calls is open, the call that has waited longest for a message

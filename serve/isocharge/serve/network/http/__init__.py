@@ -1,4 +1,4 @@
-"""HTTP server of the Open Inference Protocol, with limits of size and time."""
+"""HTTP server of the Open Inference Protocol, which limits the size and the duration of requests."""
 
 from isocharge.common.extras import require
 

@@ -1,4 +1,4 @@
-"""HTTP/1.1 on one connection, with limits of size and time.
+"""HTTP/1.1 on one connection. The size and the duration of requests are limited.
 
 A complete request is answered at once in the event loop, because most answers take microseconds. A request that may
 take longer is answered in another thread. Later requests of the same connection wait until its answer is sent.

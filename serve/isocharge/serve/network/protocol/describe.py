@@ -59,7 +59,7 @@ def model_config(loaded: LoadedVersion, limits: ServerLimits) -> dict[str, Any]:
 
 
 def statistics_of(store: ModelStore, name: str = "", version: str = "") -> dict[str, Any]:
-    """Return the counters of a version of a model, of all its versions, or of all models.
+    """Return the counters of one version of a model, of all versions of a model, or of all models.
 
     Args:
         store: The models.

@@ -70,7 +70,7 @@ def _path_item(path: str, route: Route) -> Json:
 
 
 def _content(schema: Schema, media_type: str) -> Json:
-    """Return the description of a body of this media type, with a reference to its schema."""
+    """Return the description of a body of this media type. The description refers to the schema of the body."""
     return {media_type: {"schema": {"$ref": REFERENCE.format(name=schema.name)}}}
 
 

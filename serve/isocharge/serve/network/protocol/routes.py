@@ -276,7 +276,10 @@ def _infer(request: Request) -> Response:
 
 
 def model_paths(ending: str = "") -> tuple[str, str]:
-    """Return the two paths of a route for a model: with the name, and with the name and the version of the model."""
+    """Return the two paths of a route for a model.
+
+    The first path contains the name of the model, and the second path also its version.
+    """
     return f"/v2/models/{{model}}{ending}", f"/v2/models/{{model}}/versions/{{version}}{ending}"
 
 
