@@ -53,6 +53,8 @@ class PressChunk:
         # Interpolate the three stress components of all fields from the nodes of the element of each point.
         n_component = 3 * is_odd.size
         basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel()).astype(self.field.dtype)
+        # Shapes: (n_press, n_element, n_local, n_component), (n_pair * n_point, n_local, n_component), and
+        # (n_pair, n_point, n_component).
         field_by_element = self.field.reshape(len(self.field), mesh.n_element, -1, n_component)
         nodal_stress = field_by_element[press_index[:, None], element].reshape(*basis_values.shape, n_component)
         stress = np.matmul(basis_values[:, None, :], nodal_stress).reshape(*position.shape, n_component)

@@ -165,9 +165,11 @@ def _ray_angles(blocks: Blocks, stops: Complexes, radius_ratio: Array) -> Array:
         Angles, shape (..., n_sector + 1), rad.
     """
     stop_angle = np.unwrap(np.angle(stops), axis=-1)
-    even_angle = np.linspace(0.0, 2.0 * np.pi / blocks.copies, stop_angle.shape[-1])
-    mean_difference = np.mean(stop_angle[..., :-1] - even_angle[:-1], axis=-1)
-    even_angle = even_angle + mean_difference[..., None]
+    angle_from_first = np.linspace(0.0, 2.0 * np.pi / blocks.copies, stop_angle.shape[-1])
+    mean_difference = np.mean(stop_angle[..., :-1] - angle_from_first[:-1], axis=-1)
+    even_angle = angle_from_first + mean_difference[..., None]
+
+    # Turn each ray from its stop towards the equal angles. `tanh` limits the turn to `MAX_TURN`.
     evenness = 0.5 * np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)[..., None]
     turn = MAX_TURN * np.tanh(evenness * (even_angle - stop_angle) / MAX_TURN)
     mixed_angle = stop_angle + turn

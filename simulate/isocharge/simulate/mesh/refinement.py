@@ -289,7 +289,8 @@ def refine(mesh: PlacedMesh, lines: Complexes, finest: float) -> PlacedMesh:
         if not is_split.any():
             break
 
-        for axis in (0, 1):  # halve along xi first, then along eta
+        # Halve along xi first, then along eta. Each halving appends the second halves, which may be halved again.
+        for axis in (0, 1):
             halved = is_split[:, axis]
             size[halved, axis] *= 0.5
             second_low = low[halved].copy()
