@@ -1,9 +1,11 @@
 """Configuration of the site: the pages, the example scripts with their pictures, and a reference of all modules.
 
-    python -m sphinx -W --keep-going -c .ci/docs . build/docs
-
 The source folder of the site is the folder of the project. Links between pages therefore work both on the site and
 where the code is hosted.
+
+Example of a build:
+
+    python -m sphinx -W --keep-going -c .ci/docs . build/docs
 """
 
 import shutil

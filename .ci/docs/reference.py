@@ -43,7 +43,7 @@ def check_docstrings(names: list[str]) -> None:
 def write_pages(names: list[str], folder: Path) -> None:
     """Write a page for each module, and one page that lists all modules.
 
-    No table of contents contains the pages of the modules, because every page of the site repeats these tables.
+    The pages of the modules are in no table of contents, because every page of the site would repeat such a table.
 
     Args:
         names: Names of the modules.

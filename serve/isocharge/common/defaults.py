@@ -1,11 +1,13 @@
 """Defaults that several packages share: the presses of a sweep, and the largest batch.
 
-This module imports nothing, so that `--help` shows the defaults without delay.
+This module imports no other module, so that `--help` shows the defaults without delay.
 """
 
 DEFAULT_RADIUS = 8.0
-"""Largest distance of a press from the film's centre, mm. The electrodes of most built-in sensors begin farther out, at
-about 10 mm."""
+"""Largest distance of a press from the film's centre, mm.
+
+The electrodes of most built-in sensors begin farther out, at about 10 mm.
+"""
 
 DEFAULT_FORCE_RANGE = (0.05, 2.0)
 """Smallest and largest force, N. The released models cover this range."""

@@ -82,7 +82,7 @@ def bounded_lines(file: TextIO, max_characters: int = MAX_LINE_CHARACTERS) -> It
 
 
 def read_needed(path: Path, error: type[IsochargeError], advice: str, max_bytes: int = MAX_FILE_BYTES) -> bytes:
-    """Read the bytes of a regular file, and raise an error with advice if this is not possible.
+    """Read the bytes of a regular file. If this is not possible, raise an error that states what to do.
 
     Args:
         path: The file.

@@ -1,10 +1,9 @@
 """Multilayer perceptron with a skip layer: its definition, and its evaluation with NumPy.
 
-    h_0 = x,    h_l = f(h_(l-1) W_l + b_l),    y = h_L V + c + x S
-
-The activation f follows each hidden layer. The skip layer S maps the inputs linearly to the outputs, so that the hidden
-layers only need to learn the nonlinear part. Leading dimensions of the arrays are batch dimensions, so that the weights
-of several perceptrons can be evaluated in one call.
+For inputs x, the hidden layers compute h_l = f(h_(l-1) W_l + b_l) with h_0 = x. The output layer computes
+y = h_L V + c + x S. The activation f follows each hidden layer. The skip layer S maps the inputs linearly to the
+outputs, so that the hidden layers only need to learn the nonlinear part. Leading dimensions of the arrays are batch
+dimensions, so that the weights of several perceptrons can be evaluated in one call.
 
 The definition is generic in the type of its arrays. Training evaluates it with PyTorch tensors
 (`isocharge.train.training.torch_evaluation`), and the ONNX and C exports write it.

@@ -1,7 +1,11 @@
 """Decoding of TOML and JSON into typed structs with msgspec, with error messages that name the key.
 
-The attributes of a `Settings` class are the keys of a file. Their types and bounds define the allowed values, and a
-missing key has the default of its attribute:
+The attributes of a `Settings` class are the keys of a file. The types and bounds of the attributes define the allowed
+values. A missing key has the default of its attribute. Error messages state what was expected, and
+`Meta(description="[x, y] in mm")` replaces the words after "expected". Conditions that a type cannot express are
+checked in `__post_init__`, which raises `WrongKey`.
+
+Example of a table and its reader:
 
     class FilmTable(Settings, frozen=True):
         radius_mm: Positive
@@ -9,14 +13,11 @@ missing key has the default of its attribute:
 
     film = read_toml(path, "a film", SensorError, FilmTable)
 
-All error messages have the same form:
+Examples of error messages, which all have the same form:
 
     mine.toml: film.radius_mm: expected a positive number, got -45
     mine.toml: unknown key 'film.radius'; did you mean 'radius_mm'? Known are radius_mm, poisson
     mine.toml: key 'film.radius_mm' is missing
-
-`Meta(description="[x, y] in mm")` replaces the words after "expected". Conditions that a type cannot express are
-checked in `__post_init__`, which raises `WrongKey`.
 """
 
 import difflib

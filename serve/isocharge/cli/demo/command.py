@@ -1,4 +1,4 @@
-"""`isocharge demo`: simulate, train, serve and draw the results; or show a virtual sensor; or write the playground."""
+"""Command `isocharge demo`: run the complete demo, show a virtual sensor on the live page, or write the playground."""
 
 from pathlib import Path
 from typing import Annotated

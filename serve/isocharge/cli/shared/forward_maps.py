@@ -32,7 +32,7 @@ outermost presses beyond them."""
 
 
 def executor_for(workers: int | None, cluster: str | None) -> AbstractContextManager[Executor | None]:
-    """Return the executor for the values of `--workers` and `--cluster`.
+    """Return the executor that the values of `--workers` and `--cluster` select.
 
     Raises:
         InputError: If both options are given.

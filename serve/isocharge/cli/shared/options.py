@@ -1,4 +1,4 @@
-"""Arguments and options that several commands share, and the conversion of their values."""
+"""Arguments and options that several commands share, and functions that convert their values."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -36,7 +36,7 @@ class Leads:
 
     @property
     def summary(self) -> str:
-        """Sentence that states which electrodes have no straight lead."""
+        """Sentence that names the electrodes without a straight lead."""
         if not self.without:
             return f"all {len(self.paths)} leads go straight to the rim"
         return f"no straight lead to the rim for {', '.join(self.without)}: use another layer for their leads"

@@ -101,7 +101,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class SeedGrid:
-    """Charges on the nodes of a square grid over the disk, at forces that are equally spaced in the logarithm.
+    """Charges on the nodes of a square grid over the disk. The logarithms of the forces are equally spaced.
 
     Attributes:
         position: Positions of the nodes, shape (n_node, 2), mm.

@@ -2,8 +2,9 @@
 
 With the Jacobian J = d(Q)/d(x, y, ln F, ...), the Fisher information is J' diag(i) J, where i is the information that
 one reading provides about its charge (`NoiseModel.information`). The covariance of an unbiased estimate is at least the
-inverse of the Fisher information (Kay 1993, ch. 3). An estimator that uses a prior may have smaller errors where the
-charges provide little information. The package isocharge.train computes the limit of such estimators, the Bayes limit.
+inverse of the Fisher information (Kay 1993, chapter 3). An estimator that uses a prior may have smaller errors where
+the charges provide little information. The package isocharge.train computes the limit of such estimators, the Bayes
+limit.
 """
 
 from dataclasses import dataclass
@@ -15,8 +16,11 @@ from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 MIN_EIGENVALUE = 1e-14
-"""Lower bound of the eigenvalues of the scaled Fisher information, dimensionless. Smaller eigenvalues are rounding
-errors. With this bound, the limits of undetermined parameters are very large instead of infinite."""
+"""Lower bound of the eigenvalues of the scaled Fisher information, dimensionless.
+
+Smaller eigenvalues are rounding errors. With this bound, the limits of undetermined parameters are very large instead
+of infinite.
+"""
 
 MIN_INFORMATION = 1e-60
 """Fisher information below which a parameter counts as unobservable: 1/mm^2 for x and y, dimensionless for ln F."""

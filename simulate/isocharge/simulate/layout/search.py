@@ -6,12 +6,9 @@ and Morrison compares all positions of a grid at once (`position_error`). If the
 minimises a power mean of the errors, which approximates the largest error.
 
 The largest error mostly occurs near the edge of an electrode, between the presses of a coarse grid. The refinement
-therefore solves
-
-    minimise t   subject to   ln error(press) <= t   for the presses with the largest errors on a fine grid
-
-by sequential quadratic programming with a limited change of the positions. The presses are selected again in each
-round.
+therefore minimises a bound t subject to the constraints ln error(press) <= t. The constraints apply to the presses with
+the largest errors on a fine grid. The method is sequential quadratic programming with a limited change of the
+positions. The presses are selected again in each round.
 """
 
 from collections.abc import Callable

@@ -48,8 +48,8 @@ class NoiseModel:
         """Compute the Fisher information that one reading provides about its charge.
 
         For a Gaussian whose mean and standard deviation both depend on the charge, the information is
-        (1 + 2 (d sigma / dQ)^2) / sigma^2 (Kay 1993, eq. 3.31). Its inverse is the smallest variance of an unbiased
-        estimate of the charge.
+        (1 + 2 (d sigma / dQ)^2) / sigma^2 (Kay 1993, equation 3.31). Its inverse is the smallest variance of an
+        unbiased estimate of the charge.
 
         Args:
             charge: Charges of any shape, pC.

@@ -85,7 +85,9 @@ An absent key has the value of the level `like`.
 
 
 def load_amplifier(level: str) -> Amplifier:
-    """Return the amplifier of a level, or read it from a TOML file such as
+    """Return the amplifier of a level, or read it from a TOML file.
+
+    Example of a file:
 
         like = "bench"       # optional: level with the values of absent keys
         white_pC = 0.5
@@ -112,13 +114,15 @@ def load_amplifier(level: str) -> Amplifier:
 
 
 def noise_model(level: str) -> NoiseModel:
-    """Return the noise model of a level, or read it from a TOML file such as
+    """Return the noise model of a level, or read it from a TOML file.
+
+    The file may describe a complete measuring chain (`load_amplifier`). Only the memoryless noise is returned.
+
+    Example of a file:
 
         like = "reference"      # optional: level with the values of absent keys, by default "clean"
         white_pC = 0.5
         proportional = 0.001    # standard deviation divided by the charge
-
-    The file may describe a complete measuring chain (`load_amplifier`). Only the memoryless noise is returned.
 
     Args:
         level: Name of a level, or path of a TOML file.

@@ -1,9 +1,8 @@
 """Fingertip: a circular footprint with Hertzian pressure.
 
-A soft sphere that is pressed against a flat surface touches it in a circle of radius a, with the pressure (Johnson
-1985, Contact Mechanics, eq. 3.39)
-
-    p(r) = p0 sqrt(1 - (r / a)^2),   p0 = 1.5 F / (pi a^2).
+A soft sphere that is pressed against a flat surface touches the surface in a circle of radius a. The pressure at the
+distance r from the centre of this circle is p(r) = p0 sqrt(1 - (r / a)^2), where F is the force and the maximum is
+p0 = 1.5 F / (pi a^2) (Johnson 1985, Contact Mechanics, equation 3.39).
 """
 
 from dataclasses import dataclass
