@@ -69,8 +69,8 @@ def stress_series(forward_map: ForwardMap) -> StressSeries:
         shift, probe_ring = _automorphism(distance_mm / film.radius, forward_map.probe.reach / film.radius)
         inner_rings = probe_ring * np.sqrt(inner_fraction)
         outer_rings = probe_ring * (MAX_RING / probe_ring) ** outer_fraction
-        inner_points_mm = film.radius * _moved(inner_rings[:, None] * direction, shift)
-        outer_points_mm = film.radius * _moved(outer_rings[:, None] * direction, shift)
+        inner_points_mm = film.radius * _image_points(inner_rings[:, None] * direction, shift)
+        outer_points_mm = film.radius * _image_points(outer_rings[:, None] * direction, shift)
         for column, force_N in enumerate(forces_N):
             inner[row, column] = np.log(_stress_sum(forward_map, distance_mm, force_N, inner_points_mm))
             outer[row, column] = np.log(_stress_sum(forward_map, distance_mm, force_N, outer_points_mm))
@@ -107,7 +107,7 @@ def _automorphism(distance: float, probe_radius: float) -> tuple[float, float]:
     return float(np.tanh(0.5 * (outer_edge + inner_edge))), float(np.tanh(0.5 * (outer_edge - inner_edge)))
 
 
-def _moved(points: Complexes, c: float) -> Complexes:
+def _image_points(points: Complexes, c: float) -> Complexes:
     """Return the images (z + c) / (1 + c z) of points z of the unit disk, any shape; see `_automorphism`."""
     return np.asarray((points + c) / (1.0 + c * points))
 
