@@ -1,7 +1,7 @@
 """Errors of contacts that are caused by the uncertainty of a film, and a choice of presses that reduce these errors.
 
-If an estimator assumes a film whose parameters differ by dp from those of the real film, the estimated contact is wrong
-by the change that compensates the difference of the charges best:
+An estimator may assume a film whose parameters differ by dp from those of the real film. The error of the estimated
+contact is then the change that compensates the difference of the charges best:
 
     dc = -G dp,   G = (J' W J)^-1 J' W P.
 

@@ -1,8 +1,9 @@
 """Charges of presses on any film of a prior, and their derivatives with respect to the contact and the film.
 
-A film is described by a vector of unknowns. The parameters of `FilmPrior` come first. Coefficients may follow: those of
-the modes of imperfections (in units of their standard deviations), those of traces that the sensor file does not
-describe, and those of the terms of the discrepancy. `UnknownLayout` defines their order.
+A film is described by a vector of unknowns. The parameters of `FilmPrior` come first. The parameters may be followed by
+three kinds of coefficients. The first are those of the modes of imperfections, in units of their standard deviations.
+The second are those of traces that the sensor file does not describe. The third are those of the terms of the
+discrepancy. `UnknownLayout` defines their order.
 """
 
 from dataclasses import dataclass, replace

@@ -110,8 +110,8 @@ class FilmPosterior(FilmEstimate):
     def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> FilmEstimate:
         """Return the estimate for a later time; see `FilmEstimate.drifted`.
 
-        If the film probably has neither imperfections nor a discrepancy, the coefficients of these effects are removed
-        from the unknowns, and only the parameters of the film remain.
+        If the film probably has neither imperfections nor a discrepancy, the estimate contains only the parameters of
+        the film.
         """
         if self.imperfect:
             return super().drifted(prior, knows_temperature=knows_temperature)

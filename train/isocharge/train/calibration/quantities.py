@@ -1,10 +1,10 @@
 """Quantities of a film that presses can identify, such as products and ratios of parameters.
 
-The charges depend on Young's modulus E, the piezoelectric coefficients and the gains almost only through their product,
-and on E and the thickness h almost only through E h. After the calibration, a single parameter may therefore be as
-uncertain as before, although the product is accurate to 0.1 %. For this reason, such products and ratios are reported
-with their standard deviations. A quantity counts as not identified if the presses hardly reduced its standard
-deviation.
+The charges depend on Young's modulus E, the piezoelectric coefficients and the gains almost only through their product.
+Similarly, they depend on E and the thickness h almost only through E h. After the calibration, a single parameter may
+therefore be as uncertain as before, although the product is accurate to 0.1 %. For this reason, such products and
+ratios are reported with their standard deviations. A quantity counts as not identified if the presses hardly reduced
+its standard deviation.
 """
 
 from collections.abc import Mapping

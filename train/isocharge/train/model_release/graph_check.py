@@ -77,9 +77,9 @@ def check_graph(
 def _golden_charges(exact: OutputFunction, presses: LabelledPresses, noise: Noise) -> tuple[Singles, Singles]:
     """Choose charges for the golden vectors: three quarters from presses, and one quarter of extreme charges.
 
-    Only presses whose position has a standard deviation below the median are used. Where a small change of a charge
-    moves the position by millimetres, the rounding of float32 numbers causes differences between runtimes that exceed
-    the tolerance of the golden vectors.
+    Only presses whose position has a standard deviation below the median are used. At other presses, a small change of
+    a charge may move the position by millimetres. The rounding of float32 numbers would then cause differences between
+    runtimes that exceed the tolerance of the golden vectors.
 
     Args:
         exact: Network in double precision.
