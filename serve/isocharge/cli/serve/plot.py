@@ -3,6 +3,7 @@
 The picture shows the path on the film, and the position, force, charges and flags over time.
 """
 
+import math
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from itertools import chain
@@ -159,7 +160,7 @@ class _Groups(NamedTuple):
             time_s: Times since the first record, shape (n,), s.
             unit_s: Length of the unit of the time axis, s.
         """
-        group_size = -(-len(time_s) // MAX_GROUPS)  # rounded up
+        group_size = math.ceil(len(time_s) / MAX_GROUPS)
         start = np.arange(0, len(time_s), group_size)  # first record of each group
         last = np.append(start[1:], len(time_s)) - 1  # last record of each group
         start_s = time_s[start]
@@ -346,5 +347,5 @@ def _draw_contacts(
 
 def _every_nth(values: Any, max_count: int) -> Any:
     """Return every n-th row of an array. The function uses the smallest n for which at most `max_count` rows remain."""
-    step = max(1, -(-len(values) // max_count))
+    step = max(1, math.ceil(len(values) / max_count))
     return values[::step]

@@ -96,12 +96,12 @@ class UnnoticedPresses(Struct, frozen=True, kw_only=True):
 
     @property
     def ring_shares(self) -> Array:
-        """Share of each ring, shape (n_ring,)."""
+        """Share of unnoticed presses in each ring, from 0 to 1, shape (n_ring,)."""
         return np.asarray(np.mean(self.share, axis=1))
 
     @property
     def total_share(self) -> float:
-        """Share of all presses between the two circles, 0 to 1."""
+        """Share of unnoticed presses between the two circles, from 0 to 1. The rings are weighted by their areas."""
         return float(np.average(self.ring_shares, weights=np.diff(self.ring_edges_mm**2)))
 
     @property
