@@ -177,9 +177,11 @@ def check_contact(contact_only, expected):
 def test_the_contact_graph_gives_the_contact_of_the_network(network):
     with torch.no_grad():
         expected = network(torch.tensor(CHARGE).float())[0].numpy()
-    graph = write_contact_graph(fold_contact_mean(network))
+    folded = fold_contact_mean(network)
+    graph = write_contact_graph(folded)
     check_contact(OnnxContact(graph), expected)
-    count = sum(parameter.numel() for parameter in network.contact.parameters())
+    layers = (*folded.layers.hidden, folded.layers.last)
+    count = folded.layers.skip.size + sum(layer.weight.size + layer.bias.size for layer in layers)
     assert 4 * count < len(graph) < 4 * count + 8000
     absurd = np.array([[0.0, 0.0, 0.0], [-5.0, 1e9, 3.0], [1e-30, 500.0, 500.0]])
     assert np.isfinite(OnnxContact(graph).predict(absurd)).all()
