@@ -1,9 +1,10 @@
 """Settings of a training, which a TOML file with the tables `network` and `training` can change."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from msgspec import Meta, json
+from msgspec.structs import replace
 
 from isocharge.common.activations import ACTIVATIONS, TANH
 from isocharge.common.errors import ConfigError
@@ -14,13 +15,39 @@ MAX_ELECTRODES = 64
 """Largest number of electrodes that a configuration can require."""
 
 FEW_ELECTRODES = 4
-"""Largest number of electrodes for which a misfit network with the width `MISFIT_WIDTH` is sufficient."""
+"""Largest number of electrodes for which the sizes `FEW_ELECTRODE_SIZES` are sufficient."""
 
-MISFIT_WIDTH = 64
-"""Width of the hidden layers of the misfit network for few electrodes."""
 
-MANY_MISFIT_WIDTH = 96
-"""Width of the hidden layers of the misfit network for more electrodes, whose charges have more dimensions."""
+class DefaultSizes(NamedTuple):
+    """Default sizes of a training, which depend on the number of electrodes.
+
+    Attributes:
+        width: Width of the hidden layers of the contact network.
+        misfit_width: Width of the hidden layers of the misfit network.
+        steps: Number of optimiser steps of the contact network.
+        rate_factor: Factor on the learning rate of the contact network. With more electrodes, the loss of a training
+            with the whole rate increases at times.
+    """
+
+    width: int
+    misfit_width: int
+    steps: int
+    rate_factor: float
+
+    @classmethod
+    def of(cls, n_electrode: int) -> "DefaultSizes":
+        """Return the default sizes for a number of electrodes."""
+        return FEW_ELECTRODE_SIZES if n_electrode <= FEW_ELECTRODES else MANY_ELECTRODE_SIZES
+
+
+FEW_ELECTRODE_SIZES = DefaultSizes(width=96, misfit_width=64, steps=2_000, rate_factor=1.0)
+"""Default sizes for at most `FEW_ELECTRODES` electrodes."""
+
+MANY_ELECTRODE_SIZES = DefaultSizes(width=128, misfit_width=96, steps=6_000, rate_factor=0.5)
+"""Default sizes for more electrodes, whose working areas are larger and whose charges have more dimensions."""
+
+N_HIDDEN_LAYERS = 3
+"""Default number of hidden layers of both networks."""
 
 Width = Annotated[int, Meta(ge=1, le=4096)]
 Widths = Annotated[tuple[Width, ...], Meta(min_length=1, description="widths from 1 to 4096")]
@@ -31,23 +58,23 @@ class NetworkConfig(Settings, frozen=True):
     """Sizes of the contact perceptron and of the misfit perceptron.
 
     Attributes:
-        hidden: Widths of the hidden layers of the contact network.
-        misfit_hidden: Widths of the hidden layers of the misfit network, which has as many; None for
-            `MISFIT_WIDTH`, or `MANY_MISFIT_WIDTH` for more than four electrodes.
+        hidden: Widths of the hidden layers of the contact network; None for the width in `DefaultSizes`.
+        misfit_hidden: Widths of the hidden layers of the misfit network, which has the same number of hidden layers;
+            None for the width in `DefaultSizes`.
         electrodes: Number of electrodes that the dataset must have; 0 for any number.
         activation: Name of the activation of the hidden layers (`isocharge.common.activations`).
         weights: "int8" rounds the weights between hidden layers to 8 bits and then trains the other weights further.
             In C the rounded weights take a quarter of the memory.
     """
 
-    hidden: Widths = (96, 96, 96)
+    hidden: Widths | None = None
     misfit_hidden: Widths | None = None
     electrodes: int = 0
     activation: str = TANH.name
     weights: Literal["float32", "int8"] = "float32"
 
     def __post_init__(self) -> None:
-        if self.misfit_hidden is not None and len(self.hidden) != len(self.misfit_hidden):
+        if self.hidden is not None and self.misfit_hidden is not None and len(self.hidden) != len(self.misfit_hidden):
             layers = f"as many layers as network.hidden ({len(self.hidden)}; they run side by side)"
             raise WrongKey("misfit_hidden", layers, list(self.misfit_hidden))
         if self.activation not in ACTIVATIONS:
@@ -55,19 +82,29 @@ class NetworkConfig(Settings, frozen=True):
         if not (self.electrodes == 0 or 3 <= self.electrodes <= MAX_ELECTRODES):
             raise WrongKey("electrodes", f"0 (as the dataset) or 3 to {MAX_ELECTRODES}", self.electrodes)
 
-    def misfit_widths(self, n_electrode: int) -> tuple[int, ...]:
+    def contact_widths(self, n_electrode: int) -> Widths:
+        """Return the widths of the hidden layers of the contact network for a number of electrodes."""
+        if self.hidden is not None:
+            return self.hidden
+        return (DefaultSizes.of(n_electrode).width,) * self._layer_count()
+
+    def misfit_widths(self, n_electrode: int) -> Widths:
         """Return the widths of the hidden layers of the misfit network for a number of electrodes."""
         if self.misfit_hidden is not None:
             return self.misfit_hidden
-        width = MISFIT_WIDTH if n_electrode <= FEW_ELECTRODES else MANY_MISFIT_WIDTH
-        return (width,) * len(self.hidden)
+        return (DefaultSizes.of(n_electrode).misfit_width,) * self._layer_count()
+
+    def _layer_count(self) -> int:
+        """Return the number of hidden layers of each network."""
+        given = self.hidden or self.misfit_hidden
+        return N_HIDDEN_LAYERS if given is None else len(given)
 
 
 class TrainingConfig(Settings, frozen=True):
     """Settings of the optimisation.
 
     Attributes:
-        steps: Number of optimiser steps of the contact network.
+        steps: Number of optimiser steps of the contact network; None for the number in `DefaultSizes`.
         misfit_steps: Number of optimiser steps of the misfit network.
         misfit_charges: Number of charges from which the misfit network learns.
         batch: Number of samples in a batch.
@@ -82,7 +119,7 @@ class TrainingConfig(Settings, frozen=True):
             other programs on the second core.
     """
 
-    steps: Count = 2_000
+    steps: Count | None = None
     misfit_steps: Count = 3_000
     misfit_charges: Annotated[int, Meta(ge=1_000, le=10_000_000)] = 80_000
     batch: Annotated[int, Meta(ge=1, le=1_000_000)] = 512
@@ -92,6 +129,10 @@ class TrainingConfig(Settings, frozen=True):
     noise: Annotated[str | NoiseModel, Meta(description="a text")] = "reference"
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
     threads: Annotated[int, Meta(ge=1, le=64)] = 1
+
+    def contact_steps(self, n_electrode: int) -> int:
+        """Return the number of optimiser steps of the contact network for a number of electrodes."""
+        return self.steps if self.steps is not None else DefaultSizes.of(n_electrode).steps
 
     @property
     def noise_model(self) -> NoiseModel:
@@ -108,6 +149,15 @@ class FitConfig(Settings, frozen=True):
 
     network: NetworkConfig = NetworkConfig()
     training: TrainingConfig = TrainingConfig()
+
+    def for_electrodes(self, n_electrode: int) -> "FitConfig":
+        """Return the same settings, in which the default sizes for a number of electrodes are stated as numbers."""
+        contact_widths = self.network.contact_widths(n_electrode)
+        misfit_widths = self.network.misfit_widths(n_electrode)
+        return FitConfig(
+            network=replace(self.network, hidden=contact_widths, misfit_hidden=misfit_widths),
+            training=replace(self.training, steps=self.training.contact_steps(n_electrode)),
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as tables for JSON."""

@@ -268,11 +268,12 @@ def _train_members(
         descent.run(run)
         return descent
 
-    steps = min(FIRST_STEPS, config.steps)
+    largest_steps = config.contact_steps(members[0].n_electrode)
+    steps = min(FIRST_STEPS, largest_steps)
     first_network = members[0].contact
     initial_weights = {name: weight.clone() for name, weight in first_network.state_dict().items()}
     best_training = train(0, steps)
-    while 2 * steps <= config.steps:
+    while 2 * steps <= largest_steps:
         first_network.load_state_dict(initial_weights)
         longer_training = train(0, 2 * steps)
         if longer_training.best >= best_training.best:
@@ -354,7 +355,7 @@ def _distillation_stage(
         network.contact,
         loss,
         score,
-        max(config.steps // 2, 1),
+        max(config.contact_steps(network.n_electrode) // 2, 1),
         slow_parameters=(network.contact.skip.weight,),
     )
 

@@ -25,7 +25,7 @@ from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import LabelledPresses
-from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
+from isocharge.train.training.config import DefaultSizes, FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fitted import Fitted, Provenance
@@ -81,7 +81,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
         TrainingError: If the loss is not finite.
     """
     data = source if isinstance(source, TrainingData) else TrainingData.of(source)
-    settings = (config or FitConfig()).checked()
+    settings = (config or FitConfig()).checked().for_electrodes(len(data.sensor.electrode_names))
     trained = train_network(data, settings, run=run)
     split = trained.split
     good_presses = data.presses.within(split.domain.radius) if data.presses.measured else split.test
@@ -283,7 +283,8 @@ def contact_stage(
         teacher: Model whose answers are learned; None to learn the contacts of the presses.
     """
     domain = network.domain
-    warm_up_steps = round(WARM_UP_FRACTION * config.steps)
+    steps = config.contact_steps(network.n_electrode)
+    warm_up_steps = round(WARM_UP_FRACTION * steps)
     charge = as_tensor(train.charge)
     target = as_tensor(domain.to_unit(train.contact))
     validation_charge = as_tensor(validation.charge if validation.measured else validation.noisy(noise, config.seed))
@@ -325,7 +326,8 @@ def contact_stage(
         network.contact,
         loss,
         score,
-        config.steps,
+        steps,
         warm_up_steps,
         slow_parameters=(network.contact.skip.weight,),
+        rate_factor=DefaultSizes.of(network.n_electrode).rate_factor,
     )

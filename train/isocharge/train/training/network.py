@@ -161,10 +161,10 @@ class InverseNetwork(nn.Module):
         super().__init__()
         self.domain = domain
         self.features = features
-        n_electrode = features.charge_features.n_electrode
+        n_electrode = self.n_electrode
         activation = ACTIVATIONS[config.activation]
         n_output = N_CONTACT_ANSWERS + N_TRAINING_ANGLES
-        self.contact = TrainablePerceptron(n_electrode, config.hidden, n_output, activation)
+        self.contact = TrainablePerceptron(n_electrode, config.contact_widths(n_electrode), n_output, activation)
         self.contact.sharpen_first_layer()
         self.misfit_vector = TrainablePerceptron(
             n_electrode, config.misfit_widths(n_electrode), n_electrode, activation
@@ -173,6 +173,11 @@ class InverseNetwork(nn.Module):
         self.scale = nn.Buffer(as_tensor(domain.scale))
         self.features_mean = nn.Buffer(as_tensor(features.mean))
         self.whitening = nn.Buffer(as_tensor(features.matrix))
+
+    @property
+    def n_electrode(self) -> int:
+        """Number of electrodes."""
+        return self.features.charge_features.n_electrode
 
     def inputs(self, charge: Tensor) -> Tensor:
         """Compute the inputs of both perceptrons from charges of shape (n, n_electrode), pC.
