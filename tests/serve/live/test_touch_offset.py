@@ -51,11 +51,15 @@ def test_touch_offset_adds_the_scatter_that_random_offsets_cause(predictor, char
 
 
 def test_touch_offset_matters_more_for_light_presses(predictor):
-    def force_ratio(charge_pC):
-        with_offset = held_record(predictor, charge_pC, touch_offset={})
-        return with_offset.force_std_N / held_record(predictor, charge_pC).force_std_N
+    """The charges of the strong press are eight times as large, so the same offset is an eighth of them."""
 
-    assert force_ratio(LIGHT_pC) > 1.5 * force_ratio(STRONG_pC)
+    def added_relative_std(charge_pC):
+        with_offset = held_record(predictor, charge_pC, touch_offset={})
+        without_offset = held_record(predictor, charge_pC)
+        added_variance = with_offset.force_std_N**2 - without_offset.force_std_N**2
+        return np.sqrt(added_variance) / without_offset.force_N
+
+    assert added_relative_std(LIGHT_pC) > 4.0 * added_relative_std(STRONG_pC)
 
 
 def test_touch_offset_that_is_switched_off_changes_nothing(predictor):
