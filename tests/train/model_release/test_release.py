@@ -53,7 +53,6 @@ LARGEST_ERRORS = {
 error of the force, %."""
 
 ELLIPSE_TOLERANCES = {
-    "eight-25um-biaxial": 0.04,
     "four-25um-biaxial": 0.03,  # the map nearly folds at the edge of the area
     "four-25um-biaxial-student": 0.09,  # small networks have larger errors
     "three-25um-biaxial-student": 0.04,
