@@ -1,4 +1,7 @@
-"""Training of the misfit perceptron: its examples, which a search makes, and its loss."""
+"""Training of the misfit perceptron: the examples from which it learns, and its loss.
+
+An example is a set of charges with the residuals of these charges at the nearest contact, which a search finds.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,14 +20,8 @@ from isocharge.train.training.config import FEW_ELECTRODES, TrainingConfig
 from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.folded_network import MISFIT_UNIT
-from isocharge.train.training.losses import (
-    focused_squared_distance,
-)
-from isocharge.train.training.network import (
-    InverseNetwork,
-    as_tensor,
-    compress_length,
-)
+from isocharge.train.training.losses import focused_squared_distance
+from isocharge.train.training.network import InverseNetwork, as_tensor, compress_length
 from isocharge.train.training.split import VALIDATION_FRACTION, Split
 
 MISFIT_RATE_FACTOR = 1.5
@@ -34,18 +31,19 @@ N_OUTSIDE_PRESSES = 6_000
 """Number of presses outside the working area from which charges for the misfit network are drawn."""
 
 OUTSIDE_SHARE = 0.15
-"""Share of the examples of the misfit network that are presses outside the working area, if those are simulated,
-dimensionless."""
+"""Share of the examples of the misfit network that are presses outside the working area, dimensionless. The share is
+zero if these presses are not simulated."""
 
 MANY_OUTSIDE_SHARE = 0.3
-"""The same share with more than `FEW_ELECTRODES` electrodes, dimensionless. They can notice nearly all presses outside
-the working area."""
+"""Share of presses outside the working area for sensors with more than `FEW_ELECTRODES` electrodes, dimensionless. The
+misfit of these sensors can reveal nearly all presses outside the working area."""
 
 SEARCH_STARTS = 2
 """Number of starts of a search for the nearest contact."""
 
 MANY_SEARCH_STARTS = 4
-"""The same number with more than `FEW_ELECTRODES` electrodes, whose charges have more local minima of the misfit."""
+"""Number of starts of a search for sensors with more than `FEW_ELECTRODES` electrodes, whose misfit has more local
+minima."""
 
 FOCUS_MISFIT = 10.0
 """Misfit at which the weight of an example of the misfit network is half of the largest weight, in standard deviations.
@@ -54,7 +52,9 @@ It is twice the smallest limit of the flag `misfit`."""
 
 @dataclass(frozen=True)
 class MisfitExamples:
-    """Draws the examples for the misfit network. The run saves them, because the search takes long.
+    """Source of the examples for the misfit network.
+
+    The run saves the examples, because the search for the nearest contacts takes long.
 
     Attributes:
         split: Presses for training, and the charge field in which the nearest contacts are searched for.
@@ -69,14 +69,21 @@ class MisfitExamples:
     run: ResumableRun | None
 
     def inner(self) -> Array:
-        """Return charges, pC, and residuals of examples made from presses in the working area.
+        """Draw examples from presses in the working area (`draw_misfit_examples`).
 
-        The shape is (2, n, n_electrode); see `draw_misfit_examples`.
+        Returns:
+            Charges, pC, and residuals, shape (2, n, n_electrode).
         """
         draw = partial(
-            draw_misfit_examples, self.split.train, self.split.field, self._noise(), starts=self._search_starts
+            draw_misfit_examples,
+            self.split.train,
+            self.split.field,
+            self._noise(),
+            self.config.misfit_charges,
+            self.config.seed,
+            starts=self._search_starts,
         )
-        return self._kept("misfit-charges", partial(draw, self.config.misfit_charges, self.config.seed))
+        return self._saved_or_drawn("misfit-charges", draw)
 
     def with_outside(self, inner_examples: Array, outside: OutsidePresses | None) -> Array:
         """Replace a share of the examples by presses outside the working area.
@@ -93,14 +100,22 @@ class MisfitExamples:
         seed = self.config.seed
         outside_share = MANY_OUTSIDE_SHARE if self._has_many_electrodes else OUTSIDE_SHARE
         n_outside = round(outside_share * self.config.misfit_charges)
-        charge = outside.draw(N_OUTSIDE_PRESSES, seed).charge
-        draw = partial(draw_outside_examples, charge, self.split.field, self._noise(), starts=self._search_starts)
-        outside_examples = self._kept("misfit-outside", partial(draw, n_outside, seed))
+        draw = partial(
+            draw_outside_examples,
+            outside.draw(N_OUTSIDE_PRESSES, seed).charge,
+            self.split.field,
+            self._noise(),
+            n_outside,
+            seed,
+            starts=self._search_starts,
+        )
+        outside_examples = self._saved_or_drawn("misfit-outside", draw)
         examples = np.concatenate([inner_examples[:, n_outside:], outside_examples], axis=1)
         return np.random.default_rng(seed).permutation(examples, axis=1)
 
     @property
     def _has_many_electrodes(self) -> bool:
+        """Whether the sensor has more than `FEW_ELECTRODES` electrodes."""
         return self.features.charge_features.n_electrode > FEW_ELECTRODES
 
     @property
@@ -109,23 +124,29 @@ class MisfitExamples:
         return MANY_SEARCH_STARTS if self._has_many_electrodes else SEARCH_STARTS
 
     def _noise(self) -> Noise:
-        """Return the noise of good presses; for charges of any sign, the noise of each channel."""
+        """Return the noise of good presses. For charges of both signs, return it as the noise of each channel."""
         noise = misfit_noise(self.config.noise_model)
         charge_features = self.features.charge_features
         if charge_features.mean is None:
             return noise
         return ChannelNoise.alike(noise, charge_features.n_electrode)
 
-    def _kept(self, name: str, draw: Callable[..., Array]) -> Array:
-        """Return the examples that a function draws, or that the run has saved under a name."""
+    def _saved_or_drawn(self, name: str, draw: Callable[..., Array]) -> Array:
+        """Return the examples that the run has saved under a name. If there are none, draw the examples and save them.
+
+        Args:
+            name: Name of the examples in the run.
+            draw: Function that draws the examples. Its keyword argument `limits` sets the limits of the charges. For
+                charges of both signs, these are the limits of the input features.
+        """
         charge_features = self.features.charge_features
         limited_draw = draw
         if charge_features.mean is not None:
             limited_draw = partial(draw, limits=(charge_features.low_pC, charge_features.high_pC))
         if self.run is None:
             return limited_draw()
-        saved: Array = self.run.storing_executor(name).submit(limited_draw).result()
-        return saved
+        examples: Array = self.run.storing_executor(name).submit(limited_draw).result()
+        return examples
 
 
 def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfig) -> TrainingStage:
@@ -134,7 +155,7 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     Args:
         network: The network, whose misfit perceptron is trained.
         examples: Charges, pC, and residuals (Q - Q(c)) / sigma at the nearest contact c, shape (2, n, n_electrode).
-            The last of them are used for validation.
+            The last examples are used for validation.
         config: Number of steps and batch size.
     """
     charges, residuals = examples
@@ -142,7 +163,6 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     targets = compress_length(torch.tensor(residuals)).float()
     n_validation = max(1, round(VALIDATION_FRACTION * config.hold_out * len(inputs)))
     n_train = len(inputs) - n_validation
-
     focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_UNIT))
 
     def distance(rows: Tensor | slice) -> Tensor:

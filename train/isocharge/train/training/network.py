@@ -90,7 +90,7 @@ class TrainablePerceptron(nn.Module):
         centre = torch.randn(n_unit, first.in_features)
         with torch.no_grad():
             first.weight.copy_(slope * direction)
-            first.bias.copy_(-(first.weight * centre).sum(dim=1))
+            first.bias.copy_(-(first.weight * centre).sum(dim=1))  # the output of each unit is zero at its centre
 
     def fit_linear_part(self, inputs: Tensor, targets: Tensor) -> None:
         """Set the skip layer to the linear least-squares fit of the first outputs.
@@ -101,14 +101,16 @@ class TrainablePerceptron(nn.Module):
             inputs: Shape (n, n_input).
             targets: Targets of the first n_target outputs, shape (n, n_target).
         """
+        n_input = inputs.shape[1]
         n_target = targets.shape[1]
-        _, *_, last = self.linear_layers()
+        *_, last = self.linear_layers()
         design = torch.cat([inputs, torch.ones(len(inputs), 1)], dim=1)
-        *slopes, offset = torch.linalg.lstsq(design.double(), targets.double()).solution.float()
+        coefficients = torch.linalg.lstsq(design.double(), targets.double()).solution.float()
+        slopes, offset = torch.split(coefficients, [n_input, 1])
         with torch.no_grad():
-            self.skip.weight[:n_target] = torch.stack(slopes, dim=1)
+            self.skip.weight[:n_target] = slopes.T
             last.weight[:n_target] *= INITIAL_NONLINEAR_SIZE
-            last.bias[:n_target] = offset
+            last.bias[:n_target] = offset[0]
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Compute the outputs, shape (n, n_output), of inputs of shape (n, n_input)."""
@@ -263,20 +265,31 @@ def fold_network(network: InverseNetwork) -> FoldedNetwork:
 
 
 def fold_contact_mean(network: InverseNetwork) -> FoldedNetwork:
-    """Fold the contact perceptron of a trained network; the only answers are x and y in mm, and ln F."""
-    weight = np.vstack([np.diag(network.domain.scale), np.zeros((3, 3))])
-    return _fold(network, [_contact_to_numpy(network)], Layer(weight, network.domain.centre))
+    """Fold the contact perceptron of a trained network without its standard deviations.
+
+    The answers of the folded network are x and y in mm, and ln F.
+    """
+    weights_of_means = np.diag(network.domain.scale)
+    weights_of_log_stds = np.zeros((3, 3))
+    units = Layer(np.vstack([weights_of_means, weights_of_log_stds]), network.domain.centre)
+    return _fold(network, [_contact_to_numpy(network)], units)
 
 
 def _fold(network: InverseNetwork, perceptrons: Sequence[Perceptron[Array]], units: Layer[Array]) -> FoldedNetwork:
-    """Fold perceptrons of a network, whose outputs `units` maps to the answers."""
+    """Fold perceptrons of a network into one.
+
+    Args:
+        network: The network, whose features and whitening are used.
+        perceptrons: Perceptrons that run side by side.
+        units: Linear layer from the outputs of all perceptrons to the answers.
+    """
     mean = _to_numpy(network.features_mean)
     matrix = _to_numpy(network.whitening)
     return FoldedNetwork(network.features.charge_features, fold(perceptrons, mean, matrix, units))
 
 
 def _contact_to_numpy(network: InverseNetwork) -> Perceptron[Array]:
-    """Return the contact perceptron without the angles."""
+    """Return the contact perceptron as NumPy arrays, without the outputs for the angles of the correlations."""
     perceptron = network.contact.to_numpy()
     weight, bias = perceptron.last
     last = Layer(weight[:, :N_CONTACT_ANSWERS], bias[:N_CONTACT_ANSWERS])

@@ -77,7 +77,10 @@ class Soap:
 def _update(
     parameter: Tensor, gradient: Tensor, state: dict[str, Any], rate: float, betas: tuple[float, float]
 ) -> None:
-    """Change one parameter and its state.
+    """Change one parameter and its state by a step of algorithm 3 of Vyas et al. (2024).
+
+    The averaged gradient is rotated into the eigenbasis. Its entries are divided by their root mean squares, as in
+    Adam. The result is rotated back and gives the direction of the step.
 
     Args:
         parameter: The parameter.

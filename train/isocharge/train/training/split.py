@@ -46,9 +46,10 @@ class Split:
 
     @classmethod
     def of(cls, data: TrainingData, training: TrainingConfig) -> "Split":
-        """Split presses into those for training, validation and test, and fit a charge field to them.
+        """Split presses into presses for training, for validation and for the test, and fit a charge field to them.
 
-        Only presses within the largest disk in which the map certainly does not fold are used.
+        A first charge field is fitted to all presses. It gives the largest disk in which the map certainly does not
+        fold. Only presses within this disk are used.
 
         Args:
             data: Presses of the sensor.
