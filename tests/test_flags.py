@@ -33,6 +33,7 @@ def column(table_name, model):
     return shares
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("model", ["three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial"])
 def test_shares_of_flagged_and_unnoticed_faults_are_those_of_the_page(model):
     forward_map = kept(nominal_map)
@@ -44,7 +45,7 @@ def test_shares_of_flagged_and_unnoticed_faults_are_those_of_the_page(model):
             assert page[fault] == pytest.approx((shares.flagged, shares.unnoticed), abs=TOLERANCE), fault
 
 
-@pytest.mark.first_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["three-25um-biaxial", "four-25um-biaxial-15mm"])
 def test_shares_of_presses_on_the_whole_film_are_those_of_the_page(model):
     rings = WholeFilmStudy(model, 500, SEED).rings((15.0, 20.0, 40.0, 43.0))
