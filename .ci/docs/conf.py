@@ -25,6 +25,8 @@ from isocharge.serve.viewer.playground_page import playground_html  # noqa: E402
 PORTIONS = ("simulate", "train", "serve")
 HOME, REFERENCE, GALLERY, COMMANDS = "README", "build/reference", "build/gallery", "build/commands"
 PLAYGROUND = "serve/docs/playground"
+NAVIGATION: dict[tuple[tuple[str, Any], ...], Any] = {}
+"""Navigation of the pages of modules, by the options with which the theme requests it."""
 
 project = "isocharge"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
@@ -40,10 +42,12 @@ include_patterns = [
 ]
 include_patterns += [pattern for name in PORTIONS for pattern in (f"{name}/README.md", f"{name}/docs/*.md")]
 exclude_patterns = [f"{GALLERY}/**/{name}" for name in ("*.py", "*.ipynb", "*.zip", "*.json")]
+exclude_patterns += [".*", "build/docs", "build/kept", "tests"]  # large folders, in which Sphinx would search for pages
 myst_heading_anchors = 3
 default_role = "code"
 napoleon_use_ivar = napoleon_use_rtype = True
 autodoc_typehints = "none"
+autodoc_use_type_comments = False  # there are none, and the search for them parses each function again
 html_theme = "furo"
 html_copy_source = html_show_sphinx = html_show_copyright = False
 html_title = project
@@ -73,6 +77,24 @@ def add_contents(_app: Any, page: str, source: list[str]) -> None:
         source[0] = source[0].replace("`playground.html`", '<a href="../../playground.html">playground.html</a>')
 
 
+def share_navigation(_app: Any, page: str, _template: str, context: dict[str, Any], _doctree: Any) -> None:
+    """Use the same navigation for all pages of modules.
+
+    These pages are in one folder and in no table of contents, so their navigation is the same. Its computation would
+    take more time than the rest of a page.
+    """
+    if page.startswith(f"{REFERENCE}/isocharge") and "toctree" in context:
+        compute = context["toctree"]
+        context["toctree"] = lambda **options: _navigation(compute, tuple(sorted(options.items())))
+
+
+def _navigation(compute: Any, options: tuple[tuple[str, Any], ...]) -> Any:
+    """Return the navigation of a page of a module for some options. It is computed for the first page only."""
+    if options not in NAVIGATION:
+        NAVIGATION[options] = compute(**dict(options))
+    return NAVIGATION[options]
+
+
 def add_whole_pages(app: Any, error: Exception | None) -> None:
     """Add the playground to the site, and copy the first page to the file name that web servers expect."""
     if error is None:
@@ -91,4 +113,5 @@ def setup(app: Any) -> None:
     app.connect("autodoc-skip-member", reference.is_of_scikit_learn)
     app.connect("autodoc-process-docstring", reference.plain_text, priority=400)
     app.connect("autodoc-process-docstring", reference.list_attributes, priority=600)
+    app.connect("html-page-context", share_navigation, priority=400)  # before the theme requests the navigation
     app.connect("build-finished", add_whole_pages)
