@@ -7,15 +7,13 @@ from msgspec import Meta, json
 from msgspec.structs import replace
 
 from isocharge.common.activations import ACTIVATIONS, TANH
+from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.errors import ConfigError
 from isocharge.common.structs import Settings, WrongKey, convert, read_toml
 from isocharge.simulate import NoiseModel, noise_model
 
 MAX_ELECTRODES = 64
 """Largest number of electrodes that a configuration can require."""
-
-FEW_ELECTRODES = 4
-"""Largest number of electrodes for which the sizes `FEW_ELECTRODE_SIZES` are sufficient."""
 
 
 class DefaultSizes(NamedTuple):
@@ -24,6 +22,7 @@ class DefaultSizes(NamedTuple):
     Attributes:
         width: Width of the hidden layers of the contact network.
         misfit_width: Width of the hidden layers of the misfit network.
+        layers: Number of hidden layers of each network.
         steps: Number of optimiser steps of the contact network.
         rate_factor: Factor on the learning rate of the contact network. With more electrodes, the loss of a training
             with the whole rate increases at times.
@@ -31,6 +30,7 @@ class DefaultSizes(NamedTuple):
 
     width: int
     misfit_width: int
+    layers: int
     steps: int
     rate_factor: float
 
@@ -40,14 +40,11 @@ class DefaultSizes(NamedTuple):
         return FEW_ELECTRODE_SIZES if n_electrode <= FEW_ELECTRODES else MANY_ELECTRODE_SIZES
 
 
-FEW_ELECTRODE_SIZES = DefaultSizes(width=96, misfit_width=64, steps=2_000, rate_factor=1.0)
+FEW_ELECTRODE_SIZES = DefaultSizes(width=96, misfit_width=64, layers=3, steps=2_000, rate_factor=1.0)
 """Default sizes for at most `FEW_ELECTRODES` electrodes."""
 
-MANY_ELECTRODE_SIZES = DefaultSizes(width=128, misfit_width=96, steps=6_000, rate_factor=0.5)
+MANY_ELECTRODE_SIZES = DefaultSizes(width=128, misfit_width=96, layers=4, steps=6_000, rate_factor=0.5)
 """Default sizes for more electrodes, whose working areas are larger and whose charges have more dimensions."""
-
-N_HIDDEN_LAYERS = 3
-"""Default number of hidden layers of both networks."""
 
 Width = Annotated[int, Meta(ge=1, le=4096)]
 Widths = Annotated[tuple[Width, ...], Meta(min_length=1, description="widths from 1 to 4096")]
@@ -74,30 +71,44 @@ class NetworkConfig(Settings, frozen=True):
     weights: Literal["float32", "int8"] = "float32"
 
     def __post_init__(self) -> None:
-        if self.hidden is not None and self.misfit_hidden is not None and len(self.hidden) != len(self.misfit_hidden):
-            layers = f"as many layers as network.hidden ({len(self.hidden)}; they run side by side)"
-            raise WrongKey("misfit_hidden", layers, list(self.misfit_hidden))
+        """Check the settings, and raise WrongKey for the first one that is wrong.
+
+        If the widths of both perceptrons are given, both need the same number of layers, because the perceptrons are
+        folded into one.
+        """
+        if self.hidden is not None and self.misfit_hidden is not None:
+            layer_count = len(self.hidden)
+            if len(self.misfit_hidden) != layer_count:
+                expected = f"as many layers as network.hidden ({layer_count}; they run side by side)"
+                raise WrongKey("misfit_hidden", expected, list(self.misfit_hidden))
         if self.activation not in ACTIVATIONS:
             raise WrongKey("activation", f"one of {', '.join(ACTIVATIONS)}", self.activation)
-        if not (self.electrodes == 0 or 3 <= self.electrodes <= MAX_ELECTRODES):
+        is_as_dataset = self.electrodes == 0
+        if not is_as_dataset and not 3 <= self.electrodes <= MAX_ELECTRODES:
             raise WrongKey("electrodes", f"0 (as the dataset) or 3 to {MAX_ELECTRODES}", self.electrodes)
 
     def contact_widths(self, n_electrode: int) -> Widths:
         """Return the widths of the hidden layers of the contact network for a number of electrodes."""
         if self.hidden is not None:
             return self.hidden
-        return (DefaultSizes.of(n_electrode).width,) * self._layer_count()
+        sizes = DefaultSizes.of(n_electrode)
+        return (sizes.width,) * self._layer_count(sizes)
 
     def misfit_widths(self, n_electrode: int) -> Widths:
         """Return the widths of the hidden layers of the misfit network for a number of electrodes."""
         if self.misfit_hidden is not None:
             return self.misfit_hidden
-        return (DefaultSizes.of(n_electrode).misfit_width,) * self._layer_count()
+        sizes = DefaultSizes.of(n_electrode)
+        return (sizes.misfit_width,) * self._layer_count(sizes)
 
-    def _layer_count(self) -> int:
-        """Return the number of hidden layers of each network."""
+    def _layer_count(self, sizes: DefaultSizes) -> int:
+        """Return the number of hidden layers of each network: that of the given widths, or the default number.
+
+        Args:
+            sizes: Default sizes.
+        """
         given = self.hidden or self.misfit_hidden
-        return N_HIDDEN_LAYERS if given is None else len(given)
+        return sizes.layers if given is None else len(given)
 
 
 class TrainingConfig(Settings, frozen=True):
@@ -151,7 +162,7 @@ class FitConfig(Settings, frozen=True):
     training: TrainingConfig = TrainingConfig()
 
     def for_electrodes(self, n_electrode: int) -> "FitConfig":
-        """Return the same settings, in which the default sizes for a number of electrodes are stated as numbers."""
+        """Return the settings with numbers instead of the default sizes, which depend on the number of electrodes."""
         contact_widths = self.network.contact_widths(n_electrode)
         misfit_widths = self.network.misfit_widths(n_electrode)
         return FitConfig(

@@ -16,7 +16,7 @@ from isocharge.train.training.network import as_tensor
 
 @dataclass(frozen=True)
 class Teacher:
-    """A model whose answers a smaller network learns (knowledge distillation, Hinton et al. 2015).
+    """A model whose answers a smaller network learns (knowledge distillation, Hinton et al., 2015).
 
     The contact of a press is one sample of the posterior of its noisy charges. A good model gives this posterior
     without the scatter of single samples, so a small network learns faster from its answers than from the contacts.
