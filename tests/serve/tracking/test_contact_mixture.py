@@ -105,7 +105,7 @@ def test_contact_at_rest_beside_a_fold_has_an_other_contact_of_equal_probability
     assert tracked.force_std_N / tracked.force_N == pytest.approx(GAIN_STD / 0.7, rel=0.05)
 
 
-@pytest.mark.parametrize("rate_Hz", [200.0, 1000.0])
+@pytest.mark.parametrize("rate_Hz", [200.0, pytest.param(1000.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("speed", [10.0, 50.0, 200.0])
 @pytest.mark.parametrize("gains", [(1.0, 1.0, 1.0), (1.007, 0.993, 1.0), (0.99, 1.01, 1.0)])
 def test_sliding_contact_is_followed_across_a_fold(rate_Hz: float, speed: float, gains: Sequence[float]):

@@ -41,10 +41,9 @@ OFFSETS = {
 """Offset of each touch over the largest offset of the session."""
 
 
-@pytest.mark.parametrize(
-    "size_pC", [-30.0, 10.0, pytest.param(-10.0, marks=pytest.mark.slow), pytest.param(30.0, marks=pytest.mark.slow)]
-)
+@pytest.mark.first_cases(5)
 @pytest.mark.parametrize("kind", OFFSETS)
+@pytest.mark.parametrize("size_pC", [10.0, -30.0, -10.0, 30.0])
 def test_common_offset_of_warm_fingers_is_not_taken_for_pretension(mine, problem, film, kind, size_pC):
     """Without an offset among its unknowns the follower moved by 0.3 to 1.2 MPa, up to six standard deviations."""
     model = Predictor(mine)

@@ -221,6 +221,7 @@ def test_replay_follows_and_resets_the_film_like_the_stream(mine, problem, film,
     assert [record.to_json() for record in recorded_stream.replay(recording, replayed, clock)] == lines
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(("electrode", "change", "is_flagged"), [(0, -0.03, True), (3, 0.015, False)])
 def test_wrong_gain_is_not_taken_for_a_change_of_pretension(mine, problem, film, electrode, change, is_flagged):
     """The charges are similar to those of a film whose pretension differs by 0.2 to 0.3 MPa.

@@ -65,14 +65,19 @@ class ContactFilter:
 
     def reset(self) -> None:
         """Discard the contact."""
+        # The filters start again with the first contact, so that their values here are never used.
         self._position_filter = TwoModeFilter.start(0j, 1.0, POSITION_MOTION)
         self._force_filter = TwoModeFilter.start(0.0, 1.0, FORCE_MOTION)
         self._tracked: TrackedContact | None = None
-        self._outliers = 0
-        self._t_s = 0.0
+        self._outliers = 0  # number of outliers in succession
+        self._t_s = 0.0  # time of the latest frame that was no outlier
 
     def step(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> TrackedContact:
-        """Process the next frame.
+        """Smooth the position and the force of the next frame, each with its own filter.
+
+        Both filters start again after a gap in time, and if the filter of the position rejects the position. A rejected
+        position that could only be reached faster than `MAX_SPEED_mm_per_s` is an outlier instead: up to `MAX_OUTLIERS`
+        outliers in succession are ignored. If only the force is rejected, only its filter starts again.
 
         Args:
             contact: Contact predicted by the model.
@@ -80,32 +85,33 @@ class ContactFilter:
             flags: Flags of the frame.
 
         Returns:
-            The smoothed contact. If the frame is an outlier, it is the smoothed contact of the previous frame.
+            The smoothed contact. If the frame is ignored, it is the smoothed contact of the previous frame.
         """
         measured = self._measured(contact, flags)
-        position_noise = measured.white_share * measured.position_variance
-        force_noise = measured.white_share * measured.log_force_std * measured.log_force_std
+        position_variance = measured.white_share * measured.position_variance
+        force_variance = measured.white_share * measured.log_force_std * measured.log_force_std
         position = None
         log_force = None
 
-        # A filter returns None if the measured value is too far from its prediction.
+        # Continue the filters. A filter rejects a measured value far from its prediction, and then returns None.
         dt_s = t_s - self._t_s
-        if self._tracked is not None and 0.0 < dt_s <= MAX_GAP_s:
-            position = self._position_filter.step(measured.position, dt_s, measured.shape, position_noise)
+        previous = self._tracked
+        if previous is not None and 0.0 < dt_s <= MAX_GAP_s:
+            position = self._position_filter.step(measured.position, dt_s, measured.shape, position_variance)
             if position is not None:
-                log_force = self._force_filter.step(measured.log_force, dt_s, SCALAR_SHAPE, force_noise)
-            elif _is_too_far(measured.position, self._tracked, dt_s):
+                log_force = self._force_filter.step(measured.log_force, dt_s, SCALAR_SHAPE, force_variance)
+            elif self._outliers < MAX_OUTLIERS and _is_too_far(measured.position, previous, dt_s):
                 self._outliers += 1
-                if self._outliers <= MAX_OUTLIERS:
-                    return self._tracked
-
-        if position is None:
-            self._position_filter = TwoModeFilter.start(measured.position, position_noise, POSITION_MOTION)
-            position = Estimate(measured.position, position_noise)
-        if log_force is None:  # a force that jumps restarts only its own filter
-            self._force_filter = TwoModeFilter.start(measured.log_force, force_noise, FORCE_MOTION)
-            log_force = Estimate(measured.log_force, force_noise)
+                return previous
         self._outliers = 0
+
+        # Start each filter that was not continued.
+        if position is None:
+            self._position_filter = TwoModeFilter.start(measured.position, position_variance, POSITION_MOTION)
+            position = Estimate(measured.position, position_variance)
+        if log_force is None:
+            self._force_filter = TwoModeFilter.start(measured.log_force, force_variance, FORCE_MOTION)
+            log_force = Estimate(measured.log_force, force_variance)
         self._t_s = t_s
         self._tracked = self._tracked_contact(contact, measured, position, log_force)
         return self._tracked

@@ -1,4 +1,4 @@
-"""Gaussian mixture that follows a contact on a film with a fold in its map from contacts to charges.
+"""Gaussian mixture that follows a contact on a film whose map from contacts to charges has a fold.
 
 Where the map folds, several contacts have the same charges, and a single frame cannot distinguish them. A sequence of
 frames can distinguish them, because one contact crosses the fold while the other contact turns back at the fold.
@@ -144,13 +144,16 @@ class ContactMixture:
         """Discard the contact."""
         self._components: Components | None = None
         self._hypotheses: list[ContactHypothesis] = []
-        self._step_frames: list[tuple[Array, float]] = []
+        self._step_frames: list[tuple[Array, float]] = []  # charges and time of each frame of the present step
         self._step_begin_s = -math.inf
-        self._t_s = -math.inf
-        self._next_search_s = -math.inf
+        self._t_s = -math.inf  # mean time of the frames of the previous step
+        self._next_search_s = -math.inf  # time before which the whole film is not searched again
 
     def update(self, charge_pC: Array, t_s: float) -> list[ContactHypothesis]:
         """Process the next frame.
+
+        The mixture is updated once for all frames of a step of `STEP_s`. Between the updates, the contacts are
+        extrapolated to the time of the frame.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
@@ -181,6 +184,7 @@ class ContactMixture:
         slow_noise_pC2 = (SLOW_NOISE_STD * charge_pC) ** 2
         measurement = Measurement(charge_pC, frame_noise_pC2 + slow_noise_pC2)
 
+        # Follow the contact of the previous step. If there is none, search the whole film, but not in every step.
         components = None
         if self._components is not None and 0.0 < dt_s < MAX_GAP_s:
             components = self._advance(self._components, measurement, dt_s)
@@ -287,6 +291,9 @@ class ContactMixture:
     def _update(self, prior: Components, measurement: Measurement, iterations: int) -> Components | None:
         """Update the components with the charges, and prune and split them.
 
+        The weight of each component is multiplied by its likelihood. Components outside of the film are removed. If the
+        most probable component does not explain the charges, there is no contact.
+
         Args:
             prior: Predicted components.
             measurement: Charges of this step.
@@ -297,13 +304,15 @@ class ContactMixture:
         """
         state, linearised = self._most_probable_states(prior, measurement, iterations)
 
-        # Likelihood of each component: -2 ln p = squared misfit + squared change of the state + ln det(covariance).
+        # Likelihood p of each component: -2 ln p = squared misfit + squared change of the state + ln det(covariance).
+        # All squares have the shape (n_component,).
         weighted = linearised.weighted_innovation
         squared_misfit = ((measurement.charge_pC - linearised.charge_pC) ** 2 / measurement.variance).sum(axis=1)
         squared_state_change = (weighted.swapaxes(1, 2) @ linearised.charge_covariance @ weighted)[:, 0, 0]
         square = squared_misfit + squared_state_change
         _, log_determinant = np.linalg.slogdet(linearised.innovation_covariance)
         log_weight = prior.log_weight - 0.5 * (square + log_determinant)
+
         is_outside_film = np.hypot(state[:, X], state[:, Y]) > MAX_RELATIVE_RADIUS * self.charges.radius_mm
         log_weight[is_outside_film] = -np.inf
         best = int(log_weight.argmax())
@@ -334,10 +343,11 @@ class ContactMixture:
         # Change of the state if the position changes by one standard deviation along the longest axis.
         direction = covariance[:, POSITION] @ axes[:, longest] / std_mm
         sides = np.array([1.0, -1.0])
-        probes = mean + FOLD_DISTANCE * np.outer(sides, direction)
-        if not self._is_across_fold(mean, probes).any():
+        states_on_both_sides = mean + FOLD_DISTANCE * np.outer(sides, direction)
+        if not self._is_across_fold(mean, states_on_both_sides).any():
             return components
 
+        # The added components are narrower along this direction, and have a smaller weight than the component between.
         removed_share = 1.0 - SPLIT_STD_RATIO**2
         narrow_covariance = covariance - removed_share * np.outer(direction, direction)
         log_weight = components.log_weight[best] - 0.5 * SPLIT_DISTANCE**2
@@ -364,12 +374,15 @@ class ContactMixture:
     def _group(self, components: Components) -> list[ContactHypothesis]:
         """Combine the components that describe the same contact.
 
+        The most probable remaining component and all components of the same contact form one group, until no component
+        remains.
+
         Returns:
             The contacts, in descending order of their probability.
         """
         probability = np.exp(components.log_weight - components.log_weight.max())
         probability /= probability.sum()
-        remaining = np.argsort(-probability, kind="stable")
+        remaining = np.argsort(-probability, kind="stable")  # rows of the components, the most probable first
         hypotheses = []
         while remaining.size:
             is_same = self._is_same_contact(components, remaining)
@@ -390,12 +403,12 @@ class ContactMixture:
         """
         first = rows[0]
         mean = components.mean[rows]
-        position_variance = components.covariance[:, [X, Y], [X, Y]]
+        position_variance = components.covariance[:, [X, Y], [X, Y]]  # of x and of y, shape (n_component, 2)
         std_mm = np.sqrt(position_variance[first] + position_variance[rows])
         distance_mm = np.abs(mean[:, POSITION] - components.mean[first, POSITION])
         is_near = (distance_mm < SEPARATE_DISTANCE * std_mm).all(axis=1)
         is_same = is_near & ~self._is_across_fold(components.mean[first], mean)
-        is_same[0] = True
+        is_same[0] = True  # even if rounding errors make the first component appear to be across a fold
         return np.asarray(is_same)
 
 

@@ -7,8 +7,8 @@ The misfit vector of a touch is the part of its charges that no contact explains
   uncertain (`FilmDirections`), the drift of the gain of each electrode, and a common offset. The common offset is a
   charge that is added to all electrodes while a touch lasts, such as the pyroelectric charge of a warm finger.
 
-At each pretension, a Kalman filter estimates the linear unknowns (a Rao-Blackwellised filter, Doucet et al. 2000). If a
-gain, an offset or an error of the calibration explains a change of the misfit, the estimated pretension therefore
+At each pretension, a Kalman filter estimates the linear unknowns (a Rao-Blackwellised filter, Doucet and others 2000).
+If a gain, an offset or an error of the calibration explains a change of the misfit, the estimated pretension therefore
 hardly changes.
 
 The size of the offsets is unknown at first. The filter therefore compares several offset levels. At the first level,
@@ -86,7 +86,7 @@ LEVEL_CHANGE_PROBABILITY = 0.0003
 
 
 class TouchResiduals(NamedTuple):
-    """Squared misfits of a touch after it is corrected with the most likely offset level.
+    """Squared misfits of a touch after the touch is corrected with the most likely offset level.
 
     All values are relative to the mean squared misfit of good touches.
 
@@ -161,7 +161,8 @@ class FilmFilter:
 
     def reset(self) -> None:
         """Return to the distribution before the first touch."""
-        # Joint probability of the offset level and the pretension, shape (n_level, n_pretension).
+        # Joint probability of the offset level and the pretension, shape (n_level, n_pretension). Level 0 is the level
+        # without offsets, and the other levels share the remaining probability equally.
         level_count = self._level_std.size
         level_probability = np.full(level_count, (1.0 - NO_OFFSET_PROBABILITY) / max(level_count - 1, 1))
         level_probability[0] = 1.0 - level_probability[1:].sum()
@@ -346,6 +347,9 @@ class FilmFilter:
     def update(self, charge_pC: Array, log_changes: Array) -> TouchResiduals:
         """Update the distribution by a touch.
 
+        The Kalman update assumes that the touch fits the model. A touch may also be an outlier with a small
+        probability. Each estimate is therefore changed only in proportion to the probability that the touch fits.
+
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
             log_changes: Changes of the logarithms of the charges by one unit of each direction at the contact, shape
@@ -358,7 +362,7 @@ class FilmFilter:
         noise_covariance = self._noise_covariance(jacobian)
         kalman = self._kalman_update(misfit, jacobian, noise_covariance)
 
-        # The update is weighted by the probability that the touch is not an outlier.
+        # Probability that the touch is not an outlier, at each level and pretension
         good_density = (1.0 - OUTLIER_PROBABILITY) * kalman.density
         total_density = good_density + OUTLIER_PROBABILITY * OUTLIER_DENSITY
         good_probability = good_density / total_density
@@ -379,10 +383,14 @@ class FilmFilter:
                 n_unknown).
             noise_covariance: Result of `_noise_covariance`.
         """
+        # The first two axes of all arrays are level and pretension.
         cross_covariance = jacobian @ self._covariance
         transposed = cross_covariance.swapaxes(-1, -2)
         innovation_covariance = noise_covariance + cross_covariance @ jacobian.swapaxes(-1, -2)
-        innovation = (misfit - (jacobian @ self._mean[..., None])[..., 0])[..., None]  # a column for each system
+        predicted_misfit = (jacobian @ self._mean[..., None])[..., 0]
+        innovation = (misfit - predicted_misfit)[..., None]  # as a column
+
+        # One call solves the systems for the innovation and for the columns of the cross covariance.
         right_sides = np.concatenate([innovation, cross_covariance], axis=-1)
         solutions = np.linalg.solve(innovation_covariance, right_sides)
         weighted_innovation = solutions[..., :1]
@@ -459,7 +467,7 @@ class FilmFilter:
         return np.where(is_small, SMALLEST_OFFSET_STEP_pC, mean_offset_pC)
 
     def _residuals(self, misfit: Array, jacobian: Array, noise_covariance: Array) -> TouchResiduals:
-        """Return the squared misfits of a touch after it is corrected with the most likely offset level.
+        """Return the squared misfits of a touch after the touch is corrected with the most likely offset level.
 
         Args:
             misfit: Misfit vectors, as `_linearise` returns them.
@@ -478,8 +486,11 @@ class FilmFilter:
 
         offset_jacobian = level_jacobian[self.nearest, :, self._layout.offset]
         offset_variance = self._scatter_std[level] ** 2 * (offset_jacobian**2).sum()
+
+        # The squared misfit at each pretension g is r^T P r, the sum over the electrodes e and f.
+        quadratic_form = "ge,gef,gf->g"
         return TouchResiduals(
-            filtered=np.einsum("ge,gef,gf->g", residual, precision, residual),
-            without_gains=np.einsum("ge,gef,gf->g", residual_without_gains, precision, residual_without_gains),
+            filtered=np.einsum(quadratic_form, residual, precision, residual),
+            without_gains=np.einsum(quadratic_form, residual_without_gains, precision, residual_without_gains),
             offset_variance=float(offset_variance),
         )

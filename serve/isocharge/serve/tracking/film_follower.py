@@ -1,8 +1,8 @@
 """Correction of contacts for changes of the film, which are estimated from ordinary touches.
 
-Four charges have one degree of freedom more than a contact (x, y, force). This degree of freedom is the misfit. If the
-pretension of a film changes, for example because the room is warmer by 1 K, the misfits of all touches grow. The
-pretension of the film is the pretension at which the misfits are smallest.
+The charges of four electrodes have one degree of freedom more than a contact (x, y, force). This degree of freedom is
+the misfit. If the pretension of a film changes, for example because the room is warmer by 1 K, the misfits of all
+touches grow. The pretension of the film is the pretension at which the misfits are smallest.
 
 The module `isocharge.serve.tracking.film_filter` estimates the pretension from the frame with the largest force of each
 touch. The filter also estimates the gains, a common offset, and the directions in which the film remained uncertain
@@ -22,15 +22,15 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import ModelError
 from isocharge.serve.flags import BEYOND, GAP, MISFIT, OUTSIDE, REPEAT, STRESS
 from isocharge.serve.model.film_directions import read_film_directions
-from isocharge.serve.model.pretensions import Pretensions, read_pretensions
 from isocharge.serve.prediction.contact import Contact, Sensitivity, is_close
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.tracking.film_filter import FilmFilter, TouchResiduals
+from isocharge.serve.tracking.followable_pretensions import followable_pretensions
+from isocharge.serve.tracking.pretension_grid import odds_of_no_change
 
 HARMLESS_FLAGS = frozenset({STRESS, GAP, REPEAT})
 """Flags of a frame that do not make its touch unusable. GAP and REPEAT only mean that frames were lost."""
@@ -215,8 +215,12 @@ class FilmFollower:
         self.predictor = self._calibrated
         self.is_lost = False
         self._applied_estimate = self._calibrated_estimate
+
+        # Model at a neighbouring pretension, with which the sensitivity of contacts to the pretension is computed.
         self._neighbouring_model: Predictor | None = None
         self._neighbouring_step_MPa = SENSITIVITY_STEP_MPa
+
+        # Factors of the charges for both models, and the contact for which they were computed; see `_charge_factors`.
         self._factors: tuple[Array, Array] | None = None
         self._factors_contact: Contact | None = None
         self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
@@ -241,7 +245,8 @@ class FilmFollower:
     ) -> None:
         """Process a frame. After the last frame of a touch, the estimate of the film is updated.
 
-        The estimate is updated with the frame of the touch that has the largest force and no flags.
+        The estimate is updated with the frame of the touch that has the largest force and no flags. A touch is not used
+        if one of its frames has a flag that is not harmless.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC; None if nothing touches the film.
@@ -255,7 +260,7 @@ class FilmFollower:
             harmless_flags = HARMLESS_FLAGS_OUTSIDE if OUTSIDE in flags else HARMLESS_FLAGS
             if not harmless_flags.issuperset(flags):
                 self._is_touch_usable = False
-        elif self._peak is None or contact.force_N > self._peak.contact.force_N:
+        elif self._peak is None or contact.force_N > self._peak.contact.force_N:  # the largest force so far
             assert charge_pC is not None
             self._peak = PeakFrame(contact, charge_pC)
 
@@ -268,23 +273,27 @@ class FilmFollower:
     def follow_contact(self, contact: Contact, charge_pC: Array) -> FollowedContact:
         """Correct a contact for the present estimate of the film, and add the uncertainty of the pretension.
 
-        Before the first estimate, the contact is returned unchanged.
+        The followed film has other charges than the calibrated one. The measured charges are therefore divided by the
+        ratio of both, and the contact is computed again from the result. The uncertainty is computed with a model at a
+        neighbouring pretension. Before the first estimate, the contact is returned unchanged.
 
         Args:
             contact: Contact that `predictor` computed from the charges.
             charge_pC: Touch charges, shape (n_electrode,), pC.
         """
-        if self._neighbouring_model is None:
+        if self._neighbouring_model is None:  # there is no estimate yet
             return FollowedContact(contact, charge_pC)
-        neighbouring_pC = charge_pC
+        corrected_contact = contact
+        corrected_pC = charge_pC
+        neighbouring_pC = charge_pC  # charges for the model at the neighbouring pretension
         if self._directions.count > 0:
             factor, neighbouring_factor = self._charge_factors(contact)
             neighbouring_pC = charge_pC / neighbouring_factor
-            charge_pC = charge_pC / factor
-            contact = self.predictor.predict(charge_pC)
+            corrected_pC = charge_pC / factor
+            corrected_contact = self.predictor.predict(corrected_pC)
         predict_neighbouring = partial(self._neighbouring_model.predict, neighbouring_pC)
-        shift = self._sensitivity.shift(contact, self._applied_estimate.std_MPa, predict_neighbouring)
-        return FollowedContact(contact.widened(shift), charge_pC)
+        shift = self._sensitivity.shift(corrected_contact, self._applied_estimate.std_MPa, predict_neighbouring)
+        return FollowedContact(corrected_contact.widened(shift), corrected_pC)
 
     def _charge_factors(self, contact: Contact) -> tuple[Array, Array]:
         """Return the factors by which the charges are divided before they are passed to the models.
@@ -309,6 +318,10 @@ class FilmFollower:
     def observe_touch(self, peak: PeakFrame, clock_s: float) -> None:
         """Update the estimate of the film with a touch, and decide whether the film is lost.
 
+        The film is lost if no pretension explains the latest touches, if the gain of an electrode seems to be wrong, or
+        if the offsets are too large. When the film gets lost, the estimate returns to that before the latest touches.
+        No estimate is used before `FEWEST_TOUCHES` touches.
+
         Args:
             peak: Frame with the largest force of the touch.
             clock_s: Time of the touch on a clock that does not jump, s.
@@ -327,7 +340,7 @@ class FilmFollower:
             estimate = self._estimate()
             self._recent_estimates.append(estimate)
             self._apply_estimate(estimate)
-        elif not was_lost:
+        elif not was_lost:  # the film has been lost with this touch
             self._apply_estimate(self._estimate_before_recent_touches())
             self._recent_estimates.clear()
 
@@ -337,7 +350,10 @@ class FilmFollower:
         return self._recent_estimates[0] if is_old_enough else self._calibrated_estimate
 
     def _squared_misfits(self, charge_pC: Array, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
-        """Return the squared misfits of a touch. They determine whether the film is lost.
+        """Return the squared misfits of a touch, which determine whether the film is lost.
+
+        One group of misfits tests the hypothesis that the gain of one electrode is wrong. For these misfits, the
+        charges are corrected for the offset and the directions, and are then multiplied by each wrong gain.
 
         Args:
             charge_pC: Touch charges of the frame with the largest force, shape (n_electrode,), pC.
@@ -379,55 +395,67 @@ class FilmFollower:
         return bool(sum_by_wrong_gain.min() < sum_by_pretension.min() - WRONG_GAIN_MARGIN)
 
     def _estimate(self) -> FilmStateEstimate:
-        """Return the mean estimate of the film over two hypotheses. Both hypotheses have the same prior probability.
+        """Return the estimate of the film, averaged over two hypotheses.
 
         The first hypothesis is that the pretension has changed since the calibration. The second hypothesis is that it
-        has not changed.
+        has not changed. Before the first touch, each hypothesis has the probability one half. The variance includes the
+        difference between the two hypotheses.
         """
         calibrated_MPa = self._pretensions.calibrated_MPa
-        change = self._filter.mean_MPa - calibrated_MPa
-        unchanged_variance = self._filter_variance() + self._pretensions.floor_MPa**2
-        changed_probability = self._changed_probability(change, unchanged_variance)
-        std = math.sqrt(unchanged_variance + changed_probability * (1.0 - changed_probability) * change**2)
-        pretension_MPa = calibrated_MPa + changed_probability * change
+        change_MPa = self._filter.mean_MPa - calibrated_MPa
+        variance_MPa2 = self._filter_variance() + self._additional_variance()
+        changed_probability = self._changed_probability()
+
+        # Mean and variance of the mixture of both hypotheses
+        pretension_MPa = calibrated_MPa + changed_probability * change_MPa
+        variance_between_MPa2 = changed_probability * (1.0 - changed_probability) * change_MPa**2
+        std_MPa = math.sqrt(variance_MPa2 + variance_between_MPa2)
+
+        # Means of the directions at this pretension, and their slopes as finite differences
         directions = self._filter.direction_means(pretension_MPa)
         neighbouring_directions = self._filter.direction_means(pretension_MPa + SENSITIVITY_STEP_MPa)
         directions_per_MPa = (neighbouring_directions - directions) / SENSITIVITY_STEP_MPa
-        return FilmStateEstimate(pretension_MPa, std, directions, directions_per_MPa)
+        return FilmStateEstimate(pretension_MPa, std_MPa, directions, directions_per_MPa)
 
     def _filter_variance(self) -> float:
-        """Return the variance of the pretension, MPa^2. It includes the error of the correction for offsets."""
+        """Return the variance of the pretension according to the filter, MPa^2."""
         deviations_MPa = self._filter.grid_MPa - self._filter.mean_MPa
-        variance = float(self._filter.probability @ deviations_MPa**2)
-        return variance + (OFFSET_CORRECTION_ERROR * self._filter.offset_correction_MPa) ** 2
+        return float(self._filter.probability @ deviations_MPa**2)
 
-    def _changed_probability(self, change_MPa: float, unchanged_variance: float) -> float:
-        """Return the probability that the pretension has changed since the calibration.
+    def _additional_variance(self) -> float:
+        """Return the variance of the pretension that the filter does not contain, MPa^2.
 
-        Args:
-            change_MPa: Measured change of the pretension.
-            unchanged_variance: Variance of the measured change if the pretension has not changed, MPa^2.
+        This variance consists of the errors of the other parameters of the film and of the error of the correction for
+        offsets.
         """
-        changed_variance = unchanged_variance + self._pretensions.std_MPa**2
-        exponent = -0.5 * change_MPa**2 * (1.0 / unchanged_variance - 1.0 / changed_variance)
-        odds_of_unchanged = math.sqrt(changed_variance / unchanged_variance) * math.exp(exponent)
-        return 1.0 / (1.0 + odds_of_unchanged)
+        offset_std = OFFSET_CORRECTION_ERROR * self._filter.offset_correction_MPa
+        return self._pretensions.floor_MPa**2 + offset_std**2
+
+    def _changed_probability(self) -> float:
+        """Return the probability that the pretension has changed since the calibration."""
+        pretensions = self._pretensions
+        change_MPa = self._filter.grid_MPa - pretensions.calibrated_MPa
+        odds = odds_of_no_change(change_MPa, self._filter.probability, pretensions.std_MPa, self._additional_variance())
+        return 1.0 / (1.0 + odds)
 
     def _apply_estimate(self, estimate: FilmStateEstimate) -> None:
         """Use a new estimate of the film to compute all later contacts.
 
-        If the pretension has changed by less than `SMALLEST_CHANGE_MPa`, the present models are kept.
+        If the pretension has changed by less than `SMALLEST_CHANGE_MPa`, the present pretension and the present models
+        are kept, and only the other values of the estimate are used.
         """
+        self._factors = None  # the factors of the charges belong to the previous estimate
         present_MPa = self._applied_estimate.pretension_MPa
         is_same_pretension = abs(estimate.pretension_MPa - present_MPa) < SMALLEST_CHANGE_MPa
         if is_same_pretension:
-            estimate = estimate._replace(pretension_MPa=present_MPa)
-        self._applied_estimate = estimate
-        self._factors = None
-        if not is_same_pretension:
+            self._applied_estimate = estimate._replace(pretension_MPa=present_MPa)
+        else:
+            self._applied_estimate = estimate
             self.predictor = self._model_at(estimate.pretension_MPa)
+
+        # The first estimate needs the neighbouring model even if the pretension has not changed.
         if not is_same_pretension or self._neighbouring_model is None:
-            self._set_neighbouring_model(estimate.pretension_MPa)
+            self._set_neighbouring_model(self._applied_estimate.pretension_MPa)
 
     def _set_neighbouring_model(self, pretension_MPa: float) -> None:
         """Set the model with which the sensitivity of contacts to the pretension is computed.
@@ -441,52 +469,8 @@ class FilmFollower:
             step_MPa = -step_MPa
         self._neighbouring_step_MPa = step_MPa
         self._neighbouring_model = self._model_at(pretension_MPa + step_MPa)
-        self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
+        self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)  # the sign of the step does not affect variances
 
     def _model_at(self, pretension_MPa: float) -> Predictor:
         """Return the model of the film at a pretension."""
         return self._calibrated.with_constants(self._pretensions.constants(pretension_MPa))
-
-
-def followable_pretensions(predictor: Predictor) -> Pretensions:
-    """Read the file of pretensions of a model, and check that changes of its film can be estimated.
-
-    Raises:
-        ModelError: If the model has three electrodes, or has no file of pretensions, or the file of pretensions belongs
-            to another model.
-    """
-    electrodes = predictor.metadata.electrodes
-    if len(electrodes) <= 3:
-        raise ModelError(
-            f"model {predictor.metadata.label}: its film cannot be followed: {len(electrodes)} charges "
-            f"{electrodes} only determine x, y and force; expected a model with four electrodes or more, whose misfit "
-            "shows a change of the film"
-        )
-    pretensions = read_pretensions(predictor.folder)
-    _check_same_model(predictor, pretensions)
-    return pretensions
-
-
-def _check_same_model(predictor: Predictor, pretensions: Pretensions) -> None:
-    """Check that the weights of a file of pretensions belong to a model.
-
-    With the weights of the calibrated pretension, the graph of the model must compute the same contacts as with its own
-    weights. With the weights of another pretension, the graph must compute other contacts.
-
-    Raises:
-        ModelError: If the weights belong to another model.
-    """
-    lowest_MPa, highest_MPa = pretensions.range_MPa
-    other_MPa = highest_MPa if pretensions.calibrated_MPa == lowest_MPa else lowest_MPa
-    charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)
-    calibrated_model = predictor.with_constants(pretensions.constants(pretensions.calibrated_MPa))
-    other_model = predictor.with_constants(pretensions.constants(other_MPa))
-    own, calibrated, other = (
-        np.asarray(model.predict_batch(charges_pC)) for model in (predictor, calibrated_model, other_model)
-    )
-    is_same_model = np.allclose(calibrated, own, rtol=1e-5, atol=1e-5, equal_nan=True)
-    if not is_same_model or np.array_equal(other, own):
-        raise ModelError(
-            f"{predictor.folder}: pretensions.npz is not of this model.onnx; copy the model's folder again, or "
-            "calibrate again"
-        )

@@ -91,7 +91,11 @@ class ContactHypothesis(NamedTuple):
 
     @property
     def contact(self) -> Contact:
-        """The contact of the component as a `Contact`, the type that a model predicts."""
+        """The contact of the component as a `Contact`, the type that a model predicts.
+
+        The state of the component has the logarithm of the force. The standard deviation of the force is therefore the
+        force times the standard deviation of this logarithm.
+        """
         x_mm, y_mm, log_force = self.mean[CONTACT].tolist()
         covariance = self.covariance[CONTACT, CONTACT]
         std = np.sqrt(covariance.diagonal())

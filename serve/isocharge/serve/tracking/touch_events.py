@@ -44,6 +44,9 @@ class TouchEvents:
     def step(self, tracked: TrackedContact, t_s: float) -> str | None:
         """Return the event that begins with a frame; None if there is none.
 
+        A slide begins when the contact moves and is away from the position at which it last rested. A hold begins when
+        the contact has rested at one position for `HOLD_TIME_s`. The same event does not occur twice in succession.
+
         Args:
             tracked: The tracked contact.
             t_s: Time of the frame, s.

@@ -146,6 +146,6 @@ def _other_contact(hypotheses: list[ContactHypothesis]) -> OtherContact | None:
     """
     if len(hypotheses) == 1 or hypotheses[0].probability > CERTAIN_PROBABILITY:
         return None
-    second = hypotheses[1]
+    _, second, *_ = hypotheses
     contact = second.contact
     return OtherContact(contact.x_mm, contact.y_mm, contact.force_N, second.probability)

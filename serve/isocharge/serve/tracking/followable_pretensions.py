@@ -1,0 +1,56 @@
+"""Weights of a model whose film can be followed, and the checks that they belong to the model."""
+
+import numpy as np
+
+from isocharge.common.errors import ModelError
+from isocharge.serve.model.pretensions import Pretensions, read_pretensions
+from isocharge.serve.prediction.predictor import Predictor
+
+
+def followable_pretensions(predictor: Predictor) -> Pretensions:
+    """Read the file of pretensions of a model, and check that changes of its film can be estimated.
+
+    Raises:
+        ModelError: If the model has three electrodes, or has no file of pretensions, or the file of pretensions belongs
+            to another model.
+    """
+    electrodes = predictor.metadata.electrodes
+    if len(electrodes) <= 3:
+        raise ModelError(
+            f"model {predictor.metadata.label}: its film cannot be followed: {len(electrodes)} charges "
+            f"{electrodes} only determine x, y and force; expected a model with four electrodes or more, whose misfit "
+            "shows a change of the film"
+        )
+    pretensions = read_pretensions(predictor.folder)
+    _check_same_model(predictor, pretensions)
+    return pretensions
+
+
+def _check_same_model(predictor: Predictor, pretensions: Pretensions) -> None:
+    """Check that the weights of a file of pretensions belong to a model.
+
+    With the weights of the calibrated pretension, the graph of the model must compute the same contacts as with its own
+    weights. With the weights of another pretension, the graph must compute other contacts.
+
+    Args:
+        predictor: The calibrated model, with its own weights.
+        pretensions: Weights of the network at any pretension, from the file.
+
+    Raises:
+        ModelError: If the weights belong to another model.
+    """
+    lowest_MPa, highest_MPa = pretensions.range_MPa
+    other_MPa = highest_MPa if pretensions.calibrated_MPa == lowest_MPa else lowest_MPa
+    charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)  # a weak, a typical and a strong press
+    calibrated_model = predictor.with_constants(pretensions.constants(pretensions.calibrated_MPa))
+    other_model = predictor.with_constants(pretensions.constants(other_MPa))
+    own, calibrated, other = (
+        np.asarray(model.predict_batch(charges_pC)) for model in (predictor, calibrated_model, other_model)
+    )
+    # The tolerance covers the rounding errors of the interpolated weights. Missing correlations are NaN.
+    is_same_model = np.allclose(calibrated, own, rtol=1e-5, atol=1e-5, equal_nan=True)
+    if not is_same_model or np.array_equal(other, own):
+        raise ModelError(
+            f"{predictor.folder}: pretensions.npz is not of this model.onnx; copy the model's folder again, or "
+            "calibrate again"
+        )
