@@ -6,6 +6,7 @@ The folder tests/data/frames contains the layouts of three sensors, as their mak
 import binascii
 import math
 import struct
+import sys
 import tomllib
 from pathlib import Path
 
@@ -169,14 +170,22 @@ def stuffed(framing, **others):
         ("hdlc", lambda data: b"~" + data.replace(b"}", b"}]").replace(b"~", b"}^") + b"~"),
     ],
 )
-def test_cobs_slip_and_hdlc_frames_are_read(framing, stuff):
-    """A frame with a wrong checksum and a piece of another length are dropped without damage to other frames."""
+def test_cobs_slip_and_hdlc_frames_are_encoded_and_read(framing, stuff):
+    """The encoder sends no delimiter before a frame of HDLC, which is optional (RFC 1662).
+
+    A frame with a wrong checksum and a piece of another length are dropped without damage to other frames.
+    """
     bodies = [struct.pack("<Bf", seq, 0.1 * seq) for seq in range(256)]
     sent = [stuff(body + struct.pack("<I", binascii.crc32(body))) for body in bodies]
     with_wrong_checksum = stuff(bodies[0] + struct.pack("<I", binascii.crc32(bodies[1])))
     too_short = stuff(b"123")
     stream = b"".join([*sent[:9], with_wrong_checksum, too_short, *sent[9:]])
-    parser = stuffed(framing).parser()
+    described = stuffed(framing)
+    encoded_frames = [described.encode(Frame(seq, None, (0.1 * seq,))) for seq in range(256)]
+    first_delimiter = b"~" if framing == "hdlc" else b""
+    assert [first_delimiter + data for data in encoded_frames] == sent
+
+    parser = described.parser()
     frames = []
     for start in range(0, len(stream), 7):
         frames += parser.feed(stream[start : start + 7])
@@ -235,6 +244,29 @@ fields = [{name = "seq", type = "u8"}, {name = "t_ms", type = "u8"}, {name = "A"
     parser = SyncParser(described)
     assert parser.feed(described.encode(Frame(257, 300_000, (1e6,)))) == [Frame(1, 44_000, (16383.5,), names=("A",))]
     assert (parser.seq_modulus, parser.t_us_modulus) == (256, 256_000)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "expected"),
+    [
+        ({"type": "i16"}, 1e300, 32767.0),
+        ({"type": "u8"}, -1.0, 0.0),
+        ({"type": "i24", "scale": -2.0}, 1e9, -2.0 * -(2**23)),
+        ({"type": "f32"}, -math.inf, -struct.unpack(">f", b"\x7f\x7f\xff\xff")[0]),
+        ({"type": "f64"}, math.inf, sys.float_info.max),
+    ],
+)
+def test_channel_beyond_the_range_of_its_field_is_clipped(field, value, expected):
+    size = {"8": 1, "6": 2, "4": 3, "2": 4}[field["type"][-1]] if field["type"] != "f64" else 8
+    described = layout({"sync": "55", "length": 1 + size, "fields": [{"name": "A"} | field]})
+    assert described.parser().feed(described.encode(Frame(None, None, (value,))))[0].values == (expected,)
+
+
+def test_signed_counter_wraps_and_has_no_scale():
+    described = layout({"sync": "55", "length": 3, "fields": [
+        {"name": "seq", "type": "i8", "scale": 0.5}, {"name": "A", "type": "u8"},
+    ]})  # fmt: skip
+    assert described.encode(Frame(130, None, (0.0,))) == b"\x55" + struct.pack("<bB", 130 - 256, 0)
 
 
 WRONG = [

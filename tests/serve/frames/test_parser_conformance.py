@@ -109,7 +109,7 @@ def described(table):
 
 def slip(frame):
     """Return a frame with the byte stuffing of RFC 1055."""
-    data = device_from_table({"frames": STUFFED}, "test").frames.encode(frame)
+    data = device_from_table({"frames": STUFFED}, "test").frames.encode_unstuffed(frame)
     return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
 
 

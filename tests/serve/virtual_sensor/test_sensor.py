@@ -8,10 +8,12 @@ from itertools import islice
 
 import numpy as np
 import pytest
+import serial
 
 from isocharge.common.errors import PortError, SceneError
-from isocharge.serve import BinaryParser, Faults, Port, Script, VirtualSensor, encode_text, wander
+from isocharge.serve import BinaryParser, Faults, Port, Script, VirtualSensor, encode_frame, encode_text, wander
 from isocharge.serve.frames.frame import SequenceGaps
+from isocharge.serve.port.serial_line import Request
 from isocharge.serve.virtual_sensor.script import corrupt
 
 
@@ -63,6 +65,20 @@ def test_frame_number_and_clock_overflow(film):
     assert sum(map(len, islice(sensor.frames(), 65_540))) == 65_540
     assert (frames[65_535].seq, frames[65_536].seq) == (65_535, 0)
     assert frames[4295].t_us == 4_295_000_000 - 2**32
+
+
+def test_frame_number_and_clock_of_a_board_with_a_wider_counter(film):
+    frames = []
+    sensor = VirtualSensor(
+        film.charges,
+        steady(10, 1.0),
+        encode=lambda frame: bytes(frames.append(frame) or 1),
+        seq_modulus=1 << 32,
+        t_us_modulus=1000 << 32,
+    )
+    assert sum(map(len, islice(sensor.frames(), 65_540))) == 65_540
+    assert frames[65_536].seq == 65_536
+    assert frames[4295].t_us == 4_295_000_000
 
 
 @pytest.mark.parametrize("charges", [np.zeros(3), np.zeros((2, 3)), np.full((10, 3), np.nan)])
@@ -123,13 +139,31 @@ def test_frames_are_sent_on_time_with_their_truth(film):
     assert late_s[-300:].min() - late_s[:300].min() < 0.02  # 0.05 if it slept for the time between two frames
 
 
+def test_frames_after_a_stall_of_the_process_are_postponed_and_not_sent_in_a_burst(film):
+    """The stall is as long as 200 frames. Without a pause, these frames would be sent within a few milliseconds."""
+
+    def encode(frame):
+        if frame.seq == 100:
+            time.sleep(0.4)
+        return encode_frame(frame)
+
+    with VirtualSensor(film.charges, steady(rate_Hz=500.0), encode=encode) as sensor:
+        frames, _ = read(sensor.url, 300)
+        sent_s = {frame.seq: sensor.truth(frame.seq).sent_s for frame in frames}
+        assert sensor.paused_s > 0.3
+    for seq in range(101, max(sent_s) + 1):
+        assert sent_s[seq] - sent_s[100] > (seq - 100) / 500.0 - 0.06  # a frame may be late by 0.05 s
+
+
 def test_frames_are_withheld_without_a_reader(film):
     """Frames that do not fit into the buffer are withheld completely. A later reader receives no damaged frame."""
     with VirtualSensor(film.charges, steady(rate_Hz=2000.0)) as sensor:
         while sensor.withheld < 100:
             time.sleep(0.01)
         for _ in range(2):
+            played_count = sensor.sent + sensor.withheld
             frames, counts = read(sensor.url, 200)
+            assert frames[0].seq >= played_count  # frames that were sent before the port was opened are discarded
             gaps = SequenceGaps()
             for frame in frames:
                 gaps.update(frame.seq)
@@ -141,6 +175,27 @@ def test_frames_are_withheld_without_a_reader(film):
         assert frames[0].seq < 1000
     with pytest.raises(PortError, match="does not play"):
         sensor.url  # noqa: B018
+
+
+@pytest.mark.parametrize("echo", [False, True])
+def test_frames_are_sent_and_numbered_on_request(film, echo):
+    request = Request(b"?\n", rate_Hz=100.0, echo=echo)
+    parser = BinaryParser()
+    with VirtualSensor(film.charges, steady(rate_Hz=500.0), request=request.data, echo=echo) as sensor:
+        with Port(sensor.url, request=request) as port:
+            frames = list(islice((frame for chunk in port for frame in parser.feed(chunk.data)), 20))
+        assert port.echo_share == pytest.approx(1.0 if echo else 0.0, abs=0.06)
+        assert sensor.withheld > 20
+    assert [frame.seq for frame in frames] == list(range(20))
+    assert frames[-1].t_us > 19 * 9_000  # at most 100 requests per second
+    assert parser.counts.bytes_dropped == 0
+
+
+def test_bytes_that_a_sensor_ignores_do_not_block_their_sender(film):
+    sensor = VirtualSensor(film.charges, steady(rate_Hz=500.0))
+    with sensor, serial.Serial(sensor.url, write_timeout=10.0) as line:
+        for _ in range(100):
+            line.write(b"?" * 2000)
 
 
 def test_unplugged_port_returns_under_the_same_link(film):

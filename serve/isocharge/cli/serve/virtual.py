@@ -20,9 +20,9 @@ from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
 from isocharge.serve import Script, VirtualSensor, encode_frame, encode_text, load_device
-from isocharge.serve.frames.frame_layout import FrameLayout
+from isocharge.serve.live.board_encoder import BoardEncoder
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
-from isocharge.serve.virtual_sensor.sensor import Encode, posix_modules
+from isocharge.serve.virtual_sensor.sensor import posix_modules
 from isocharge.simulate import (
     Amplifier,
     Circle,
@@ -37,7 +37,7 @@ from isocharge.simulate import (
 
 
 class FrameFormat(StrEnum):
-    """Format of the frames, if no device file describes them."""
+    """Format of the frames, unless a device file describes the frames."""
 
     binary = "binary"
     csv = "csv"
@@ -100,11 +100,17 @@ def virtual_command(
             "(default: random presses, no faults)",
         ),
     ] = None,
-    frames: Annotated[FrameFormat, typer.Option("--frames", help="Format of the frames.")] = FrameFormat.binary,
+    frames: Annotated[
+        FrameFormat | None,
+        typer.Option("--frames", help="Format of the frames. (default: binary, or a format that fits --device)"),
+    ] = None,
     device: Annotated[
         Path | None,
         typer.Option(
-            "--device", metavar="FILE", help="Device file whose described frames are sent, TOML. (default: --frames)"
+            "--device",
+            metavar="FILE",
+            help="Device file of the board to simulate, TOML: its frames, channels and gains. (default: none, charges "
+            "in pC)",
         ),
     ] = None,
 ) -> None:
@@ -123,12 +129,16 @@ def virtual_command(
     played_sensor, footprint = _sensor_and_probe(sensor, probe, film)
     amplifier = _amplifier(noise, settings)
     electrode_count = len(played_sensor.electrodes)
+    board = None
+    if device is not None:
+        board = BoardEncoder(load_device(device), played_sensor.electrode_names, frames)
+    # Until the film is solved, the player sends frames without a touch, for which no charges need to be computed.
     player = VirtualSensor(
         lambda _: np.zeros((0, electrode_count)),
         _untouched_frame(rate),
         noise=measure_function(amplifier, rate),
         seed=seed,
-        encode=_encoder(frames, device),
+        **_frame_settings(frames, board),
         faults=settings.faults,
         link=link,
     )
@@ -146,20 +156,25 @@ def virtual_command(
             charges_per_K = film_charges_per_K(forward_map)
         remaining_rest_s = start_s + rest - time.monotonic()
         if remaining_rest_s > 0.0:
-            threading.Event().wait(remaining_rest_s)
+            threading.Event().wait(remaining_rest_s)  # sleeps, because nothing sets the event
         presses = scripted_presses or random_script(forward_map, seed, rate, force_max)
         player.use(film_charges(forward_map), presses, charges_per_K)
         played_name = sensor if film is None else f"film {film} of {sensor}"
         say(f"playing {played_name} at {rate:g} Hz; Ctrl-C stops")
-        threading.Event().wait(seconds)
+        threading.Event().wait(seconds)  # sleeps until Ctrl-C if `seconds` is None
+    reads = "read" if board is None or board.request is None else "requested"
     say(
-        f"{player.sent} frames sent, {player.withheld} withheld because no program read them, {player.lost} lost and "
-        f"{player.corrupted} damaged on purpose, {player.unplugged} times unplugged"
+        f"{player.sent} frames sent, {player.withheld} withheld because no program {reads} them, {player.lost} lost "
+        f"and {player.corrupted} damaged on purpose, {player.unplugged} times unplugged"
     )
+    if player.paused_s > 0.0:
+        say(f"the sensor paused for {player.paused_s:.1f} s in all, because this computer was busy")
+    if board is not None and board.clipped:
+        say(f"{board.clipped} frames had a charge beyond the range of its field in {device}, and were set to its limit")
 
 
 def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) -> tuple[Sensor, Probe]:
-    """Return sensor and probe as described, or a random variation of them if there is a seed.
+    """Return the sensor and the probe as described. If there is a seed, vary both at random.
 
     Args:
         sensor_name: Name or file of the sensor.
@@ -179,7 +194,7 @@ def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) 
 
 
 def _amplifier(noise: str, settings: VirtualScript) -> Amplifier:
-    """Return the amplifier that `--noise` names, changed as the settings of the script request."""
+    """Return the amplifier that `--noise` names, with the changes that the settings of the script request."""
     changes: dict[str, Any] = {
         "step": settings.temperature_step_K,
         "bias": settings.drift_pC_per_s,
@@ -194,24 +209,24 @@ def _untouched_frame(rate_Hz: float) -> Script:
     return Script(no_position, no_position, np.zeros(1), rate_Hz)
 
 
-def _encoder(frames: FrameFormat, device: Path | None) -> Encode:
-    """Return the function that encodes a frame as bytes.
+def _frame_settings(frames: FrameFormat | None, board: BoardEncoder | None) -> dict[str, Any]:
+    """Return the arguments of `VirtualSensor` that determine the frames.
 
     Args:
-        frames: Format of the frames, if there is no device file.
-        device: Device file that describes the frames; None if there is none.
-
-    Raises:
-        InputError: If the device file does not describe frames.
+        frames: Format of the frames, if there is no device file; None for the binary frame.
+        board: Board of the device file; None if there is none.
     """
-    if device is not None:
-        layout = load_device(device).frames
-        if not isinstance(layout, FrameLayout):
-            raise InputError(f'--device {device}: expected a file with described frames: [frames] format = "described"')
-        return layout.encode
-    if frames is FrameFormat.binary:
-        return encode_frame
-    return partial(encode_text, notation=frames.value)
+    if board is not None:
+        settings: dict[str, Any] = {"encode": board.encode}
+        settings["seq_modulus"] = board.seq_modulus
+        settings["t_us_modulus"] = board.t_us_modulus
+        if board.request is not None:
+            settings["request"] = board.request.data
+            settings["echo"] = board.request.echo
+        return settings
+    if frames is None or frames is FrameFormat.binary:
+        return {"encode": encode_frame}
+    return {"encode": partial(encode_text, notation=frames.value)}
 
 
 def _largest_distance_mm(radius_mm: float, scripted_presses: Script | None) -> float:

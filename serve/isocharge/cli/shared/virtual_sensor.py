@@ -53,8 +53,7 @@ def random_script(forward_map: ForwardMap, seed: int, rate_Hz: float, max_force_
 def film_charges(forward_map: ForwardMap) -> Charges:
     """Return the function that computes charges, shape (n, electrodes), pC, from contacts, shape (n, 3), mm and N.
 
-    Below the smallest force of the forward map, the charges of a contact are proportional to the force to the power of
-    2/3, as on a membrane.
+    Below the smallest force of the forward map, the charges of a contact are proportional to F^(2/3), as on a membrane.
     """
     return partial(_charges, forward_map.charges, forward_map.domain.force_range[0])
 
@@ -78,7 +77,9 @@ def film_charges_per_K(forward_map: ForwardMap) -> Charges | None:
 
 
 def _charges(map_charges: Callable[[Array], Array], min_force_N: float, contact: Array) -> Array:
-    """Compute the charges of contacts, including those below the smallest force of the map; see `film_charges`.
+    """Compute the charges of contacts, including contacts below the smallest force of the forward map.
+
+    Below the smallest force, the charges at the smallest force are scaled with F^(2/3), as on a membrane.
 
     Args:
         map_charges: Function from contacts in the domain of the forward map to charges.
@@ -89,7 +90,8 @@ def _charges(map_charges: Callable[[Array], Array], min_force_N: float, contact:
         Charges, shape (n, electrodes), pC.
     """
     force_N = contact[:, 2]
-    charge_factor = (force_N.clip(max=min_force_N) / min_force_N) ** (2.0 / 3.0)  # 1 for forces in the domain
+    relative_force = force_N.clip(max=min_force_N) / min_force_N  # 1 for forces in the domain
+    charge_factor = relative_force ** (2.0 / 3.0)
     contact_in_domain = contact.copy()
     contact_in_domain[:, 2] = force_N.clip(min=min_force_N)
     return map_charges(contact_in_domain) * charge_factor[:, None]
@@ -103,9 +105,10 @@ def measure_function(amplifier: Amplifier, rate_Hz: float) -> Callable[..., Any]
         rate_Hz: Frames per second, Hz.
 
     Returns:
-        Function of the charges of consecutive frames, shape (n, electrodes), pC, of a source of random numbers and,
-        optionally, of the change of the charges per kelvin of the film. It returns the measured charges. The running
-        amplifier, with its drift and its noise, is created by the first call.
+        Function that converts the charges of the next n frames, shape (n, electrodes), pC, to measured charges of the
+        same shape. Its further arguments are a source of random numbers and, optionally, the change of the charges per
+        kelvin of the film. The first call creates the state of the amplifier, with its drift and its noise, which the
+        following calls continue.
     """
     running_amplifier: Callable[..., Any] | None = None
 

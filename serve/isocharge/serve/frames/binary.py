@@ -62,13 +62,15 @@ def decode_frame(piece: bytes) -> Frame:
     data = cobs_decode(piece)
     if len(data) < HEADER.size + CRC.size:
         raise ValueError("the frame is shorter than a frame without charges")
-    body = data[: -CRC.size]
-    if CRC.pack(crc16(body)) != data[-CRC.size :]:
+    body = data[: -CRC.size]  # header and charges
+    stated_crc = data[-CRC.size :]
+    if CRC.pack(crc16(body)) != stated_crc:
         raise ChecksumError("the CRC is wrong")
     version, seq, t_us, count, flags = HEADER.unpack_from(body)
-    if version != FRAME_VERSION or len(body) != HEADER.size + 4 * count:
+    if version != FRAME_VERSION or len(body) != HEADER.size + 4 * count:  # a charge has 4 bytes
         raise ValueError("the frame has another version, or another number of charges than it states")
-    return Frame(seq, t_us, struct.unpack_from(f"<{count}f", body, HEADER.size), flags)
+    charges = struct.unpack_from(f"<{count}f", body, HEADER.size)
+    return Frame(seq, t_us, charges, flags)
 
 
 def crc16(data: bytes) -> int:

@@ -1,4 +1,4 @@
-"""Checksums of frames. They have the names that catalogues and manuals use.
+"""Checksums of frames. The checksums have the names that catalogues and manuals use.
 
 A cyclic redundancy check (CRC) has the parameters of Williams's model ("A painless guide to CRC error detection
 algorithms", 1993). Names and values are those of Cook's catalogue of parametrised CRC algorithms, where
@@ -53,7 +53,7 @@ class Crc:
         subtracted, which is an exclusive or.
         """
         polynomial = self._in_register_order(self.polynomial)
-        if self.reflected:
+        if self.reflected:  # the byte enters at the low end of the register, and its lowest bit leaves first
             register = byte
             for _ in range(8):
                 leaving_bit = register & 1
@@ -62,6 +62,7 @@ class Crc:
                     register ^= polynomial
             return register
 
+        # The byte enters at the high end of the register, and its highest bit leaves first.
         highest_bit = 1 << (self.width - 1)
         register = byte << (self.width - 8)
         for _ in range(8):
@@ -69,12 +70,15 @@ class Crc:
             register <<= 1
             if leaving_bit:
                 register ^= polynomial
-        return register & ((1 << self.width) - 1)
+        register_mask = (1 << self.width) - 1
+        return register & register_mask
 
     def __call__(self, data: bytes) -> int:
         """Compute the check value of some bytes.
 
-        The bytes are processed one at a time with a table of 256 registers.
+        For each byte, the register is shifted by 8 bits. The 8 bits that leave the register are combined with the byte
+        by an exclusive or. The result is an index of the table, whose entry is combined with the register in the same
+        way.
         """
         table = self.table
         register = self.initial_register
@@ -83,6 +87,7 @@ class Crc:
                 register = (register >> 8) ^ table[(register ^ byte) & 0xFF]
             return register ^ self.final
 
+        # The highest bits leave the register first.
         shift = self.width - 8
         mask = (1 << self.width) - 1
         for byte in data:

@@ -40,7 +40,7 @@ class AutoParser(Parser):
             self.counts.count_dropped(len(piece))
             for candidate in self._candidates:
                 frames = candidate.feed(piece)
-                if frames:
+                if frames:  # the format is recognised, and the rest of the data is passed to this parser alone
                     self._candidates = (candidate,)
                     self.counts = candidate.counts
                     return frames + self._feed_recognised(candidate, data[match.end() :])
@@ -55,6 +55,10 @@ class AutoParser(Parser):
         """Return the frames that the parser of the recognised format finds, and copy its format and its moduli.
 
         The format and the moduli are copied in each call, because the parser may learn them only after many frames.
+
+        Args:
+            parser: Parser of the recognised format.
+            data: The next bytes.
         """
         frames = parser.feed(data)
         self.format = parser.format

@@ -73,7 +73,7 @@ class SequenceGaps:
         self._last_seq = seq
         if last_seq is None:
             return ()
-        step = (seq - last_seq) % modulus
+        step = (seq - last_seq) % modulus  # from 0 to modulus - 1, also if the counter has wrapped
         if step == 1:
             return ()
         if step == 0:
@@ -92,20 +92,21 @@ class CounterWrap:
     If the counter decreases, it has either wrapped or restarted. A wrap is assumed if a usual modulus explains the
     decrease. The modulus must be larger than all previous values, and the step modulo this modulus must be about as
     small as the previous steps.
-
-    Args:
-        usual_moduli: Moduli that boards use, in ascending order.
-        initial_modulus: Modulus to assume until the counter wraps.
-        max_steps: Largest step across a wrap, as a multiple of the previous step.
     """
 
     def __init__(self, usual_moduli: Iterable[int], initial_modulus: int, max_steps: int) -> None:
-        """Begin without any value. The class describes the arguments."""
+        """Begin without any value.
+
+        Args:
+            usual_moduli: Moduli that boards use, in ascending order.
+            initial_modulus: Modulus to assume until the counter wraps.
+            max_steps: Largest step across a wrap, as a multiple of the previous step.
+        """
         self._usual_moduli = tuple(usual_moduli)
         self._modulus = initial_modulus
         self._max_steps = max_steps
         self._last_value: int | None = None
-        self._last_step = 1
+        self._last_step = 1  # the latest increase
         self._largest_value = 0
 
     def update(self, value: int | None) -> int:
@@ -131,7 +132,7 @@ class CounterWrap:
     def _modulus_after_decrease(self, step: int) -> int:
         """Return the smallest usual modulus that explains a negative step.
 
-        If no modulus explains it, the present modulus is returned.
+        If no modulus explains the step, the present modulus is returned.
 
         A modulus explains the step if it is larger than all values, and if the step modulo the modulus is at most
         `max_steps` times the previous step.
@@ -141,7 +142,7 @@ class CounterWrap:
         """
         max_step = self._max_steps * self._last_step
         for modulus in self._usual_moduli:
-            step_across_wrap = step % modulus
+            step_across_wrap = step % modulus  # positive, although `step` is negative
             has_plausible_step = step_across_wrap <= min(max_step, modulus // 2)
             if self._largest_value < modulus and has_plausible_step:
                 return modulus
@@ -235,7 +236,16 @@ class Columns:
     """
 
     def __init__(self, names: Sequence[str], scales: Sequence[float], flags: int | None = None) -> None:
-        """Find the columns of the frame counter, of the clock and of the channels by their names."""
+        """Find the columns of the frame counter, of the clock and of the channels by their names.
+
+        If there are several clocks, the first in the order of `TIMES_US` is used. Each column that is neither a
+        counter, nor a clock, nor the flags is a channel.
+
+        Args:
+            names: Names of all columns; an empty text for a column without a name.
+            scales: Factor by which the numbers of each column are multiplied.
+            flags: Position of the column with the flags; None if there is no such column.
+        """
         clock_columns = [names.index(name) for name in TIMES_US if name in names]
         self.seq = names.index(SEQ) if SEQ in names else None
         self.time = clock_columns[0] if clock_columns else None
@@ -269,17 +279,18 @@ class Columns:
 class Parser(ABC):
     """Base class of all parsers, which convert bytes to frames.
 
-    Args:
-        format: Description of the format, for the user.
-        seq_modulus: Value at which the `seq` of a frame wraps to 0.
-        t_us_modulus: Time at which the `t_us` of a frame wraps to 0, us.
-
     Attributes:
         counts: Counters since the parser was created.
     """
 
     def __init__(self, format: str, seq_modulus: int = SEQ_MODULUS, t_us_modulus: int = T_US_MODULUS) -> None:
-        """Begin without bytes. The class describes the arguments."""
+        """Begin without bytes.
+
+        Args:
+            format: Description of the format, for the user.
+            seq_modulus: Value at which the `seq` of a frame wraps to 0.
+            t_us_modulus: Time at which the `t_us` of a frame wraps to 0, us.
+        """
         self.format = format
         self.seq_modulus = seq_modulus
         self.t_us_modulus = t_us_modulus
@@ -340,6 +351,7 @@ class DelimitedParser(Parser):
         *pieces, tail = (self._tail + data).split(self._delimiter)
         frames = []
         for piece in pieces:
+            # The first piece may be the end of overlong bytes, whose beginning was dropped by an earlier call.
             if self._is_overlong or len(piece) > self._max_length:
                 self._is_overlong = False
                 self.counts.count_rejected(len(piece) + 1)  # with the delimiter

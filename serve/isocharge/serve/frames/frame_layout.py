@@ -15,10 +15,10 @@
         ...
     ]
 
-The types are u8, u16, u24, u32, i8, i16, i24, i32, f32, f64 and `pad`. Padding is either `count` bytes without a
-meaning, or a `value` in hexadecimal that every frame must have, such as its length. A field named `seq` is the frame
-counter, `t_us`, `t_ms` or `t_s` is the clock, and `flags` contains the bits of `isocharge.serve.frames.frame`. All
-other fields are channels.
+The section above lists all keys of such a frame. The types of the fields are u8, u16, u24, u32, i8, i16, i24, i32, f32,
+f64 and `pad`. Padding is either `count` bytes without a meaning, or a `value` in hexadecimal that every frame must
+have, such as its length. A field named `seq` is the frame counter, `t_us`, `t_ms` or `t_s` is the clock, and `flags`
+contains the bits of `isocharge.serve.frames.frame`. All other fields are channels.
 
 If the checksum of a frame with a sync pattern is wrong, the parser searches for the pattern again from the next byte.
 The pattern may have occurred by chance inside the data, and an intact frame may begin there. Stuffed frames end at
@@ -31,7 +31,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, field
 
-from isocharge.common.structs import Finite, Settings, WrongKey
+from isocharge.common.structs import Settings, WrongKey
 from isocharge.serve.frames.checksums import CHECKSUMS, Checksum, Crc
 from isocharge.serve.frames.frame import (
     FLAGS,
@@ -45,27 +45,8 @@ from isocharge.serve.frames.frame import (
     Parser,
     StuffedParser,
 )
+from isocharge.serve.frames.frame_field import PADDING, ByteOrder, Field, Hexadecimal
 from isocharge.serve.frames.stuffing import STUFFINGS
-
-STRUCT_FORMATS = {
-    "u8": "B",
-    "u16": "H",
-    "u24": "3s",
-    "u32": "I",
-    "i8": "b",
-    "i16": "h",
-    "i24": "3s",
-    "i32": "i",
-    "f32": "f",
-    "f64": "d",
-}
-"""Format of the module `struct` for each type of a field. Numbers of three bytes are read as bytes."""
-
-PADDING = "pad"
-"""Type of bytes that are not read."""
-
-MAX_PADDING = 4096
-"""Largest padding, bytes. The limit prevents that a typing error requests a gigabyte."""
 
 MAX_REQUEST_RATE_Hz = 100_000.0
 """Highest rate of requests, Hz."""
@@ -77,88 +58,9 @@ DATAGRAM = "datagram"
 """Framing in which a datagram contains one or more whole frames."""
 
 Framing = Literal["sync", "cobs", "slip", "hdlc", "datagram"]
-ByteOrder = Literal["little", "big"]
-Hexadecimal = Annotated[
-    str, Meta(pattern=r"^\s*([0-9A-Fa-f]{2}\s*)+$", description="bytes in hexadecimal, as in '20 4E'")
-]
 HexadecimalNumber = Annotated[
     str, Meta(pattern="^[0-9A-Fa-f]{1,8}$", description="a number in hexadecimal, as in '1021'")
 ]
-
-
-class Field(Settings, frozen=True):
-    """A field of a frame.
-
-    Attributes:
-        kind: Type of the field.
-        name: Meaning of the field, or name of the channel; empty for padding.
-        scale: Value of one count, in the unit of the channel or of the clock.
-        count: Number of bytes of padding.
-        value: Bytes that the padding of every frame must have, in hexadecimal.
-    """
-
-    kind: Literal["pad", "u8", "u16", "u24", "u32", "i8", "i16", "i24", "i32", "f32", "f64"] = field(name="type")
-    name: Annotated[str, Meta(max_length=1000)] = ""
-    scale: Finite = 1.0
-    count: Annotated[int, Meta(ge=1, le=MAX_PADDING)] = 1
-    value: Hexadecimal | None = None
-
-    def __post_init__(self) -> None:
-        """Check the keys of the field; raise WrongKey for the first key that is not valid."""
-        if self.scale == 0.0:
-            raise WrongKey("scale", "a finite number that is not 0", self.scale)
-        if self.kind == PADDING:
-            return
-        if not self.name:
-            raise WrongKey("name")
-        expected_none = f"none, because only the type {PADDING} may have one"
-        if self.count != 1:
-            raise WrongKey("count", expected_none, self.count)
-        if self.value is not None:
-            raise WrongKey("value", expected_none, self.value)
-
-    @property
-    def struct_format(self) -> str:
-        """Format of the field for the module `struct`."""
-        if self.kind != PADDING:
-            return STRUCT_FORMATS[self.kind]
-        if self.value:
-            return f"{len(bytes.fromhex(self.value))}x"
-        return f"{self.count}x"
-
-    @property
-    def size(self) -> int:
-        """Number of bytes."""
-        return struct.calcsize(f"<{self.struct_format}")
-
-    @property
-    def modulus(self) -> int:
-        """Value at which an unsigned counter of this size wraps to 0."""
-        return 1 << 8 * self.size
-
-    def pack(self, value: float, byte_order: ByteOrder) -> float | bytes:
-        """Return a value in the form that `struct` packs.
-
-        A counter or a clock that does not fit its field wraps. A channel that does not fit is set to its limit.
-
-        Args:
-            value: The value, in the unit of the field.
-            byte_order: Byte order of the frame. Only fields of three bytes, which `struct` cannot pack, need it.
-        """
-        count = value / self.scale
-        if self.kind in ("f32", "f64"):
-            return count
-
-        whole_count = round(count)
-        if self.name in (SEQ, *TIMES_US):
-            whole_count %= self.modulus
-        is_signed = self.kind.startswith("i")
-        lowest = -self.modulus // 2 if is_signed else 0
-        highest = lowest + self.modulus - 1
-        limited_count = min(max(whole_count, lowest), highest)
-        if self.size == 3:  # struct has no format for three bytes
-            return limited_count.to_bytes(3, byte_order, signed=is_signed)
-        return limited_count
 
 
 class CrcParameters(Settings, frozen=True):
@@ -226,7 +128,11 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     checksum_order: ByteOrder | None = None
 
     def __post_init__(self) -> None:
-        """Check that the fields form a frame, and that the length and the checksum fit the fields."""
+        """Check that the fields form a frame, and that the length and the checksum fit the fields.
+
+        Raises:
+            WrongKey: For the first key that is missing or not valid.
+        """
         names = [field.name for field in self.fields]
         if isinstance(self.checksum, str) and self.checksum not in CHECKSUMS:
             raise WrongKey("checksum", f"one of {', '.join(CHECKSUMS)}, or the parameters of a CRC", self.checksum)
@@ -348,11 +254,31 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             converted[position] = int.from_bytes(numbers[position], self.byte_order, signed=is_signed)
         return converted
 
+    def frame_of_zeros(self) -> Frame:
+        """Return a frame whose channels are 0."""
+        return self.columns.frame([0] * len(self.fields))
+
     def encode(self, frame: Frame) -> bytes:
-        """Return the bytes of a frame without stuffing. The values are assigned to the channels in their order.
+        """Return the bytes that a board sends for a frame, with byte stuffing and delimiter.
+
+        The values are assigned to the channels in their order.
 
         Raises:
-            struct.error: If a number does not fit its field.
+            ValueError: If the frame has another number of values than there are channels, or a value is not a number.
+        """
+        data = self.encode_unstuffed(frame)
+        if self.framing not in STUFFINGS:
+            return data
+        stuffing = STUFFINGS[self.framing]
+        return stuffing.encode(data) + stuffing.delimiter
+
+    def encode_unstuffed(self, frame: Frame) -> bytes:
+        """Return the bytes of a frame without byte stuffing and without delimiter.
+
+        The values are assigned to the channels in their order.
+
+        Raises:
+            ValueError: If the frame has another number of values than there are channels, or a value is not a number.
         """
         seq = 0 if frame.seq is None else frame.seq
         t_us = 0 if frame.t_us is None else frame.t_us
@@ -412,6 +338,7 @@ class SyncParser(Parser):
         while 0 <= start <= len(unparsed) - length:
             if start > position:
                 self.counts.count_dropped(start - position)
+            # If the bytes are no frame, one byte is dropped, and a frame may begin at the next byte.
             decoded = self._attempt(self.layout.decode, unparsed[start : start + length], 1)
             frames += decoded
             position = start + length if decoded else start + 1
@@ -434,7 +361,10 @@ class DatagramParser(Parser):
         self.layout = layout
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames of one datagram."""
+        """Return the frames of one datagram, which contains one or several whole frames.
+
+        A datagram whose length is not a multiple of the length of a frame is rejected as a whole.
+        """
         length = self.layout.length
         if len(data) % length:
             self.counts.count_rejected(len(data))

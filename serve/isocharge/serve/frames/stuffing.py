@@ -19,11 +19,13 @@ class Stuffing(NamedTuple):
 
     Attributes:
         delimiter: The byte between frames.
+        encode: Function from the bytes of a frame to the bytes that are sent before the delimiter.
         decode: Function from the bytes between two delimiters to the bytes of the frame. It raises ValueError for bytes
             that no encoder produces.
     """
 
     delimiter: bytes
+    encode: Callable[[bytes], bytes]
     decode: Callable[[bytes], bytes]
 
 
@@ -49,6 +51,7 @@ def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
     """
     encoded = bytearray()
     rest = block
+    # A last piece of exactly `MAX_BLOCK` bytes gets this distance only if a zero follows the bytes.
     while len(rest) > MAX_BLOCK or (len(rest) == MAX_BLOCK and ends_in_zero):
         encoded.append(MAX_BLOCK + 1)
         encoded += rest[:MAX_BLOCK]
@@ -59,6 +62,9 @@ def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
 
 def cobs_decode(data: bytes) -> bytes:
     """Decode bytes that `cobs_encode` has encoded.
+
+    The data consist of blocks. Each block begins with a distance byte, which is followed by distance - 1 bytes of the
+    result. Between two blocks, the result has a zero, unless the first of them has the largest distance.
 
     Raises:
         ValueError: If a distance points beyond the end, or `data` contains a zero.
@@ -78,12 +84,22 @@ def cobs_decode(data: bytes) -> bytes:
     return bytes(decoded)
 
 
+def _slip_encode(data: bytes) -> bytes:
+    """Encode bytes with the byte stuffing of SLIP, so that the result does not contain the byte C0."""
+    return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc")
+
+
 def _slip_decode(piece: bytes) -> bytes:
     """Decode bytes with the byte stuffing of SLIP; raise ValueError if no encoder produces them."""
     decoded = piece.replace(b"\xdb\xdc", b"\xc0").replace(b"\xdb\xdd", b"\xdb")
     if piece.count(b"\xdb") != piece.count(b"\xdb\xdc") + piece.count(b"\xdb\xdd"):
         raise ValueError("expected DC or DD after the byte DB")
     return decoded
+
+
+def _hdlc_encode(data: bytes) -> bytes:
+    """Encode bytes with the byte stuffing of HDLC, so that the result does not contain the byte 7E."""
+    return data.replace(b"\x7d", b"\x7d\x5d").replace(b"\x7e", b"\x7d\x5e")
 
 
 def _hdlc_decode(piece: bytes) -> bytes:
@@ -102,8 +118,8 @@ def _hdlc_decode(piece: bytes) -> bytes:
 
 
 STUFFINGS = {
-    "cobs": Stuffing(b"\x00", cobs_decode),
-    "slip": Stuffing(b"\xc0", _slip_decode),
-    "hdlc": Stuffing(b"\x7e", _hdlc_decode),
+    "cobs": Stuffing(b"\x00", cobs_encode, cobs_decode),
+    "slip": Stuffing(b"\xc0", _slip_encode, _slip_decode),
+    "hdlc": Stuffing(b"\x7e", _hdlc_encode, _hdlc_decode),
 }
 """Every kind of byte stuffing, by its name in a device file."""

@@ -57,18 +57,19 @@ MAX_TIME_STEPS = 16
 class Layout:
     """Layout of the values in one line, or in a cycle of several lines.
 
-    Args:
-        notation: Notation of the lines.
-        names: Names of all values; empty for a CSV without a header.
-        width: Number of values.
-        lines: Number of lines in a cycle; 1 for rows.
-
     Attributes:
         columns: Meaning of each value.
     """
 
     def __init__(self, notation: Notation, names: tuple[str, ...], width: int, lines: int = 1) -> None:
-        """Store the layout. The class describes the arguments."""
+        """Store the layout.
+
+        Args:
+            notation: Notation of the lines.
+            names: Names of all values; empty for a CSV without a header.
+            width: Number of values.
+            lines: Number of lines in a cycle; 1 for rows.
+        """
         self.notation = notation
         self.names = names
         self.width = width
@@ -79,16 +80,17 @@ class Layout:
 class TextParser(DelimitedParser):
     """Parser of lines of text, which recognises their layout.
 
-    Args:
-        columns: Names for the columns of a CSV.
-        meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the device uses.
-
     Attributes:
         layout: The layout; None until it is recognised.
     """
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
-        """Begin without a layout. The class describes the arguments."""
+        """Begin without a layout.
+
+        Args:
+            columns: Names for the columns of a CSV.
+            meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the device uses.
+        """
         super().__init__(b"\n", MAX_LINE_LENGTH, "text of a layout that is not clear yet")
         self.layout: Layout | None = None
         self._columns = columns
@@ -97,9 +99,11 @@ class TextParser(DelimitedParser):
         self._clock_wrap = clock_wrap(1.0)
         self._last_unreadable_line = b""
         self._is_first_line = True
-        # Lines from which the layout is recognised, with their sizes in bytes.
+
+        # Lines from which the layout is recognised, with their sizes in bytes
         self._unrecognised: list[tuple[Line, int]] = []
-        # Values by name, and number of bytes, of the present cycle of lines.
+
+        # Values by name, and number of bytes, of the present cycle of lines
         self._cycle_values: dict[str, float] = {}
         self._cycle_bytes = 0
 
@@ -143,8 +147,8 @@ class TextParser(DelimitedParser):
     def _reject_unreadable(self, piece: bytes, size: int) -> list[Frame]:
         """Count a line that cannot be parsed.
 
-        If the line is equal to the previous line of this kind, it is the echo of a request. The other lines are then
-        kept for recognition.
+        A line that is equal to the previous line that could not be parsed is the echo of a request. The other lines are
+        then kept for recognition.
 
         Args:
             piece: The line.
@@ -191,6 +195,8 @@ class TextParser(DelimitedParser):
     def _recognise(self, line: Line, size: int) -> list[Frame]:
         """Collect lines until their layout repeats, and return the frames in the lines with this layout.
 
+        Until then, the result is empty. The lines before the repeated lines are counted as rejected.
+
         Args:
             line: The next line.
             size: Number of bytes of the line.
@@ -204,10 +210,13 @@ class TextParser(DelimitedParser):
                 self._reject(oldest_size)
             return []
 
+        # The last lines form `RECOGNITION_REPEATS` cycles of `period` lines. The lines before them are rejected.
         first_repeated = len(self._unrecognised) - RECOGNITION_REPEATS * period
         repeated_lines = self._unrecognised[first_repeated:]
         self._unrecognised = self._unrecognised[:first_repeated]
         self._reject_unrecognised()
+
+        # One cycle determines the layout, with which all repeated lines are read.
         first_cycle = [cycle_line for cycle_line, _ in repeated_lines[:period]]
         layout = self._layout_of(first_cycle)
         self._set_layout(layout)
@@ -251,7 +260,8 @@ class TextParser(DelimitedParser):
     def _read_cycle_line(self, layout: Layout, line: Line, size: int) -> list[Frame]:
         """Store the values of a line of a cycle, and return the frame if the cycle is complete.
 
-        Each line of a cycle may contain the clock in addition to its value.
+        Each line of a cycle may contain the clock in addition to its value. A cycle begins with the first name of the
+        layout, or with a name that the present cycle already has.
 
         Args:
             layout: The layout of the lines.
@@ -267,7 +277,8 @@ class TextParser(DelimitedParser):
             self._drop_cycle()
         self._cycle_values |= dict(zip(line.names, line.values, strict=True))
         self._cycle_bytes += size
-        if len(self._cycle_values) < layout.width:
+        is_incomplete = len(self._cycle_values) < layout.width
+        if is_incomplete:
             return []
 
         values = [self._cycle_values[name] for name in layout.names]
@@ -323,19 +334,22 @@ def _sort_key(name: str) -> tuple[bool, str]:
 
 
 def _period(lines: list[Line]) -> int:
-    """Return the number of lines in the cycle that has just occurred three times in succession; 0 if there is none.
+    """Return the number of lines in the cycle that has just occurred `RECOGNITION_REPEATS` times in succession.
 
-    Only lines with names form cycles of several lines.
+    Two lines are equal if they have the same notation, the same names and the same number of values. The result is 0 if
+    there is no cycle. Only lines with names form cycles of several lines.
 
     Args:
-        lines: The latest lines.
+        lines: The latest lines, at least one.
     """
     signatures = [(line.notation, line.names, len(line.values)) for line in lines]
-    last_signature = signatures[-1]
-    earlier_signatures = signatures[-2::-1]  # from the latest to the earliest
+    *earlier_signatures, last_signature = signatures
     if last_signature not in earlier_signatures:
         return 0
-    period = earlier_signatures.index(last_signature) + 1
+
+    # The cycle begins again with the previous line that equals the last line.
+    lines_back_to_front = earlier_signatures[::-1]
+    period = lines_back_to_front.index(last_signature) + 1
     has_names = lines[-1].notation in (Notation.pairs, Notation.teleplot)
     if period > 1 and not has_names:
         return 0

@@ -1,4 +1,6 @@
-"""Parsing of lines of text from boards in several notations, and writing of frames as such lines.
+"""Parsers for the lines of text that boards send, and functions that write frames as such lines.
+
+A board may use one of the following notations.
 
 | notation | example |
 |---|---|
@@ -30,7 +32,7 @@ MAX_JSON_LEVEL = 3
 
 _SEPARATOR = re.compile(r"\s*[,;\t]\s*|\s+")
 
-_PAIR = re.compile(r"\s*([^\s:=,;]+)\s*[:=]\s*([^\s:=,;]+)\s*(?:[,;]\s*|\s|$)")
+_PAIR = re.compile(r"\s*(?P<name>[^\s:=,;]+)\s*[:=]\s*(?P<value>[^\s:=,;]+)\s*(?:[,;]\s*|\s|$)")
 
 _NAME = re.compile(r"[^\W\d][\w.\[\]/-]*")
 
@@ -90,11 +92,15 @@ def parse_line(data: bytes) -> Line:
 
 
 def _csv(text: str) -> Line:
-    """Parse a line of numbers between separators, or a header with the names of the columns."""
+    """Parse a line of numbers between separators, or a header with the names of the columns.
+
+    Raises:
+        ValueError: If the line consists neither of numbers nor of different names.
+    """
     cells = _SEPARATOR.split(text.rstrip(",; \t"))
     try:
         return Line(Notation.csv, values=tuple(map(parse_number, cells)))
-    except ValueError:
+    except ValueError:  # a cell is not a number, so that the line may be a header
         are_names = all(map(_NAME.fullmatch, cells))
         are_different = len(set(cells)) == len(cells)
         if are_names and are_different:
@@ -119,15 +125,18 @@ def _sentence(text: str) -> Line:
 
 
 def _pairs(text: str) -> Line:
-    """Parse a line of one or several pairs `name:value` or `name=value`."""
+    """Parse a line of one or several pairs `name:value` or `name=value`.
+
+    Raises:
+        ValueError: If a part of the line is not a pair, or a name occurs twice.
+    """
     pairs: dict[str, float] = {}
     position = 0
     while position < len(text):
         match = _PAIR.match(text, position)
-        if match is None or match[1] in pairs:
+        if match is None or match["name"] in pairs:
             raise ValueError(f"expected name:value, got {text[position:]!r}")
-        name, value = match.groups()
-        pairs[name] = parse_number(value)
+        pairs[match["name"]] = parse_number(match["value"])
         position = match.end()
     return Line(Notation.pairs, names=tuple(pairs), values=tuple(pairs.values()))
 
@@ -194,8 +203,9 @@ def _json_numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, fl
         return []
 
     numbers = []
+    prefix = f"{path}." if level > 0 else ""
     for key, value in items:
-        numbers += _json_numbers(f"{path}.{key}" if level else key, value, level + 1)
+        numbers += _json_numbers(prefix + key, value, level + 1)
     return numbers
 
 

@@ -99,7 +99,10 @@ class PredictionStage(ContactStage):
         self._validity = model.predictor.validity
 
     def step(self, frame: ContactFrame) -> None:
-        """Predict the contact of a frame in which something touches, and add its flags."""
+        """Predict the contact of a frame in which something touches, and add its flags.
+
+        A frame out of contact, or with the flag `invalid`, remains without a contact.
+        """
         reading = frame.reading
         if INVALID in reading.flags or not reading.contact or reading.charge_pC is None:
             return
@@ -131,7 +134,11 @@ class FilmStage(ContactStage):
         self.follower = FilmFollower(model.predictor, rule, warming_ratio)
 
     def step(self, frame: ContactFrame) -> None:
-        """Correct the contact for the estimated film, and update the estimate of the film with the frame."""
+        """Correct the contact for the estimated film, and then update the estimate of the film with the frame.
+
+        If the film can no longer be followed, the contact gets the flag `film`. The updated model is used from the next
+        frame on.
+        """
         charge_pC = frame.reading.charge_pC
         if frame.contact is not None and charge_pC is not None:
             frame.contact, frame.model_charge_pC = self.follower.follow_contact(frame.contact, charge_pC)
@@ -176,7 +183,7 @@ class TrackingStage(ContactStage):
         self._tracker.mixture = mixture
 
     def step(self, frame: ContactFrame) -> None:
-        """Track the contact.
+        """Update the tracker with the contact of the frame, and add the tracked contact and its event to the frame.
 
         If a mixture follows the contact, the contact of the mixture replaces the contact of the model.
         """
@@ -226,7 +233,7 @@ class ChargeScaleStage(ContactStage):
         self.reset()
 
     def step(self, frame: ContactFrame) -> None:
-        """Increase the standard deviations of the contact and of the tracked contact."""
+        """Add the error of the common scale to the standard deviations of the contact and of the tracked contact."""
         if frame.contact is None:
             return
         shift = self._shift(frame, frame.contact)
@@ -259,11 +266,10 @@ class ChargeScaleStage(ContactStage):
         if charge_scale_std <= 0.0 or charge_pC is None:
             return None
         predictor = self._model.predictor
-        if predictor is not self._sensitivity_predictor:
+        if predictor is not self._sensitivity_predictor:  # the sensitivity was computed with another model
             self.reset()
-        return self._sensitivity.shift(
-            contact, charge_scale_std, lambda: predictor.predict(charge_pC * (1.0 + CHARGE_SCALE_STEP))
-        )
+        scaled_pC = charge_pC * (1.0 + CHARGE_SCALE_STEP)
+        return self._sensitivity.shift(contact, charge_scale_std, lambda: predictor.predict(scaled_pC))
 
 
 class TouchOffsetRule(Rule, frozen=True, kw_only=True):
@@ -300,13 +306,16 @@ class TouchOffsetStage(ContactStage):
         self.reset()
 
     def step(self, frame: ContactFrame) -> None:
-        """Increase the standard deviations of the contact and of the tracked contact."""
+        """Add the error of the common offset to the standard deviations of the contact and of the tracked contact.
+
+        The contact of a mixture is not changed.
+        """
         charge_pC = frame.model_charge_pC
         contact = frame.contact
         if contact is None or charge_pC is None or frame.is_mixture_contact:
             return
         predictor = self._model.predictor
-        if predictor is not self._sensitivity_predictor:
+        if predictor is not self._sensitivity_predictor:  # the sensitivity was computed with another model
             self.reset()
         shifted_pC = charge_pC + TOUCH_OFFSET_STEP_pC * self._warming_ratio
         shift = self._sensitivity.shift(contact, self._rule.std_pC, lambda: predictor.predict(shifted_pC))

@@ -73,7 +73,11 @@ class Gain(Rule, frozen=True, kw_only=True):
     offset: Finite | dict[str, Finite] | None = None
 
     def __post_init__(self) -> None:
-        """Check that either `pC_per_unit`, or `V_per_unit` and `feedback_pF`, are given; raise WrongKey otherwise."""
+        """Check that the section has either `pC_per_unit`, or `V_per_unit` and `feedback_pF`, and that no gain is 0.
+
+        Raises:
+            WrongKey: For the first key that is missing or wrong.
+        """
         if self.V_per_unit is not None and self.pC_per_unit is not None:
             raise WrongKey("V_per_unit", "either pC_per_unit, or V_per_unit and feedback_pF", self.V_per_unit)
         if self.V_per_unit is None and self.feedback_pF is not None:
@@ -313,6 +317,8 @@ def load_device(path: str | Path | None) -> Device:
 
 def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     """Convert the content of a device file to settings.
+
+    The format of the frames is `auto` by default. A section that is switched off counts as absent.
 
     Args:
         table: Sections and keys as in the description of this module.

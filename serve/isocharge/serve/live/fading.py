@@ -1,15 +1,11 @@
 """Cause of a decrease of the charges of a held press: a leak of the amplifier, or creep of the film.
 
-A leak removes the same share of the charge in every second. Creep removes the same share in every decade of time. The
-two laws are straight lines:
-
-    leak:   ln Q = a - t / tau
-    creep:  ln Q = a + b ln t
-
-where t is the time since the touch. Both lines are fitted to the charges of a press. A law is only reported if the
+A leak removes the same share of the charge in every second. Creep removes the same share in every decade of time. Let t
+be the time since the touch. With a leak, ln Q = a - t / tau is a straight line over t. With creep, ln Q = a + b ln t is
+a straight line over ln t. Both lines are fitted to the charges of a press. A law is only reported if the
 squared residuals of the other law are at least `MIN_RESIDUAL_RATIO` times as large. A third law is creep with a
-thermoelastic step (see `isocharge.serve.signal_chain.memory`). It is reported if the squared residuals of both lines
-are at least `MIN_RESIDUAL_RATIO` times as large.
+thermoelastic step (see `isocharge.serve.signal_chain.memory`). This law is reported if the squared residuals of both
+lines are at least `MIN_RESIDUAL_RATIO` times as large.
 
 The section [leak] of a device file corrects a leak, and the section [memory] corrects creep. If [leak] is used for
 creep, the error grows with time.
@@ -113,6 +109,10 @@ def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
 
     Args:
         sizes: Times since the touch, s, and mean magnitudes of the charges at these times, positive, pC.
+
+    Returns:
+        The law with its parameter; an empty law if there are too few times, if the charges do not decrease, or if no
+        law fits clearly better than the others.
     """
     if len(sizes) < MIN_WINDOWS:
         return Fading()

@@ -14,6 +14,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError, NoFramesError, TareError, cut
 from isocharge.serve.flags import RECONNECTED
 from isocharge.serve.frames.frame import SATURATED_BIT, Frame, Parser, SequenceGaps
+from isocharge.serve.frames.frame_layout import FrameLayout
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.port.device_clock import DeviceClock, ReadingTime
 from isocharge.serve.port.source import Chunk
@@ -50,6 +51,7 @@ class ChannelPicker:
         self._channels = channels
         self._reader = reader
         self._where = where
+        # Names, number of values and positions of the channels of the previous frame, which `pick` uses again.
         self._names: tuple[str, ...] | None = None
         self._n_values = -1
         self._positions: tuple[int, ...] = ()
@@ -64,16 +66,17 @@ class ChannelPicker:
             ChargeError: If a frame has no value for an electrode.
         """
         if frame.names != self._names or len(frame.values) != self._n_values:
-            self._positions = self._look_up(frame)
+            self._positions = self.positions(frame)
             self._names = frame.names
             self._n_values = len(frame.values)
-        values = itemgetter(*self._positions)(frame.values)
+        values = itemgetter(*self._positions)(frame.values)  # a tuple, or a single number for one electrode
         return np.array(values, dtype=float).reshape(-1)
 
-    def _look_up(self, frame: Frame) -> tuple[int, ...]:
+    def positions(self, frame: Frame) -> tuple[int, ...]:
         """Return the position of each electrode's channel among the values of a frame.
 
-        The description of the class explains how the channels are assigned.
+        If the device file assigns channels to the electrodes, these channels are used. Otherwise the channels with the
+        names of the electrodes are used. If the channels have other names, they are used in their order.
 
         Raises:
             ChargeError: If the device file assigns no channels, the names differ, and the number of values is wrong.
@@ -111,6 +114,32 @@ class ChannelPicker:
         return position
 
 
+def check_channels(device: Device, electrodes: tuple[str, ...], reader: str) -> None:
+    """Check without a frame that the device file assigns a channel to each electrode.
+
+    The channels of described frames are known, and are assigned as those of a received frame. The channels of other
+    frames are not known. Each electrode then needs a key in the section `[channels]` if there is such a section.
+
+    Args:
+        device: Settings of the board.
+        electrodes: Names of the electrodes, in the order of the charges.
+        reader: Reader that expects these electrodes, for messages, such as "model three/1".
+
+    Raises:
+        ChargeError: If there is no channel for an electrode.
+    """
+    if isinstance(device.frames, FrameLayout):
+        picker = ChannelPicker(electrodes, device.channels, reader, device.where)
+        picker.positions(device.frames.frame_of_zeros())
+        return
+    missing = [name for name in electrodes if name not in device.channels]
+    if device.channels and missing:
+        raise ChargeError(
+            f"{device.where}: [channels] {missing[0]}: {reader} expects a channel for each of the electrodes "
+            f"{electrodes}, got {', '.join(device.channels)}; add the electrode, or choose the model of this sensor"
+        )
+
+
 def channel_names(frame: Frame) -> tuple[str, ...]:
     """Return the names of the channels as in the section `[channels]`; numbers from 1 if the frames have no names."""
     if frame.names:
@@ -127,14 +156,19 @@ def position_of(name: str, frame: Frame) -> int | None:
     """
     if name in frame.names:
         return frame.names.index(name)
-    digits = name.removeprefix("ch")
-    is_number = digits.isascii() and digits.isdigit() and len(digits) <= MAX_CHANNEL_DIGITS
-    if not is_number:
-        return None
-    number = int(digits)
-    if not 1 <= number <= len(frame.values):
+    number = channel_number(name)
+    if number is None or number > len(frame.values):
         return None
     return number - 1
+
+
+def channel_number(name: str) -> int | None:
+    """Return the number of a channel, counted from 1, for a name such as `2` or `ch2`; None for any other name."""
+    digits = name.removeprefix("ch")
+    is_number = digits.isascii() and digits.isdigit() and len(digits) <= MAX_CHANNEL_DIGITS
+    if not is_number or int(digits) == 0:
+        return None
+    return int(digits)
 
 
 def electrode_of(name: str) -> str:
@@ -229,7 +263,7 @@ class ReadingStream:
         frames = self.frames(chunk)
         for frame in frames:
             yield self.advance(frame, chunk)
-        self.arrived(frames, chunk)
+        self.end_chunk(frames, chunk)
 
     def frames(self, chunk: Chunk) -> list[Frame]:
         """Return the frames that end in a chunk. If the chunk follows an outage, discard the earlier state first."""
@@ -240,9 +274,15 @@ class ReadingStream:
     def advance(self, frame: Frame, chunk: Chunk) -> TimedReading:
         """Compute the time and the touch charges of the next frame of a chunk.
 
+        The clock of the device gives the time of the frame. The gap counter compares the number of the frame with that
+        of the previous frame. The signal chain converts the values of the electrodes to touch charges.
+
         Args:
             frame: The frame.
-            chunk: The chunk, whose arrival determines the time.
+            chunk: The chunk, whose arrival time dates frames that have no time of their own.
+
+        Returns:
+            The touch charges with the flags of the frame, and the time of the frame.
 
         Raises:
             ChargeError: If the frame has no value for an electrode.
@@ -263,14 +303,16 @@ class ReadingStream:
         except TareError as error:
             value_of_electrode = dict(zip(self._electrodes, values.tolist(), strict=True))
             offsets = ", ".join(f"{name} = {value:.10g}" for name, value in value_of_electrode.items())
+            setting = "[gain] offset = {" + offsets + "}"
             raise TareError(
-                f"{error}; if the board rests there without a touch, say so in a device file: [gain] offset = "
-                f"{{{offsets}}}"
+                f"{error}; if the board rests there without a touch, say so in a device file: {setting}"
             ) from error
         return TimedReading(reading, time_of_reading)
 
-    def arrived(self, frames: list[Frame], chunk: Chunk) -> None:
-        """End a chunk, and adjust the clock to the arrival of the chunk.
+    def end_chunk(self, frames: list[Frame], chunk: Chunk) -> None:
+        """Adjust the clock to the arrival of a chunk whose frames have been processed.
+
+        If the chunk completed no frame, check that the stream has frames of a known format.
 
         Args:
             frames: The frames that ended in the chunk.
@@ -293,9 +335,10 @@ class ReadingStream:
         _check_recognised(self.parser, max_bytes=-1)
 
     def _reconnect(self) -> None:
-        """Discard the state after an outage.
+        """Discard the state of the parser, the gap counter, the clock and the tare after an outage.
 
-        After an outage, frames are missing, and the film may have been touched.
+        After an outage, frames are missing, and the film may have been touched. The next frame gets the flag
+        `reconnected`.
         """
         self.parser.reset()
         self.gaps.reset()

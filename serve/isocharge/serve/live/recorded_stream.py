@@ -44,8 +44,9 @@ class RecordedStream:
         self._stream = stream
         self.recorder = recorder
         self._caller_recorder = recorder  # The caller opened this recording and closes it.
-        self._current_chunk: tuple[Chunk, list[str]] | None = None
+        self._current_chunk: tuple[Chunk, list[str]] | None = None  # a chunk and its records, which are not written yet
         self._requests: deque[Callable[[], None]] = deque()
+        # The latest requested recording, or None as a request to end the recording; empty without a request.
         self._next_recorder: deque[Recorder | None] = deque(maxlen=1)
         self._next_load: Load | None = None
         self._loading_model: Future[Predictor] | None = None
@@ -167,7 +168,10 @@ class RecordedStream:
             self.recorder.mark(marker)
 
     def _continue_loading(self) -> None:
-        """Use the requested model if it has been loaded, and begin to load the next requested model."""
+        """Use the requested model if it has been loaded, and begin to load the next requested model.
+
+        A separate thread loads a model, so that the stream does not wait. At most one model is loaded at a time.
+        """
         if self._loading_model is not None and self._loading_model.done():
             self._use(self._loading_model)
             self._loading_model = None
@@ -176,7 +180,7 @@ class RecordedStream:
             self._next_load = None
             loader = ThreadPoolExecutor(1, "model")
             self._loading_model = loader.submit(load)
-            loader.shutdown(wait=False)
+            loader.shutdown(wait=False)  # the thread ends after this model
 
     def _use(self, loaded: "Future[Predictor]") -> None:
         """Use a loaded model from now on.
@@ -224,7 +228,7 @@ def replay(
 ) -> Iterator[PredictionRecord]:
     """Compute the records of a recording again, and yield them.
 
-    For each chunk, the replay yields the same number of records as were used when the recording was made.
+    A chunk of bytes yields as many records as it yielded when the recording was made.
 
     Args:
         recording: The recording.
@@ -249,7 +253,7 @@ def replay(
                     stream.use(load(label))
             case Back():
                 stream.reset_film()
-            case Event(chunk=None):
+            case Event(chunk=None):  # a new tare was requested
                 clock.set(event)
                 stream.tare()
             case Event(chunk=Chunk() as chunk, latencies_us=latencies_us):

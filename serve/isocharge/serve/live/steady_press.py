@@ -79,8 +79,7 @@ class SteadyRule(NamedTuple):
 
 
 class Phase(StrEnum):
-    """State of a press watch, which is either the event that the watch waits for, or the result of the latest
-    reading."""
+    """State of a press watch: the event that the watch waits for, or the result of the latest reading."""
 
     taring = "taring"
     lift = "lift"
@@ -157,16 +156,18 @@ class PressWatch:
         self._electrodes = electrodes
         self._rule = rule or SteadyRule()
         self._phase = Phase.taring
-        self._rest: deque[tuple[float, Array]] = deque()
-        self._window: deque[WindowFrame] = deque()
-        self._rest_pC = np.zeros(len(electrodes))
-        self._has_rest = False
-        self._begin_s = -np.inf
-        self._end_s = -np.inf
-        self._check_s = -np.inf
-        self._reason = ""
-        self._min_scatter_pC = np.inf
-        self._sizes: list[tuple[float, float]] = []
+        self._rest: deque[tuple[float, Array]] = deque()  # times and charges of the latest frames without a touch
+
+        # State of the present press
+        self._window: deque[WindowFrame] = deque()  # the latest frames of the press
+        self._rest_pC = np.zeros(len(electrodes))  # mean charges just before the press
+        self._has_rest = False  # whether enough frames before the press were at rest
+        self._begin_s = -np.inf  # time of the first frame of the press
+        self._end_s = -np.inf  # time of the latest frame of the press
+        self._check_s = -np.inf  # time at which the window was last examined
+        self._reason = ""  # why the press is not steady yet
+        self._min_scatter_pC = np.inf  # smallest scatter of all windows of the press
+        self._sizes: list[tuple[float, float]] = []  # time since the touch and mean charge of each calm window
 
     def arm(self) -> None:
         """Ignore the present press, and accept only the next press."""
@@ -194,11 +195,12 @@ class PressWatch:
         if not reading.contact:
             return self._process_rest(reading.charge_pC, t_s)
 
+        # Something touches the film.
         if self._phase in (Phase.waiting, Phase.taring):
             self._begin_press(t_s)
         charge_pC = reading.charge_pC - self._rest_pC
         held_s = t_s - self._begin_s
-        if self._phase is Phase.lift:
+        if self._phase is Phase.lift:  # the press has been taken or refused, and the finger is still on the film
             return WatchResult(Phase.lift, charge_pC, held_s)
         result = self._process_press(reading, charge_pC, t_s)
         return result._replace(charge_pC=charge_pC, held_s=held_s)
@@ -214,10 +216,15 @@ class PressWatch:
         held_s = self._end_s - self._begin_s
         is_press_unfinished = self._phase is Phase.settling
         self._phase = Phase.waiting
+
+        # Store the frame, and drop frames that are too old to measure the rest before the next press.
         if t_s > self._end_s + rule.edge_s:  # the finger has left the film
             self._rest.append((t_s, charge_pC))
         oldest_rest_s = t_s - rule.rest_s - rule.edge_s
-        while self._rest and self._rest[0][0] < oldest_rest_s:
+        while self._rest:
+            first_rest_s, _ = self._rest[0]
+            if first_rest_s >= oldest_rest_s:
+                break
             self._rest.popleft()
 
         if is_press_unfinished and held_s >= rule.min_held_s:
@@ -226,7 +233,7 @@ class PressWatch:
         return WatchResult(Phase.waiting, charge_pC)
 
     def _begin_press(self, t_s: float) -> None:
-        """Begin a press at a time, s, and measure the rest just before it.
+        """Begin a press at the time `t_s`, s, and measure the charges at rest just before the press.
 
         The latest frames before the press are left out, because the finger may have touched the film already.
         """
@@ -268,6 +275,8 @@ class PressWatch:
         self._window.append(WindowFrame(t_s, charge_pC, reading.flags))
         while self._window[0].t_s < t_s - rule.window_s:
             self._window.popleft()
+
+        # The window is examined several times within its length, but not in each frame.
         is_window_full = held_s >= rule.window_s and len(self._window) >= rule.min_frames
         is_check_due = t_s - self._check_s >= rule.window_s / CHECKS_PER_WINDOW
         if is_window_full and is_check_due:
@@ -294,8 +303,9 @@ class PressWatch:
         scatter_pC = float(press.scatter_pC.max())
         is_calm = scatter_pC <= MAX_SCATTER_RATIO * self._min_scatter_pC
         self._min_scatter_pC = min(self._min_scatter_pC, scatter_pC)
-        began_before_window = press.held_s >= 2.0 * press.window_s
-        if is_calm and began_before_window:
+        # The first window of a press contains its beginning, during which the force may still rise.
+        is_after_first_window = press.held_s >= 2.0 * press.window_s
+        if is_calm and is_after_first_window:
             middle_s = press.held_s - 0.5 * press.window_s
             self._sizes.append((middle_s, float(np.abs(press.charge_pC).mean())))
 
@@ -310,8 +320,12 @@ class PressWatch:
         return None
 
     def _measure_window(self) -> SteadyPress:
-        """Fit a straight line to each charge in the window, and return the mean, the scatter and the change."""
-        frame_times, charges, flags = zip(*self._window, strict=True)
+        """Fit a straight line to each charge in the window, and return the mean, the scatter and the change.
+
+        The scatter is the standard deviation of the residuals. The change is the difference between the two ends of the
+        line.
+        """
+        frame_times, charges, flags = zip(*self._window, strict=True)  # one sequence for each field of `WindowFrame`
         begin_s = frame_times[0]
         end_s = self._end_s
         times_s = np.array(frame_times) - begin_s
@@ -320,7 +334,8 @@ class PressWatch:
 
         # Least squares with centred times, so that the slope is independent of the mean.
         centred_s = times_s - times_s.mean()
-        slope_pC_per_s = centred_s @ charge_pC / max(float(centred_s @ centred_s), 1e-30)
+        square_sum_s2 = max(float(centred_s @ centred_s), 1e-30)  # not 0, even if all times are equal
+        slope_pC_per_s = centred_s @ charge_pC / square_sum_s2
         mean_pC = charge_pC.mean(axis=0)
         residual_pC = charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)
         different_flags = dict.fromkeys(flag for frame_flags in flags for flag in frame_flags)
@@ -349,7 +364,8 @@ def unsteadiness(
 ) -> str:
     """Return the reason why a press is not steady, as a part of a sentence; an empty string if it is steady.
 
-    A press is steady if its charges scatter little about a straight line and this line changes little over the window.
+    A straight line is fitted to each charge in the window. The press is steady if each charge scatters little about its
+    line, and each line changes little over the window. Noise alone explains a part of the scatter and of the change.
 
     Args:
         rule: Conditions for a steady press.
@@ -367,7 +383,7 @@ def unsteadiness(
 
     # Standard deviation of the change over a window of n frames of a line that is fitted to noise: sqrt(12 / n).
     drift_std_pC = press.scatter_pC * np.sqrt(12.0 / press.frames)
-    size_pC = np.maximum(np.abs(press.charge_pC), mean_size_pC)
+    size_pC = np.maximum(np.abs(press.charge_pC), mean_size_pC)  # small charges may change as much as the mean charge
     max_drift_pC = rule.max_relative_drift * size_pC + rule.drift_sigmas * drift_std_pC
     if (np.abs(press.drift_pC) <= max_drift_pC).all():
         return ""

@@ -176,6 +176,9 @@ class TouchStream:
 
         All stages are built before the first attribute is changed, so that an error changes nothing.
 
+        Args:
+            predictor: The model, with which the stages begin.
+
         Raises:
             ModelError: If a stage cannot use the model. The stream then keeps its stages.
         """
@@ -250,10 +253,12 @@ class TouchStream:
 
         The counts of `totals` continue.
         """
-        self._before_restart = self.totals()
+        self._before_restart = self.totals()  # `totals` adds them to the counts of the new parser
         self._readings.restart()
         self._discard_contact()
         self.reset_film()
+
+        # The path from chunks to readings has created new objects.
         self.parser = self._readings.parser
         self.gaps = self._readings.gaps
         self.clock = self._readings.clock
@@ -286,7 +291,7 @@ class TouchStream:
             self.counts.outages += 1
             self._discard_contact()
         frames = self._readings.frames(chunk)
-        skipped_flags = set[str]()
+        skipped_flags = set[str]()  # flags of frames without a record, of which the lasting flags are passed on
         for number, frame in enumerate(frames, start=1):
             timed = self._readings.advance(frame, chunk)
             is_last = number == len(frames)
@@ -298,7 +303,7 @@ class TouchStream:
                 timed = timed._replace(reading=_with_lasting_flags(timed.reading, skipped_flags))
             self.counts.records += 1
             yield self._record(chunk, frame, timed)
-        self._readings.arrived(frames, chunk)
+        self._readings.end_chunk(frames, chunk)
 
     def finish(self) -> None:
         """End the stream, as at the end of a file.

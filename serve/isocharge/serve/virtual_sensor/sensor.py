@@ -2,8 +2,12 @@
 
 The touch charges of the whole script are computed before the first frame is sent. The amplifier, whose output depends
 on earlier charges, processes the charges block by block. Frames are written at absolute times, so the frame rate does
-not drift. The sensor never waits for a reader. A frame that does not fit into the buffer of the port is discarded and
-counted, and the reader receives a gap in the frame numbers.
+not drift. If the computer is too busy to write a frame in time, all later frames are postponed, as if the board had
+paused. Otherwise the delayed frames would be sent in one burst, which overflows the buffer of the port and looks like a
+higher frame rate.
+
+The sensor never waits for a reader. A frame that does not fit into the buffer of the port is discarded and counted, and
+the reader receives a gap in the frame numbers.
 """
 
 import array
@@ -67,8 +71,14 @@ class PseudoPort:
             return os.write(self._writer, data) == len(data)
         return False
 
+    def received(self) -> bytes:
+        """Return the bytes that the reader has sent since the last call, without waiting."""
+        with contextlib.suppress(BlockingIOError):
+            return os.read(self._writer, PORT_BUFFER_BYTES)
+        return b""
+
     def close(self) -> None:
-        """Close the pseudo-terminal. For the reader, this has the same effect as unplugging the cable."""
+        """Close the pseudo-terminal. For the reader, closing the port has the same effect as unplugging the cable."""
         os.close(self._writer)
         os.close(self._reader)
 
@@ -104,6 +114,12 @@ The function is called block by block in the order of time, so that the output m
 Encode = Callable[[Frame], bytes]
 """Frame format: function from a frame to its bytes."""
 
+MAX_LATENESS_S = 0.05
+"""Largest delay of a frame after which the next frames are sent at their times nevertheless, s.
+
+After a larger delay, all later frames are postponed by this delay.
+"""
+
 BLOCK_S = 0.5
 """Length of the blocks that the amplifier processes, s."""
 
@@ -136,10 +152,12 @@ class VirtualSensor:
 
     Attributes:
         port_path: Path of the pseudo-terminal that was opened first.
-        withheld: Number of frames that were discarded because they did not fit into the buffer of the port.
+        withheld: Number of frames that were discarded because they did not fit into the buffer of the port, or were not
+            requested.
         lost: Number of frames that were not sent because of a fault.
         corrupted: Number of frames that were damaged by a fault.
         unplugged: Number of outages of the port that have ended.
+        paused_s: Time by which frames were postponed because the computer was busy, s.
 
     Example:
         >>> with VirtualSensor(charges, wander(seed=1)) as sensor:  # doctest: +SKIP
@@ -156,6 +174,10 @@ class VirtualSensor:
         offset_pC: Sequence[float] | None = None,
         seed: int = 0,
         encode: Encode = encode_frame,
+        seq_modulus: int = SEQ_MODULUS,
+        t_us_modulus: int = T_US_MODULUS,
+        request: bytes | None = None,
+        echo: bool = False,
         faults: Faults | None = None,
         link: Path | None = None,
     ) -> None:
@@ -169,6 +191,11 @@ class VirtualSensor:
                 charges are drawn at random.
             seed: Seed of noise, offset and faults.
             encode: Frame format.
+            seq_modulus: Value at which the frame counter wraps to 0.
+            t_us_modulus: Time at which the clock of the sensor wraps to 0, us.
+            request: Bytes that the reader sends for each frame. The frame that is due next after a request is sent, and
+                only such frames are numbered. None for a sensor that sends all frames.
+            echo: Whether the request is returned before the frame, as on a line with two wires.
             faults: Faults between the sensor and the reader; none by default.
             link: Path of a symbolic link to the port, which exists while the context is active. If the faults contain
                 outages, a temporary link is created by default, because the port has another name after an outage.
@@ -180,10 +207,18 @@ class VirtualSensor:
         self._script = script
         self._noise = noise
         self._encode = encode
+        self._seq_modulus = seq_modulus
+        self._t_us_modulus = t_us_modulus
+        self._request = request
+        self._echo = echo
+        self._unanswered = b""  # bytes from the reader that may contain the beginning of a request
+        self._answer_count = 0
         self._faults = faults or Faults()
         self._link = link
+        # Touch charges of the script, and their changes per kelvin of the film, each of shape (n, electrodes).
         self._clean_pC = _clean_charges(charges, script)
         self._clean_pC_per_K: Array | None = None
+        # The script that follows the present one, with its charges and their changes per kelvin.
         self._next_script: tuple[Script, Array, Array | None] | None = None
         n_electrode = self._clean_pC.shape[1]
         random_pC = self._rng.uniform(-MAX_RANDOM_OFFSET_pC, MAX_RANDOM_OFFSET_pC, n_electrode)
@@ -193,9 +228,10 @@ class VirtualSensor:
         self.lost = 0
         self.corrupted = 0
         self.unplugged = 0
+        self.paused_s = 0.0
         self._frame_count = 0
         self._script_start = 0  # number of the frame with which the script began
-        self._sent_s = np.full(SEQ_MODULUS, np.nan)
+        self._sent_s = np.full(SEQ_MODULUS, np.nan)  # time at which the latest frame with each counter was sent
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
         self._port: PseudoPort | None = None
@@ -254,7 +290,7 @@ class VirtualSensor:
                 self._script_start = first_number
             first_row = first_number - self._script_start
             rows = range(first_row, first_row + block_size)
-            clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")
+            clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")  # begins again after the last row
             measured_pC = self._measured(clean_pC, rows)
             sent_pC = measured_pC + self._offset_pC
             for number, charge_pC in enumerate(sent_pC.tolist(), first_number):
@@ -282,12 +318,14 @@ class VirtualSensor:
         """
         faults = self._faults
         is_silent = faults.is_silent(self._script_time_s(number))
+        # No random number is drawn if no frames are lost, so that the noise of the seed stays the same.
         if is_silent or (faults.lose_share and self._rng.random() < faults.lose_share):
             self.lost += 1
             return b""
-        device_us_per_s = 1e6 + faults.clock_ppm
-        t_us = round(number / self._script.rate_Hz * device_us_per_s) % T_US_MODULUS
-        data = self._encode(Frame(number % SEQ_MODULUS, t_us, charge_pC))
+        device_us_per_s = 1e6 + faults.clock_ppm  # an error of 1 ppm is 1 us in a second
+        t_us = round(number / self._script.rate_Hz * device_us_per_s) % self._t_us_modulus
+        seq = number if self._request is None else self._answer_count
+        data = self._encode(Frame(seq % self._seq_modulus, t_us, charge_pC))
         if not faults.corrupt_share:
             return data
         damaged = corrupt(data, faults.corrupt_share, self._rng)
@@ -303,7 +341,7 @@ class VirtualSensor:
         """Return the true press in the latest frame with a frame counter.
 
         Args:
-            seq: Counter of the frame, which wraps to 0 at `SEQ_MODULUS`.
+            seq: Number of the frame since the start, modulo `SEQ_MODULUS`.
 
         Raises:
             SceneError: If no frame with this counter has been played.
@@ -332,6 +370,9 @@ class VirtualSensor:
         self._frame_count = 0
         self.withheld = 0
         self.unplugged = 0
+        self.paused_s = 0.0
+        self._unanswered = b""
+        self._answer_count = 0
         if self._link is None and self._faults.unplug_every_s > 0.0:
             self._folder = tempfile.TemporaryDirectory(prefix="isocharge-")
             self._link = Path(self._folder.name) / "film"
@@ -357,9 +398,12 @@ class VirtualSensor:
         """Write each frame at its time until the sensor is stopped."""
         start_s = time.perf_counter()
         for number, data in enumerate(self.frames()):
-            due_s = start_s + number / self._script.rate_Hz
+            due_s = start_s + self.paused_s + number / self._script.rate_Hz
             if self._stop.wait(max(0.0, due_s - time.perf_counter())):
                 return
+            lateness_s = time.perf_counter() - due_s
+            if lateness_s > MAX_LATENESS_S:
+                self.paused_s += lateness_s
             self._sent_s[number % SEQ_MODULUS] = time.perf_counter()
             # Count the frame before it is written, because a reader may ask for its truth as soon as it has the frame.
             self._frame_count = number + 1
@@ -368,8 +412,35 @@ class VirtualSensor:
             elif self._port is None:
                 self._open_port()
                 self.unplugged += 1
-            if data and self._port is not None and not self._port.write_whole(data):
+            is_requested = self._port is not None and self._take_request(self._port)
+            if not data or self._port is None:
+                continue
+            if not is_requested or not self._port.write_whole(self._echo_of_request + data):
                 self.withheld += 1
+
+    @property
+    def _echo_of_request(self) -> bytes:
+        """The bytes that the line returns before a frame; empty if there is no echo."""
+        if self._request is None or not self._echo:
+            return b""
+        return self._request
+
+    def _take_request(self, port: PseudoPort) -> bool:
+        """Read what the reader has sent, and return whether it contains a request since the last call.
+
+        A sensor that sends all frames ignores what the reader sends, and the result is true.
+        """
+        received = port.received()  # otherwise the buffer would become full, and a reader that sends would wait forever
+        if self._request is None:
+            return True
+        self._unanswered += received
+        start = self._unanswered.rfind(self._request)
+        if start < 0:
+            self._unanswered = self._unanswered[-len(self._request) :]
+            return False
+        self._unanswered = self._unanswered[start + len(self._request) :]
+        self._answer_count += 1
+        return True
 
     def _open_port(self) -> PseudoPort:
         """Open the port, create the link, and return the port.
