@@ -15,7 +15,6 @@ from isocharge.simulate import (
     Polygon,
     Probe,
     Resolution,
-    Sensor,
     Sweep,
     Theory,
     load_sensor,
@@ -154,14 +153,21 @@ def three_map() -> ForwardMap:
 
 
 @pytest.fixture(scope="session")
-def side_force_map() -> SideForceMap:
-    """Derivatives of the charges for side forces on a film of 0.8 MPa with four electrodes."""
+def taut_map() -> ForwardMap:
+    """Forward map of a film of 0.8 MPa with four electrodes, up to 8 mm and from 0.2 to 1 N.
+
+    The solution does not depend on the electrodes, so a test may replace the sensor by one with the same film.
+    """
     sensor = load_sensor("four-25um-biaxial")
-    return kept(solve_side_forces, replace(sensor, film=replace(sensor.film, pretension=0.8)))
+    return kept(
+        ForwardMap.build, replace(sensor, film=replace(sensor.film, pretension=0.8)), Circle(1.0), 8.0, (0.2, 1.0)
+    )
 
 
-def solve_side_forces(sensor: Sensor) -> SideForceMap:
-    return SideForceMap.build(ForwardMap.build(sensor, Circle(1.0), 8.0, (0.1, 1.0)))
+@pytest.fixture(scope="session")
+def side_force_map(taut_map: ForwardMap) -> SideForceMap:
+    """Derivatives of the charges of `taut_map` with respect to side forces."""
+    return kept(SideForceMap.build, taut_map)
 
 
 @pytest.fixture(scope="session")

@@ -129,6 +129,7 @@ PLACES = [(0.0, 0.0), (8.0, -5.0), (-20.0, 10.0), (-3.0, 36.0)]
 # The linear membrane: a tension so large that the press does not change it
 
 
+@pytest.mark.first_cases(3)
 @pytest.mark.parametrize(("at", "radius"), list(zip(PLACES, (4.0, 1.0, 4.0, 1.0), strict=True)))
 def test_taut_membrane_under_a_disk(at, radius):
     """Green's function is harmonic. Outside the probe, the deflection is therefore that of a point load."""
@@ -143,6 +144,7 @@ def test_taut_membrane_under_a_disk(at, radius):
 # The clamped plate
 
 
+@pytest.mark.first_cases(3)
 @pytest.mark.parametrize(("at", "radius"), list(zip(PLACES, (4.0, 0.2, 4.0, 0.2), strict=True)))
 def test_plate_under_a_disk(at, radius):
     """The deflection is that of a disk of point loads, and under a small probe nearly that of one point load."""

@@ -1,6 +1,6 @@
 """The simulator: from a press on a clamped piezoelectric film to the charges of its electrodes.
 
-Lengths are in mm, forces in N, stresses in MPa, charges in pC. Four lines give the charges of one press.
+Lengths are in mm, forces in N, stresses in MPa, charges in pC. These four lines compute the charges of one press.
 
     from isocharge.simulate import Circle, load_sensor, press, touch_charge
 

@@ -15,6 +15,7 @@ from isocharge.common.errors import OutputExists, SceneError, SolveError
 from isocharge.common.progress import listening
 from isocharge.common.resumable_run import draft_of, resume_folder
 from isocharge.simulate import Circle, Resolution, SolveSettings, Sweep, Theory, load_sensor, run_sweep
+from isocharge.simulate.forward import forward_map
 
 SENSOR = load_sensor("three-25um-biaxial")
 QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
@@ -186,6 +187,7 @@ from pathlib import Path
 sys.path[:0] = {path!r}
 from isocharge.simulate import *
 from isocharge.common.progress import listening
+from isocharge.simulate.forward import forward_map
 from isocharge.simulate.execution.workers import local_workers
 
 def killed(title, done, *_):
@@ -193,6 +195,7 @@ def killed(title, done, *_):
         os.kill(os.getpid(), 9)
 
 if __name__ == "__main__":
+    forward_map.CHECK_COUNT = {check_count}  # as in the process that resumes the run
     membrane = Theory(stretching=True, bending=False, pretensioned=False)
     quick = SolveSettings(theory=membrane, resolution=Resolution(4, 8, 4))
     sweep = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7)
@@ -206,7 +209,7 @@ if __name__ == "__main__":
 def test_killed_run_is_resumed_with_the_same_bytes(tmp_path, whole):
     """The run is killed by SIGKILL between two shards, and its workers end as well."""
     script = tmp_path / "driver.py"
-    script.write_text(DRIVER.format(path=sys.path))
+    script.write_text(DRIVER.format(path=sys.path, check_count=forward_map.CHECK_COUNT))
     run = subprocess.run([sys.executable, script, tmp_path / "presses"], capture_output=True, text=True, timeout=100)
     assert run.returncode == -signal.SIGKILL, run.stderr
     assert [path.exists() for path in (tmp_path / "presses", draft_of(tmp_path / "presses"))] == [False, True]

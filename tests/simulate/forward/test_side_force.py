@@ -22,7 +22,8 @@ def taut(name: str, pretension: float):
     return replace(sensor, film=replace(sensor.film, pretension=pretension))
 
 
-@pytest.mark.parametrize("contact", [(3.0, -2.0, 0.5), (-5.0, 4.0, 0.1), (7.5, -0.3, 0.9)])
+@pytest.mark.first_cases(1)
+@pytest.mark.parametrize("contact", [(3.0, -2.0, 0.5), (7.5, -0.3, 0.9), (-5.0, 4.0, 0.2)])
 def test_side_force_jacobian_equals_differences_of_direct_solves(side_force_map, contact):
     x, y, force = contact
     sensor = side_force_map.film.sensor

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate import Circle, ForwardMap, Polygon, TensionMap, load_sensor, press, touch_charge
+from isocharge.simulate import Circle, Polygon, TensionMap, load_sensor, press, touch_charge
 from isocharge.simulate.mechanics.film_temperature import warmed
-from kept import kept
 
 PROBE = Circle(1.0)
 
@@ -20,15 +19,11 @@ def drawn_sensor():
 
 
 @pytest.fixture(scope="module")
-def tension_map() -> TensionMap:
-    return kept(tension_map_of, drawn_sensor())
+def tension_map(taut_map) -> TensionMap:
+    return TensionMap.build(replace(taut_map, sensor=drawn_sensor()))
 
 
-def tension_map_of(sensor) -> TensionMap:
-    return TensionMap.build(ForwardMap.build(sensor, PROBE, 8.0, (0.1, 1.0)))
-
-
-@pytest.mark.parametrize("contact", [(3.0, -2.0, 0.5), pytest.param((-5.0, 4.0, 0.15), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("contact", [(3.0, -2.0, 0.5), pytest.param((-5.0, 4.0, 0.2), marks=pytest.mark.slow)])
 def test_tension_jacobian_equals_differences_of_direct_solves(tension_map, contact):
     x, y, force = contact
     sensor = tension_map.film.sensor

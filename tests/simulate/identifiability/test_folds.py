@@ -1,5 +1,6 @@
 """Folds, ambiguous pairs and working areas of synthetic charge maps with known folds, and of built-in sensors."""
 
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -236,6 +237,9 @@ def test_allowed_error_bounds_the_working_area():
     working = working_area(folded_map(), REFERENCE, error=0.2, search_pairs=False)
     assert working.bound == "error"
     assert "exceeds 0.2 mm" in working.summary
+    [unique_radius] = re.findall(r"Up to (\S+) mm, the charges determine the contact uniquely\.", working.summary)
+    assert float(unique_radius) == pytest.approx(FOLD_X, abs=0.11)
+    assert working.radius < float(unique_radius)
     ring = working.error_radius * np.exp(2j * np.pi * np.arange(360) / 360)
     contact = np.stack([ring.real, ring.imag, np.full(360, 0.05)], axis=1)
     assert limits_at(folded_map(), contact, REFERENCE).position.max() == pytest.approx(0.2, rel=0.01)

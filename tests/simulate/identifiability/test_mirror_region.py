@@ -1,16 +1,14 @@
 """Presses outside the working area that have the charges of a press inside it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from isocharge.simulate import Circle, ForwardMap, FunctionMap, load_sensor, noise_model
 from isocharge.simulate.forward.charge_map import Domain, within
-from isocharge.simulate.forward.whole_film import whole_film_map
 from isocharge.simulate.identifiability.mirror_region import MirrorRegion, has_mirror, mirror_region
 from isocharge.simulate.identifiability.nearest_contact import search
 from kept import kept
+from whole_films import whole_film_map_solved_once
 
 NOISE = noise_model("reference")
 FORCES = (0.05, 2.0)
@@ -59,7 +57,7 @@ def test_a_press_at_20_mm_on_the_film_has_the_charges_of_one_at_5_mm():
     """The mirror image in the circle of 10 mm is at R^2 / r = 5 mm. On the film, it is at 5.2 mm, with 0.24 N."""
     sensor = load_sensor("four-25um-biaxial")
     inside = kept(ForwardMap.build, sensor, Circle(1.0), 9.0, FORCES)
-    coarse = replace(kept(whole_film_map, sensor, Circle(1.0), FORCES), sensor=sensor)
+    coarse = whole_film_map_solved_once(sensor, Circle(1.0), FORCES)
     charge = coarse.charges(np.array([[20.0, 0.0, 0.5], [0.0, -20.0, 0.5], [10.2, 0.0, 0.5]]))
     contact, residual = search(inside, charge, NOISE.sigma(charge), candidates=512)
     np.testing.assert_allclose(contact[:2, :2], [[5.2, 0.0], [0.0, -5.2]], atol=0.15)

@@ -7,6 +7,7 @@ import pytest
 
 from isocharge.simulate import (
     Circle,
+    Domain,
     Electrode,
     ForwardMap,
     Sensor,
@@ -18,8 +19,7 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.forward.side_force import SideForceMap
 from isocharge.simulate.identifiability.identification import Identification
-from isocharge.simulate.identifiability.side_force_limits import ANGLE_COUNT, SideForceLimits
-from kept import kept
+from isocharge.simulate.identifiability.side_force_limits import ANGLE_COUNT, SideForceLimits, side_force_limits
 
 REFERENCE = noise_model("reference")
 PROBE = Circle(1.0)
@@ -38,8 +38,10 @@ def sensor_with_electrodes(count: int) -> Sensor:
 
 
 @pytest.fixture(scope="module")
-def forward_map() -> ForwardMap:
-    return kept(ForwardMap.build, sensor_with_electrodes(6), PROBE, 6.0, (0.2, 1.0))
+def forward_map(taut_map) -> ForwardMap:
+    """Forward map of the sensor with six electrodes, up to 6 mm and from 0.2 to 1 N."""
+    family = replace(taut_map.family, domain=Domain(6.0, (0.2, 1.0)))
+    return replace(taut_map, sensor=sensor_with_electrodes(6), family=family)
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +50,13 @@ def side_force_map_with_six_electrodes(side_force_map) -> SideForceMap:
     sensor = sensor_with_electrodes(6)
     film = replace(side_force_map.film, sensor=sensor)
     return replace(side_force_map, film=film, fields=replace(side_force_map.fields, sensor=sensor))
+
+
+@pytest.fixture(scope="module")
+def identification(forward_map, side_force_map_with_six_electrodes) -> Identification:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SideForceMap, "build", lambda *_, **__: side_force_map_with_six_electrodes)
+        return Identification.of(forward_map, REFERENCE)
 
 
 @pytest.mark.slow
@@ -77,11 +86,7 @@ def test_side_force_limit_equals_that_of_direct_solves(forward_map, side_force_m
     assert limits.relative_force[number] == pytest.approx(np.sqrt(covariance[2, 2]), rel=0.02)
 
 
-def test_identify_reports_the_side_force_with_six_electrodes(
-    forward_map, side_force_map_with_six_electrodes, monkeypatch
-):
-    monkeypatch.setattr(SideForceMap, "build", lambda *_, **__: side_force_map_with_six_electrodes)
-    identification = Identification.of(forward_map, REFERENCE)
+def test_identify_reports_the_side_force_with_six_electrodes(identification):
     rows = identification.to_dict()["limits_with_side_force"]
     contact_rows = identification.to_dict()["limits_in_working_area"]
     assert [row["force_N"] for row in rows] == [0.2, 1.0]
@@ -91,8 +96,10 @@ def test_identify_reports_the_side_force_with_six_electrodes(
     assert "The side force of the probe can" in identification.summary
 
 
-def test_identify_with_five_electrodes_omits_the_side_force(forward_map):
-    sensor = sensor_with_electrodes(5)
-    identification = Identification.of(replace(forward_map, sensor=sensor), REFERENCE)
-    assert identification.to_dict()["limits_with_side_force"] == []
-    assert "side force" not in identification.summary
+def test_identify_with_five_electrodes_omits_the_side_force(forward_map, identification):
+    five = replace(forward_map, sensor=sensor_with_electrodes(5))
+    limits = side_force_limits(five, five, REFERENCE, [0.2, 1.0], 6.0)
+    assert limits == ()
+    without_side_force = replace(identification, side_force=limits)
+    assert without_side_force.to_dict()["limits_with_side_force"] == []
+    assert "side force" not in without_side_force.summary

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from isocharge.simulate import Circle, load_sensor, noise_model, press, touch_charge
+from isocharge.simulate import Circle, SolveSettings, load_sensor, noise_model, press, touch_charge
+from isocharge.simulate.forward.whole_film import COARSE_RESOLUTION
 from isocharge.simulate.identifiability.cramer_rao import cramer_rao
 
 STEP = 0.05
@@ -12,13 +13,16 @@ STEP = 0.05
 LOG_FORCE_STEP = 0.05
 """Step of the finite differences with respect to ln F, dimensionless."""
 
+SETTINGS = SolveSettings(resolution=COARSE_RESOLUTION)
+"""Settings of the direct solves. Their error of a few percent is small in relation to the variation of the limits."""
+
 
 def position_limit(sensor, x: float, y: float, force: float) -> float:
     """Compute the Cramer-Rao limit of the position, mm, from finite differences of direct solves."""
-    start = press(sensor.film, Circle(1.0), (x, y), force)
+    start = press(sensor.film, Circle(1.0), (x, y), force, SETTINGS)
 
     def charge(dx: float = 0.0, dy: float = 0.0, log_force: float = 0.0) -> np.ndarray:
-        moved = press(sensor.film, Circle(1.0), (x + dx, y + dy), force * np.exp(log_force), start=start)
+        moved = press(sensor.film, Circle(1.0), (x + dx, y + dy), force * np.exp(log_force), SETTINGS, start=start)
         return touch_charge(sensor, moved)
 
     by_x = (charge(dx=STEP) - charge(dx=-STEP)) / (2.0 * STEP)

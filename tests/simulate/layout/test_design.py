@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import SolveError
-from isocharge.simulate import ChargeSpline, Domain, ForwardMap, FunctionMap, limits_at
+from isocharge.simulate import Domain, ForwardMap, FunctionMap, limits_at
 from isocharge.simulate.layout import case as case_module
 from isocharge.simulate.layout import design as design_module
 from isocharge.simulate.layout import search as search_module
@@ -59,9 +60,9 @@ def test_three_electrodes_form_an_equilateral_triangle(found, centres):
 
 def test_errors_agree_with_the_limits_of_the_forward_map(found):
     """The limits are computed independently from the forward map of the new sensor."""
-    charges = ChargeSpline.of(ForwardMap.build(found.sensor, found.case.probe, 4.0, (1.0, 1.0)))
+    forward_map = ForwardMap.build(found.sensor, found.case.probe, 4.0, DEFAULT_FORCE_RANGE)
     contact = np.column_stack([found.after.presses, np.ones(len(found.after.presses))])
-    limits = limits_at(charges, contact, found.case.noise).position
+    limits = limits_at(forward_map, contact, found.case.noise).position
     assert found.after.noise_alone == pytest.approx(limits, rel=0.02)
     numbers = found.after.to_dict()["noise_alone"]
     worst, rms = limits.max(), np.sqrt(np.mean(limits**2))

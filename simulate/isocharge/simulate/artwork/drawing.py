@@ -63,6 +63,7 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
 
     for path in leads.paths.values():
         space.add_lwpolyline(path.tolist(), dxfattribs={"layer": "LEADS", "const_width": leads.width})
+
     # Electrodes may share the metal of the back, so equal polygons are drawn once.
     back_polygons = dict.fromkeys(polygon for electrode in sensor.electrodes for polygon in electrode.back)
     if back_polygons:
@@ -75,7 +76,8 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
             space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "ELECTRODES"})
         name = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in electrode.name)
         text = space.add_text(name, height=TEXT_HEIGHT, dxfattribs={"layer": "NAMES"})
-        text.set_placement(max(electrode.corners))
+        rightmost_corner = max(electrode.corners)  # corners are compared by x first
+        text.set_placement(rightmost_corner)
     _draw_ruler(space, -sensor.film.radius - RULER_OFFSET)
     return document
 

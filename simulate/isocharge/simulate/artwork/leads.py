@@ -1,4 +1,4 @@
-"""Straight leads from the electrodes to the rim that cross neither each other nor another electrode."""
+"""Straight leads from the electrodes to the rim. A lead crosses neither another lead nor another electrode."""
 
 from dataclasses import dataclass
 
@@ -102,10 +102,13 @@ def _clearance(path: Array, width: float, electrodes: list[Electrode], leads: li
     Returns:
         Distance, mm; infinite if there are neither electrodes nor leads.
     """
+    # Points on the centre line of the lead
     start, end = path
-    length = np.hypot(*(end - start))
-    n_points = int(np.ceil(length / SAMPLE_DISTANCE)) + 1
+    x_length, y_length = end - start
+    n_points = int(np.ceil(np.hypot(x_length, y_length) / SAMPLE_DISTANCE)) + 1
     points = start + np.linspace(0.0, 1.0, n_points)[:, None] * (end - start)
+
+    # Half of the width of this lead is subtracted, and half of the width of the other lead as well.
     electrode_clearances = [_distance_from_boxes(points, electrode) - 0.5 * width for electrode in electrodes]
     lead_clearances = [_distance_from_lead(points, lead) - width for lead in leads]
     return min([*electrode_clearances, *lead_clearances], default=np.inf)
@@ -129,4 +132,5 @@ def _distance_from_lead(points: Array, lead: Array) -> float:
     direction = end - start
     fraction_of_length = np.clip((points - start) @ direction / (direction @ direction), 0.0, 1.0)
     nearest_points = start + fraction_of_length[:, None] * direction
-    return float(np.hypot(*(points - nearest_points).T).min())
+    x_distance, y_distance = (points - nearest_points).T
+    return float(np.hypot(x_distance, y_distance).min())

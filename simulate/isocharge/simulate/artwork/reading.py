@@ -35,8 +35,8 @@ def read_artwork(path: str | Path, layer: str = "ELECTRODES", back: str = "") ->
     """Read the electrodes of a DXF drawing, such as a drawing of `isocharge simulate design`.
 
     Closed lines are polygons, and open polylines with a width are traces. Polygons and traces that touch or overlap
-    form one electrode. The name of an electrode is the text nearest to it. If two electrodes have the same nearest
-    text, the electrodes are named A, B, C and so on. A drawing without a unit is assumed to be in mm.
+    form one electrode. The name of an electrode is the text that is nearest to the electrode. If two electrodes have
+    the same nearest text, the electrodes are named A, B, C and so on. A drawing without a unit is assumed to be in mm.
 
     Args:
         path: DXF file.
@@ -112,11 +112,14 @@ def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list
             raise SensorError(f"{where}: expected one of {', '.join(LINE_TYPES)}; redraw or explode it, or delete it")
         outline = make_path(shape)
         is_closed = shape.closed if shape.dxftype() == "LWPOLYLINE" else outline.is_closed
+
+        # Corners in mm. Arcs are replaced by chords.
         corners = tuple((scale * point.x, scale * point.y) for point in outline.flattening(ARC_TOLERANCE / scale))
         width = scale * _width(shape)
         if is_closed:
-            # The last point repeats the first one and is omitted. Clockwise polygons are reversed.
-            corners = corners[:-1] if area_of(np.array(corners)) > 0.0 else corners[:0:-1]
+            # The last point repeats the first one. One of them is omitted. Clockwise polygons are reversed.
+            is_anticlockwise = area_of(np.array(corners)) > 0.0
+            corners = corners[:-1] if is_anticlockwise else corners[:0:-1]
             check_polygon(where, corners)
             pads.append(Electrode(where, corners))
         elif width > 0.0:
@@ -131,27 +134,28 @@ def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list
 
 
 def _width(line: Any) -> float:
-    """Return the width of a polyline in the unit of the drawing, or 0 if the line has no width or a varying width."""
+    """Return the width of a polyline in the unit of the drawing; 0 if there is none or if it varies."""
     if line.dxftype() != "LWPOLYLINE":
         return 0.0
-    start_and_end_widths = chain(*line.get_points("se"))
+    start_and_end_widths = chain(*line.get_points("se"))  # of each section
     different_widths = {line.dxf.const_width or width for width in start_and_end_widths}
-    return float(different_widths.pop()) if len(different_widths) == 1 else 0.0
+    has_constant_width = len(different_widths) == 1
+    return float(different_widths.pop()) if has_constant_width else 0.0
 
 
 def _names(document: Any, groups: list[list[Electrode]], scale: float) -> list[str]:
     """Return a name for each group of polygons. Each group becomes an electrode.
 
     The name of a group is the text of the drawing that is nearest to the first polygon of the group. If two groups have
-    the same text, or the drawing has no texts, the names are the letters from A to Z, followed by numbers. There may
-    then be more names than groups.
+    the same text, or the drawing has no texts, the names are the letters from A to Z, followed by numbers. In this
+    case, there may be more names than groups.
 
     Args:
         document: The drawing.
         groups: Polygons of each group.
         scale: Length of a unit of the drawing, mm.
     """
-    text_positions = {
+    text_positions = {  # x + iy, mm
         text.plain_text(): scale * complex(*text.dxf.insert.vec2)
         for text in document.modelspace().query(" ".join(TEXT_TYPES))
     }

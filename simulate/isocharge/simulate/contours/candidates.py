@@ -30,7 +30,7 @@ RANGE_MARGIN = 0.02
 
 @dataclass(frozen=True)
 class Candidates:
-    """Possible positions of presses. Each press may have any number of them.
+    """Possible positions of presses. Each press may have any number of candidates.
 
     Attributes:
         press: Number of the press, shape (n,).
@@ -77,6 +77,8 @@ class Candidates:
 
     def distinct(self, tolerance: float) -> "Candidates":
         """Sort the candidates by press and spread, and remove duplicates.
+
+        A candidate is a duplicate if a remaining candidate of the same press with a smaller spread is near.
 
         Args:
             tolerance: Distance from a better candidate of the same press below which a candidate is removed, mm.
@@ -129,12 +131,14 @@ class SeedGrid:
         # Select the nodes of a square grid that lie within the disk or slightly outside, and move the nodes outside
         # onto the edge of the disk.
         radius = charge_map.domain.radius
-        side = 2 * max(4, int(np.ceil(radius / NODE_SPACING))) + 1
+        side = 2 * max(4, int(np.ceil(radius / NODE_SPACING))) + 1  # number of nodes along a side of the grid
         line = np.linspace(-radius, radius, side)
         square_grid = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
-        index = np.flatnonzero(np.hypot(*square_grid.T) <= radius * (1.0 + 1.0 / side))
+        grid_x, grid_y = square_grid.T
+        index = np.flatnonzero(np.hypot(grid_x, grid_y) <= radius * (1.0 + 1.0 / side))
         position = onto_disk(square_grid[index], INNER_RADIUS * radius)
 
+        # Charges of the nodes for each force, shape (n_force, n_node, n_electrode)
         min_force, max_force = charge_map.domain.force_range
         n_force = FORCES if max_force > min_force else 1
         log_forces = np.linspace(np.log(min_force), np.log(max_force), n_force)
@@ -142,6 +146,7 @@ class SeedGrid:
         contacts = [np.column_stack([position, np.full(len(position), force)]) for force in forces]
         node_charges = np.stack([charge_map.charges(contact) for contact in contacts])
 
+        # Slopes at the middle force, and the size of the charges at each force relative to that at the middle force
         middle = forces.size // 2
         gradient = charge_map.derivatives(contacts[middle])[..., :2]  # with respect to x and y
         gradient_length = np.linalg.norm(gradient, axis=2)
@@ -158,11 +163,11 @@ class SeedGrid:
         )
 
     def growth(self, force: Array) -> Array:
-        """Interpolate the relative size of the charges at forces (N) of any shape; the result is dimensionless."""
+        """Interpolate the relative size of the charges at forces (N) of any shape."""
         return np.interp(np.log(force), self.log_forces, self.relative_size)
 
     def charge(self, force: Array) -> Array:
-        """Interpolate the charges at all nodes.
+        """Interpolate the charges at all nodes between the tabulated forces.
 
         Args:
             force: Forces, shape (n, 1) or (n, n_node), N.
@@ -192,7 +197,9 @@ class SeedGrid:
         """
         total = charge.sum(axis=1)
         node_totals = self.node_charges.sum(axis=2)  # shape (n_force, n_node)
-        sign = np.sign(node_totals.sum())  # with negative coefficients the charges decrease with the force
+
+        # `np.interp` needs ascending totals. With negative coefficients, the charges decrease with the force.
+        sign = np.sign(node_totals.sum())
         log_forces = [np.interp(sign * total, sign * node_total, self.log_forces) for node_total in node_totals.T]
         return np.asarray(np.exp(np.stack(log_forces, axis=1)))
 
@@ -220,6 +227,7 @@ class SeedGrid:
         Returns:
             Indices of the presses and indices of the nodes, each of shape (m,).
         """
+        # Compare each node with its neighbours on the square grid. Nodes outside the disk have an infinite distance.
         n_press = len(distance)
         flat_grid = np.full((n_press, self.side**2), np.inf)
         flat_grid[:, self.index] = distance
@@ -235,16 +243,16 @@ class SeedGrid:
         return press, node[press, column]
 
     def is_out_of_range(self, charge: Array, force: Array | None) -> Booleans:
-        """Return a mask of the presses with at least one charge that is outside the range of the charges at the nodes.
+        """Return whether each press has a charge outside the range of the charges at the nodes.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
             force: Force of each press, shape (n,), N. If it is None, the range includes the charges at all forces.
 
         Returns:
-            Shape (n,).
+            Whether each press has such a charge, shape (n,).
         """
-        if force is None:
+        if force is None:  # the charges at all nodes and forces, which are the same for all presses
             node_charges = self.node_charges.reshape(1, -1, charge.shape[1])
         else:
             node_charges = self.charge(force[:, None])

@@ -1,7 +1,7 @@
-"""Charge as a function of the distance along lines from an electrode (Mirbagheri et al. 2007, Fig. 2, 4 and 7).
+"""Charge as a function of the distance along lines from an electrode (Mirbagheri and others 2007, figures 2, 4, 7).
 
-This is the mapping scheme of the paper. The lines start at the centre of an electrode. The angles between neighbouring
-lines are equal, and so are the distances between neighbouring presses on a line. The paper fits a polynomial to the
+This is the mapping scheme of the paper. The lines start at the centre of an electrode. All angles between neighbouring
+lines are equal. All distances between neighbouring presses on a line are equal. The paper fits a polynomial to the
 charge along each line. The module `graphical_method` draws contours through the roots of these polynomials.
 """
 
@@ -76,7 +76,7 @@ class Mapping:
         """
         centre = sensor.electrodes[electrode_index(sensor, electrode)].centre
         x, y = sensor.calibration.place(np.array(centre))
-        inwards = np.arctan2(-y, -x) % (2.0 * np.pi)
+        inwards = np.arctan2(-y, -x) % (2.0 * np.pi)  # direction from the electrode to the centre of the film
         if angles is None:
             angles = (inwards - HALF_ANGLE, inwards + HALF_ANGLE)
         first_angle, last_angle = angles

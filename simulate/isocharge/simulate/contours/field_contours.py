@@ -1,7 +1,7 @@
 """Isocharge contours: curves on which all presses with the same force cause the same charge on an electrode.
 
 Contours are traced by marching squares on a grid. The module `graphical_method` draws the same contours by the method
-of Mirbagheri et al. (2007).
+of Mirbagheri and others (2007).
 """
 
 from dataclasses import dataclass
@@ -59,11 +59,12 @@ class ContourField:
         """
         if not np.isfinite(charge):
             raise SceneError(f"charge of {electrode!r}: expected a finite number, got {charge:g} pC")
+        # The charges are divided by the largest charge before the contour is traced.
         x, y = self._grid
-        values = self._charges(electrode)
-        scale = np.abs(values).max()
-        generator = contour_generator(x, y, values / scale, line_type=LineType.Separate)
-        return tuple(np.asarray(line, dtype=float) for line in generator.lines(charge / scale))
+        charges = self._charges(electrode)
+        largest_charge = np.abs(charges).max()
+        generator = contour_generator(x, y, charges / largest_charge, line_type=LineType.Separate)
+        return tuple(np.asarray(line, dtype=float) for line in generator.lines(charge / largest_charge))
 
     def charge_range(self, electrode: str) -> tuple[float, float]:
         """Return the smallest and the largest charge of an electrode on the grid, pC."""

@@ -1,10 +1,10 @@
-"""Contours and triangulation by the graphical method of Mirbagheri et al. (2007).
+"""Contours and triangulation by the graphical method of Mirbagheri and others (2007).
 
 A polynomial is fitted to the charge along each line of a mapping scheme. The root of the polynomial is one point of the
 contour. The points are joined by a cubic spline with free ends and the chord length as its parameter, like the SPLINE
-of AutoCAD. Contours are intersected as splines, and the position is the mean of the three crossings that are nearest to
-each other. The modules `field_contours` and `triangulation` compute contours and positions directly from the charge
-map, without the errors of the drawing.
+of AutoCAD. The crossings of the splines are computed. The position is the mean of the three crossings that are nearest
+to each other. The modules `field_contours` and `triangulation` compute contours and positions directly from the charge
+map, and therefore without errors of the drawing.
 """
 
 from collections.abc import Sequence
@@ -73,8 +73,11 @@ class DrawnContour:
     def crossings(self, other: "DrawnContour") -> Array:
         """Find the positions at which this contour crosses another contour.
 
-        The splines are first approximated by chords. Newton's method then solves spline(p) = other_spline(q) for the
-        parameters p and q of both splines, beginning at each crossing of two chords.
+        The splines are first approximated by chords. Each crossing of two chords is then improved by Newton's method,
+        which solves spline(p) = other_spline(q) for the parameters p and q of both splines.
+
+        Args:
+            other: The other contour.
 
         Returns:
             Positions (x, y), shape (n, 2), mm.
@@ -85,17 +88,18 @@ class DrawnContour:
             for _ in range(NEWTON_STEPS):
                 own_parameter, other_parameter = parameters
                 gap = self._spline(own_parameter) - other._spline(other_parameter)
-                own_tangent = self._spline(own_parameter, 1)
+                own_tangent = self._spline(own_parameter, 1)  # first derivative
                 other_tangent = other._spline(other_parameter, 1)
                 jacobian = np.stack([own_tangent, -other_tangent], axis=1)
                 # Tangents may be parallel, so the step is the least-squares solution.
-                parameters = parameters - np.linalg.lstsq(jacobian, gap, rcond=None)[0]
+                step, *_ = np.linalg.lstsq(jacobian, gap, rcond=None)
+                parameters = parameters - step
             crossings.append(self._spline(parameters[0]))
         return np.array(crossings).reshape(-1, 2)
 
 
 def _chord_crossings(first: Array, second: Array) -> Integers:
-    """Find the pairs of chords of two polylines that cross.
+    """Find the pairs of chords of two polylines that cross. A chord connects two successive points of a polyline.
 
     Args:
         first: Points (x, y) of the first polyline, shape (n_first, 2).
@@ -120,12 +124,15 @@ def _chord_crossings(first: Array, second: Array) -> Integers:
 
 
 def _cross_product(first: Array, second: Array) -> Array:
-    """Return the cross products x1 y2 - y1 x2 of plane vectors of shape (..., 2); they have the shape (...)."""
+    """Return the cross products x1 y2 - y1 x2, shape (...), of plane vectors, shape (..., 2)."""
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 
 def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnContour | None:
     """Draw a contour of the electrode at which the lines of the mapping start.
+
+    The charges along each line are approximated by a polynomial. The contour passes through the points at which the
+    polynomials have the given charge.
 
     Args:
         curves: Charges along the lines of a mapping.
@@ -138,11 +145,12 @@ def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnCo
     Raises:
         SceneError: If a line has too few presses for the degree.
     """
+    # Distance from the electrode on each line; NaN if the charge does not occur on the line
     mapping = curves.mapping
-    roots = [_root(polynomial, charge, mapping.distance) for polynomial in curves.polynomials(degree)]
-    direction = np.stack([np.cos(mapping.angle), np.sin(mapping.angle)], axis=1)
-    knots = np.array(mapping.origin) + np.array(roots)[:, None] * direction
-    knots = knots[np.isfinite(roots)]
+    distances = np.array([_root(polynomial, charge, mapping.distance) for polynomial in curves.polynomials(degree)])
+    direction = np.stack([np.cos(mapping.angle), np.sin(mapping.angle)], axis=1)  # unit vectors, shape (n_line, 2)
+    points = np.array(mapping.origin) + distances[:, None] * direction
+    knots = points[np.isfinite(distances)]
     return DrawnContour(mapping.electrode, charge, knots) if len(knots) > 1 else None
 
 
@@ -235,6 +243,7 @@ class DrawnTriangulation:
         if len(contours) < len(charge):
             return _Location(NOWHERE, np.nan, Meeting.no_contour)
 
+        # Three contours meet if the crossings of their three pairs are close together.
         indices = range(len(contours))
         crossings = {(i, j): contours[i].crossings(contours[j]) for i, j in combinations(indices, 2)}
         meetings = []
@@ -266,6 +275,7 @@ class DrawnTriangulation:
         if spread.min(initial=np.inf) > self.tolerance:
             return _Location(NOWHERE, np.nan, Meeting.apart)
 
+        # The meeting is ambiguous if crossings at another position are nearly as close together.
         best = spread.argmin()
         is_elsewhere = np.linalg.norm(mean - mean[best], axis=1) > MIN_DISTANCE
         second_smallest_spread = spread[is_elsewhere].min(initial=np.inf)

@@ -1,10 +1,10 @@
-"""Triangulation: position of a press from the point at which contours meet (Mirbagheri et al. 2007, Fig. 9 and 10).
+"""Triangulation: position of a press from the point at which contours meet (Mirbagheri and others 2007, figures 9, 10).
 
 Each charge restricts the position of the press to an isocharge contour. The contours of three electrodes have three
 crossings near the press, and the paper uses the mean of these crossings as the position. With four electrodes, the
-paper averages over the four triples of electrodes. `Triangulation.locate` computes the same mean. It searches for
-positions near all contours, and finds the crossing of each pair of contours by Newton's method. `Fix.status` states if
-there is no position or more than one.
+paper averages over the four triples of electrodes. `Triangulation.locate` computes the same mean. This module searches
+for positions near all contours, and finds the crossing of each pair of contours by Newton's method. `Fix.status` states
+whether a press has no position, or more than one.
 
 If the force is unknown, the contours depend on it. `Triangulation.locate_with_force` finds the position and the force
 with the smallest mean square distance from the contours.
@@ -135,13 +135,15 @@ class Triangulation:
         Returns:
             Position of each press.
         """
-        fixed = force is not None
-        closest = self._approach(charge, self._seeds(charge, force), fixed=fixed)
-        second = self._approach(charge, self._second_seeds(closest, fixed=fixed), fixed=fixed)
-        closest = closest.joined(second).distinct(MIN_DISTANCE)
-        if fixed:
-            closest = self._cross(charge, closest)
-        return self._choose(charge, force, closest)
+        is_force_fixed = force is not None
+        first = self._approach(charge, self._seeds(charge, force), fixed=is_force_fixed)
+
+        # Near a fold, there may be a second meeting beside each meeting.
+        second = self._approach(charge, self._second_seeds(first, fixed=is_force_fixed), fixed=is_force_fixed)
+        candidates = first.joined(second).distinct(MIN_DISTANCE)
+        if is_force_fixed:
+            candidates = self._cross(charge, candidates)
+        return self._choose(charge, force, candidates)
 
     def _choose(self, charge: Array, force: Array | None, candidates: Candidates) -> Fix:
         """Choose the best candidate of each press, unless the second candidate is almost as good.
@@ -163,8 +165,10 @@ class Triangulation:
         smallest_spread = np.where(n_candidates > 0, spread[first_row], np.nan)
         second_spread = np.where(n_candidates > 1, spread[second_row], np.inf)
 
+        # Presses without candidates are `apart`, or `no_contour` if the map does not contain their charges.
         status = np.where(n_candidates > 0, int(Meeting.met), int(Meeting.apart))
-        status[(n_candidates == 0) & self._grid.is_out_of_range(charge, force)] = Meeting.no_contour
+        has_no_contour = (n_candidates == 0) & self._grid.is_out_of_range(charge, force)
+        status[has_no_contour] = Meeting.no_contour
         is_ambiguous = second_spread <= np.maximum(AMBIGUOUS_RATIO * smallest_spread, AMBIGUOUS_SPREAD)
         status[is_ambiguous] = Meeting.twice
 
@@ -197,6 +201,7 @@ class Triangulation:
         Returns:
             Starting points, at most `MAX_SEEDS` for each press.
         """
+        # One force for each press and node, shape (n, n_node), or one for each press, shape (n, 1)
         grid = self._grid
         forces = grid.matching_force(charge) if force is None else force[:, None]
         press, node = grid.lowest(grid.distance(charge, forces), MAX_SEEDS)
@@ -206,8 +211,8 @@ class Triangulation:
     def _second_seeds(self, closest: Candidates, *, fixed: bool) -> Candidates:
         """Create starting points for a second meeting across a fold.
 
-        For each meeting, two starting points are placed on opposite sides of it. They lie in the direction in which the
-        distances from the contours change least.
+        For each meeting, two starting points are placed on opposite sides of it. The starting points lie in the
+        direction in which the distances from the contours change least.
 
         Args:
             closest: Meetings of the contours that have been found.
@@ -234,6 +239,10 @@ class Triangulation:
             charge: Charges of all presses, shape (n, n_electrode), pC.
             seeds: Starting points.
             fixed: Whether the force keeps its value.
+
+        Returns:
+            The best contact of each starting point whose distance from the contours is within the tolerance, without
+            duplicates.
         """
         contact = seeds.contact
         best = seeds
@@ -260,6 +269,8 @@ class Triangulation:
         """
         n_electrode = len(self.charge_map.electrodes)
         crossings = {pair: self._crossing(charge, candidates, pair) for pair in combinations(range(n_electrode), 2)}
+
+        # Sum of the means, largest spread and number of the triples that meet near each candidate
         position_sum = np.zeros((len(candidates.press), 2))
         n_meeting = np.zeros_like(candidates.press)
         spread = np.zeros_like(candidates.spread)

@@ -121,25 +121,27 @@ class Sweep:
         if self.sampling == "grid" and self.samples < len(probes):
             raise SceneError(f"samples: expected at least one for each of {len(probes)} probes, got {self.samples}")
         n_probe = len(probes)
-        parts = [self._presses_of_probe(index, n_probe, probe.period) for index, probe in enumerate(probes)]
-        presses = SweepPresses(
-            probe=np.concatenate([part.probe for part in parts]),
-            contact=np.concatenate([part.contact for part in parts]),
-            rotation=np.concatenate([part.rotation for part in parts]),
+        presses_by_probe = [self._presses_of_probe(index, n_probe, probe.period) for index, probe in enumerate(probes)]
+        all_presses = SweepPresses(
+            probe=np.concatenate([presses.probe for presses in presses_by_probe]),
+            contact=np.concatenate([presses.contact for presses in presses_by_probe]),
+            rotation=np.concatenate([presses.rotation for presses in presses_by_probe]),
         )
+
         # Take the first press of each probe, then the second press of each probe, and so on.
-        index_within_probe = np.concatenate([np.arange(len(part)) for part in parts])
+        index_within_probe = np.concatenate([np.arange(len(presses)) for presses in presses_by_probe])
         order = np.argsort(index_within_probe, kind="stable")
-        return presses[order]
+        return all_presses[order]
 
     def _presses_of_probe(self, probe_index: int, n_probe: int, period: float) -> SweepPresses:
-        """Return the presses of one probe.
+        """Return the presses of one probe: a grid, or presses that are drawn uniformly over the disk.
 
         Args:
             probe_index: Index of the probe.
             n_probe: Number of probes in the sweep.
             period: Smallest rotation that maps the probe onto itself, rad.
         """
+        position: Complexes  # x + iy, mm
         if self.sampling == "grid":
             position, force, rotation = self._grid(self.samples // n_probe, period)
         else:
@@ -166,14 +168,18 @@ class Sweep:
         rng = np.random.default_rng([self.seed, probe_index])
         if self.sampling == "random":
             return rng.random((count, 4))
-        # A Sobol sequence is balanced if the number of points is a power of two.
+
+        # A Sobol sequence is balanced if the number of points is a power of two. Draw the next power of two, and take
+        # the first points.
         log2_count = int(np.ceil(np.log2(max(count, 2))))
-        return np.asarray(scipy.stats.qmc.Sobol(4, rng=rng).random_base2(log2_count)[:count])
+        points = scipy.stats.qmc.Sobol(4, rng=rng).random_base2(log2_count)
+        return np.asarray(points[:count])
 
     def _force(self, fraction: Array) -> Array:
-        """Return the forces (N) at fractions of the logarithmic range: 0 for the smallest force, 1 for the largest."""
-        low, high = np.log(self.force_range)
-        return np.asarray(np.clip(np.exp(low + (high - low) * fraction), *self.force_range))
+        """Return the forces (N) at fractions of the logarithmic range, from 0 (smallest force) to 1 (largest force)."""
+        min_log_force, max_log_force = np.log(self.force_range)
+        force = np.exp(min_log_force + (max_log_force - min_log_force) * fraction)
+        return np.asarray(np.clip(force, *self.force_range))  # rounding may lead out of the range
 
     def _grid(self, max_count: int, period: float) -> tuple[Complexes, Array, Array]:
         """Return the presses of a grid.
@@ -188,10 +194,11 @@ class Sweep:
         Returns:
             Positions x + iy (mm), forces (N) and rotations (rad), each of shape (n,).
         """
+        # The grid has two dimensions for the position, and one each for the force and the rotation if they vary.
         min_force, max_force = self.force_range
         has_forces = min_force < max_force
         has_rotations = self.orientation == "random" and period > 0.0
-        n_dimension = 2 + has_forces + has_rotations
+        n_dimension = 2 + int(has_forces) + int(has_rotations)
         steps_per_dimension = max(1, round(max_count ** (1.0 / n_dimension)))
         n_rotation = steps_per_dimension if has_rotations else 1
         initial_n_force = steps_per_dimension if has_forces else 1

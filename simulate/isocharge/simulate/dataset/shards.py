@@ -1,9 +1,10 @@
 """Dataset format: reader and writer of a folder with shards, a manifest and a data card.
 
-The file manifest.json contains the format version, the sensor, the probes, the ranges, the seed, the solver, the
-columns, and the checksum of each shard. The file README.md is the data card, a description for readers. Each shard,
-such as shard-00000.npz, contains the columns x_mm, y_mm, force_N, probe, orientation_deg and charge_pC. The column
-charge_pC has the shape (n, n_electrode), and all other columns have the shape (n,).
+The file manifest.json contains the format version and a description of the sensor, the probes, the ranges, the seed,
+the solver and the columns. It also contains the checksum of each shard. The file README.md is the data card, a
+description for readers. Each shard, such as shard-00000.npz, contains the columns x_mm, y_mm, force_N, probe,
+orientation_deg and charge_pC. The column charge_pC has the shape (n, n_electrode), and all other columns have the shape
+(n,).
 
 A dataset is written under a temporary name and renamed when it is complete. Measured data has the same format, but its
 manifest has no entries `solver` and `seed`.

@@ -181,8 +181,9 @@ def _finish_shards(
     Returns:
         Manifest entries of all shards, in order.
     """
+    # Load the shards that an earlier run has saved.
     presses_of_shards = list(_split(presses, shard))
-    entries: dict[int, dict[str, Any]] = {}
+    entries: dict[int, dict[str, Any]] = {}  # by the index of the shard
     for index, shard_presses in enumerate(presses_of_shards):
         data = run.load(shard_name(index), bytes, final=True)
         if data is not None:
@@ -191,6 +192,7 @@ def _finish_shards(
     missing_shards = [index for index in range(len(presses_of_shards)) if index not in entries]
     report("pressing", finished_presses, len(presses))
 
+    # Compute and save the missing shards.
     missing_samples = _samples(maps, (presses_of_shards[index] for index in missing_shards), executor)
     for index, samples in zip(missing_shards, missing_samples, strict=True):
         name, data = pack_shard(index, samples, maps[0].sensor)
@@ -217,7 +219,8 @@ def _samples(
         shards: Presses of each shard.
         executor: Executor that computes the charges; this process if None.
     """
-    # Tasks are submitted before the samples of earlier shards are yielded, so each loop has its own iterator.
+    # The tasks of later shards are submitted before the samples of earlier shards are yielded. The two loops over the
+    # shards are therefore at different positions, and each has its own iterator.
     shards, shards_for_tasks = tee(shards)
     tasks = (
         (maps[probe], presses.contact[rows], presses.rotation[rows])
@@ -229,7 +232,7 @@ def _samples(
     probe_angles = np.array([forward_map.probe.angle for forward_map in maps])
     for presses in shards:
         charge = np.empty((len(presses), len(maps[0].electrodes)))
-        for _, rows in _tasks(presses, len(maps)):
+        for _, rows in _tasks(presses, len(maps)):  # the same tasks in the same order as above
             charge[rows] = next(charges_of_tasks)
         x, y, force = (np.ascontiguousarray(column) for column in presses.contact.T)
         rotation_deg = np.rad2deg(probe_angles[presses.probe] + presses.rotation)

@@ -16,8 +16,8 @@ LIBRARIES = ("numpy", "scipy", "shapely")
 def code_fingerprint() -> str:
     """Return a text that changes whenever the code or a numerical library changes.
 
-    The text contains the version of isocharge, a checksum of the sources of isocharge.simulate and of the built-in
-    sensors, and the versions of NumPy, SciPy and shapely.
+    The text contains the versions of isocharge, NumPy, SciPy and shapely. It also contains a checksum of the source
+    files of isocharge.simulate and of the built-in sensors.
     """
     source = hashlib.sha256()
     for path in sources():

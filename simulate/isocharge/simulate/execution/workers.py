@@ -142,8 +142,7 @@ def local_workers(count: int) -> Iterator[Executor | None]:
 
 
 def _initialise_worker(worker_end: Connection) -> None:
-    """Ignore interrupts, which the parent process handles, and end this worker when the parent closes its end of the
-    pipe."""
+    """Prepare a worker: ignore interrupts, and end the worker when the parent process closes its end of the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, args=(worker_end,), daemon=True).start()

@@ -1,1 +1,1 @@
-"""Fast computation of charges from presses: readout, forward map from few solves, and splines of a forward map."""
+"""Fast computation of the charges of presses: readout, forward maps from a few solves, and splines of these maps."""

@@ -50,7 +50,7 @@ class Domain:
             contact: Contacts (x, y, F), shape (n, 3), mm and N. A coordinate that is NaN counts as inside.
 
         Returns:
-            Shape (n,).
+            Whether each contact lies outside, shape (n,).
         """
         x, y, force = contact.T
         low, high = self.force_range
@@ -95,7 +95,7 @@ class Domain:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Shape (n,).
+            Whether each contact lies in the domain, shape (n,).
         """
         inside = np.hypot(contact[:, 0], contact[:, 1]) <= self.radius * LIMIT_TOLERANCE
         return np.asarray(inside & _are_within(contact[:, 2], self.force_range))
@@ -166,7 +166,7 @@ class ChargeMap(Protocol):
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
+            Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
         """
 
 
@@ -254,17 +254,22 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
     Returns:
         Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values per mm, per mm and per 1.
     """
+    # For each of the three variables, one copy of the contacts after a step up, and one after a step down
+    contacts_up = np.tile(np.asarray(contact, dtype=float), (3, 1, 1))  # shape (3, n, 3)
+    contacts_down = contacts_up.copy()
     x_step, y_step, log_force_step = steps
-    stepped = np.empty((3, 2, *contact.shape))  # one copy of the contacts for each variable and each direction
-    stepped[:] = contact
-    for direction, sign in enumerate((1.0, -1.0)):
-        stepped[0, direction, :, 0] += sign * x_step
-        stepped[1, direction, :, 1] += sign * y_step
-        stepped[2, direction, :, 2] *= np.exp(sign * log_force_step)
-    values = np.asarray(function(stepped.reshape(-1, 3))).reshape(3, 2, len(contact), -1)
+    for stepped, sign in ((contacts_up, 1.0), (contacts_down, -1.0)):
+        x_stepped, y_stepped, force_stepped = stepped
+        x_stepped[:, 0] += sign * x_step
+        y_stepped[:, 1] += sign * y_step
+        force_stepped[:, 2] *= np.exp(sign * log_force_step)
+
+    # Evaluate the function once, for the stepped contacts in the order (variable, direction, contact).
+    stepped_contacts = np.stack([contacts_up, contacts_down], axis=1)
+    values = np.asarray(function(stepped_contacts.reshape(-1, 3))).reshape(3, 2, len(contact), -1)
     value_differences = values[:, 0] - values[:, 1]
-    slopes = value_differences / (2.0 * np.array(steps))[:, None, None]
-    return np.moveaxis(slopes, 0, 2)
+    derivatives = value_differences / (2.0 * np.array(steps))[:, None, None]  # shape (3, n, k)
+    return np.moveaxis(derivatives, 0, 2)
 
 
 def check_forces(force: Array | float, force_range: tuple[float, float], source: str) -> None:

@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy  # scipy.interpolate is imported when it is used
-from scipy.sparse import csr_array, dia_array, diags_array, eye_array, kron, vstack
-from scipy.sparse.linalg import splu
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap, Domain, check_radius
@@ -21,6 +19,7 @@ from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.numerics.disk import lattice, onto_disk, sunflower
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
+from isocharge.simulate.numerics.spline_fit import fit_spline, spline_knots
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.sensor import Calibration
 
@@ -51,10 +50,10 @@ PRESSES_PER_CELL = 1.6
 PRESSES_PER_EDGE_CELL = 2.0
 """Number of additional fitted presses on the edge of the disk, per cell along the edge."""
 
-SMOOTHING = 5e-3
-"""Weight of the third differences of the coefficients in the fit, dimensionless.
+EDGE_RADIUS = 1.0 - 1e-12
+"""Distance from the centre at which presses on the edge of the disk are fitted, in radii of the disk.
 
-It determines the coefficients outside the disk, which few presses affect.
+It is less than 1 by more than the rounding error, so that the presses lie in the domain of the forward map.
 """
 
 EXTRA_FORCE_NODES = 2
@@ -136,6 +135,8 @@ class ChargeSpline:
         domain = map_domain if radius is None else map_domain.within(radius)
         check_radius(domain.radius, map_domain.radius, "forward map")
         spacing = spacing or min(MAX_KNOT_SPACING, RELATIVE_KNOT_SPACING * forward_map.probe.reach)
+
+        # Fit coarse splines of all charges over the disk, and a finer correction near each electrode.
         sensor = forward_map.sensor
         samples = _ScaledCharges(forward_map, _force_nodes(forward_map))
         coarse = _fit_disk(samples, domain.radius, max(spacing, COARSE_SPACING))
@@ -143,6 +144,8 @@ class ChargeSpline:
         if spacing < COARSE_SPACING:
             for electrode in range(len(sensor.electrodes)):
                 patches += _fit_patch(samples, electrode, domain.radius, spacing, coarse)
+
+        # The error is measured with the finished splines, and is unknown (NaN) until then.
         spline = cls(
             electrodes=forward_map.electrodes,
             film=sensor.film,
@@ -178,7 +181,7 @@ class ChargeSpline:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
+            Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
 
         Raises:
             SceneError: If a press lies outside the domain.
@@ -205,6 +208,8 @@ class ChargeSpline:
             Charges, shape (n, n_electrode), pC; their derivatives with respect to (x, y), shape (n, n_electrode, 2),
             pC/mm; their derivatives with respect to ln F, shape (n, n_electrode), pC.
         """
+        # Each charge is a weighted sum over the forces of the splines. Derivatives of the weights with respect to ln F
+        # are computed by central differences.
         position = onto_disk(position, self.domain.radius)
         log_force = np.log(np.broadcast_to(force, len(position)))
         weights = self.force_weights(log_force)
@@ -228,7 +233,7 @@ class ChargeSpline:
             log_force: Logarithms of the forces (N), shape (...).
 
         Returns:
-            Shape (..., n_force).
+            Weights, shape (..., n_force).
         """
         nodes = np.log(self.force)
         weights = lagrange_values(nodes, barycentric_weights(nodes), log_force.ravel())
@@ -238,17 +243,20 @@ class ChargeSpline:
     def scaled_charges(self, position: Array) -> Array:
         """Compute the scaled charges at the forces of the splines.
 
+        The splines over the disk give all charges. The patches correct the charges near the electrodes. Crosstalk is
+        added last.
+
         Args:
             position: Positions (x, y), shape (n, 2), mm.
 
         Returns:
-            Shape (n, n_force, n_electrode), pC.
+            Scaled charges, shape (n, n_force, n_electrode), pC.
         """
-        scaled = np.asarray(self.table(position))
+        scaled_charge = np.asarray(self.table(position))
         for patch in self.patches:
-            inside = patch.contains(position)
-            scaled[inside, :, patch.electrode] += patch.table(position[inside])
-        return self.calibration.read(scaled)
+            is_inside = patch.contains(position)
+            scaled_charge[is_inside, :, patch.electrode] += patch.table(position[is_inside])
+        return self.calibration.read(scaled_charge)
 
     def scaled_gradients(self, position: Array) -> Array:
         """Compute the derivatives of `scaled_charges` with respect to x and y.
@@ -257,20 +265,22 @@ class ChargeSpline:
             position: Positions (x, y), shape (n, 2), mm.
 
         Returns:
-            Shape (n, n_force, n_electrode, 2), pC/mm.
+            Derivatives, shape (n, n_force, n_electrode, 2), pC/mm.
         """
+        x_order = (1, 0)  # first derivative with respect to x, none with respect to y
+        y_order = (0, 1)
         gradients = []
-        for order in ((1, 0), (0, 1)):
+        for order in (x_order, y_order):
             slope = np.asarray(self.table(position, nu=order))
             for patch in self.patches:
-                inside = patch.contains(position)
-                slope[inside, :, patch.electrode] += patch.table(position[inside], nu=order)
+                is_inside = patch.contains(position)
+                slope[is_inside, :, patch.electrode] += patch.table(position[is_inside], nu=order)
             gradients.append(self.calibration.read(slope))
         return np.stack(gradients, axis=-1)
 
 
 def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
-    """Fit splines to a forward map, which takes a few seconds. Any other charge map is returned unchanged."""
+    """Return splines of a forward map, whose fit takes a few seconds. Any other charge map is returned unchanged."""
     if isinstance(charge_map, ForwardMap):
         return ChargeSpline.of(charge_map)
     return charge_map
@@ -296,11 +306,16 @@ def _fit_positions(cells: int) -> Array:
     Returns:
         Positions (x, y), shape (n, 2).
     """
+    # The disk has the diameter `cells`, in units of the side of a cell. A few presses are added for small numbers of
+    # cells.
     cells_in_disk = np.pi * (0.5 * cells) ** 2
     cells_along_edge = np.pi * cells
-    inner_positions = lattice(int(PRESSES_PER_CELL * cells_in_disk) + 16)
+    inner_count = int(PRESSES_PER_CELL * cells_in_disk) + 16
     edge_count = int(PRESSES_PER_EDGE_CELL * cells_along_edge) + 8
-    edge_positions = np.exp(2j * np.pi * np.arange(edge_count) / edge_count) * (1.0 - 1e-12)
+
+    # Positions are complex numbers x + iy. Those on the edge are moved inwards by more than the rounding error.
+    inner_positions = lattice(inner_count)
+    edge_positions = np.exp(2j * np.pi * np.arange(edge_count) / edge_count) * EDGE_RADIUS
     position = np.concatenate([inner_positions, edge_positions])
     return np.stack([position.real, position.imag], axis=1)
 
@@ -318,31 +333,33 @@ class _ScaledCharges:
     force: Array
 
     def at(self, position: Array, is_needed: Booleans) -> Array:
-        """Compute the scaled charges of presses.
+        """Compute the scaled charges of presses: the charges divided by the squared amplitude at their force.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
             is_needed: Whether the charge of each electrode is needed, shape (n_electrode,).
 
         Returns:
-            Shape (n, n_force, n_electrode), pC.
+            Scaled charges, shape (n, n_force, n_electrode), pC.
         """
         forward_map = self.forward_map
         film = forward_map.sensor.film
         solved_force = forward_map.family.force
-        scaled = forward_map.stress_charges_by_force(position, is_needed)
-        scaled /= amplitude_squared(film, solved_force)[:, None]
+        scaled_stress_charge = forward_map.stress_charges_by_force(position, is_needed)
+        scaled_stress_charge /= amplitude_squared(film, solved_force)[:, None]
         if forward_map.sensor.piezo.d33 == 0.0:
-            return scaled
+            return scaled_stress_charge
 
-        # Interpolate to the forces of the splines, and add the charge of the contact pressure, which is proportional to
-        # the force.
+        # Interpolate from the solved forces to the forces of the splines.
         nodes = np.log(solved_force)
         force_weights = lagrange_values(nodes, barycentric_weights(nodes), np.log(self.force))
-        pressure_charge_per_force = forward_map.pressure_charges(position)
-        scaled_force = self.force / amplitude_squared(film, self.force)
+        scaled_charge = force_weights @ scaled_stress_charge
+
+        # Add the charge of the contact pressure, which is proportional to the force.
+        pressure_charge_per_force = forward_map.pressure_charges(position)  # shape (n, n_electrode)
+        scaled_force = self.force / amplitude_squared(film, self.force)  # shape (n_force,)
         scaled_pressure_charge = pressure_charge_per_force[:, None] * scaled_force[:, None]
-        return np.asarray(force_weights @ scaled + scaled_pressure_charge)
+        return np.asarray(scaled_charge + scaled_pressure_charge)
 
 
 def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.interpolate.NdBSpline":
@@ -354,18 +371,18 @@ def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.
         spacing: Largest distance between the knots, mm.
     """
     cells = int(np.clip(np.ceil(2.0 * radius / spacing), MIN_CELLS, MAX_CELLS))
-    knots = _knots(-radius, radius, cells)
+    knots = spline_knots(-radius, radius, cells)
     position = radius * _fit_positions(cells)
     all_electrodes = np.ones(len(samples.forward_map.electrodes), dtype=bool)
     charge = samples.at(position, all_electrodes)
     # No coefficients are fixed, because the splines cover the whole disk and need not vanish at its edge.
-    return _least_squares(position, charge, (knots, knots), fixed=0)
+    return fit_spline(position, charge, (knots, knots), fixed=0)
 
 
 def _fit_patch(
     samples: _ScaledCharges, electrode: int, radius: float, spacing: float, coarse: "scipy.interpolate.NdBSpline"
 ) -> list[Patch]:
-    """Fit the correction near one electrode. If no press of the disk is near the electrode, the result is empty.
+    """Fit the difference between the charge of one electrode and the coarse splines, in a rectangle around it.
 
     Args:
         samples: Scaled charges.
@@ -375,7 +392,7 @@ def _fit_patch(
         coarse: Splines of all charges over the disk.
 
     Returns:
-        One correction, or none.
+        One correction, or none if the rectangle lies outside the disk.
     """
     # Rectangle around the electrode, outside of which its charge is smooth
     sensor = samples.forward_map.sensor
@@ -383,20 +400,22 @@ def _fit_patch(
     margin = samples.forward_map.probe.reach + PATCH_MARGIN
     lower_left = corners.min(axis=0) - margin
     upper_right = corners.max(axis=0) + margin
+
+    # Knots and fitted presses
     cells = np.clip(np.ceil((upper_right - lower_left) / spacing), MIN_CELLS, MAX_CELLS).astype(int)
     x_cells, y_cells = cells
-    x_knots = _knots(lower_left[0], upper_right[0], x_cells)
-    y_knots = _knots(lower_left[1], upper_right[1], y_cells)
+    x_knots = spline_knots(lower_left[0], upper_right[0], x_cells)
+    y_knots = spline_knots(lower_left[1], upper_right[1], y_cells)
 
     edge_count = int(PRESSES_PER_EDGE_CELL * 2.0 * np.pi * radius / spacing)
     position = _patch_positions(lower_left, upper_right, cells, radius, edge_count)
     if not len(position):
         return []
 
-    # The patch approximates the error of the coarse spline.
+    # The patch approximates the error of the coarse splines for this electrode.
     is_needed = np.arange(len(sensor.electrodes)) == electrode
     residual = (samples.at(position, is_needed) - coarse(position))[:, :, electrode]
-    table = _least_squares(position, residual, (x_knots, y_knots), fixed=2)
+    table = fit_spline(position, residual, (x_knots, y_knots), fixed=2)
     return [Patch(electrode, lower_left, upper_right, table)]
 
 
@@ -421,60 +440,9 @@ def _patch_positions(lower_left: Array, upper_right: Array, cells: Integers, rad
     is_in_disk = np.hypot(grid[:, 0], grid[:, 1]) < radius
 
     edge_angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
-    edge = radius * (1.0 - 1e-12) * np.stack([np.cos(edge_angle), np.sin(edge_angle)], axis=1)
+    edge = radius * EDGE_RADIUS * np.stack([np.cos(edge_angle), np.sin(edge_angle)], axis=1)
     is_in_rectangle = ((edge > lower_left) & (edge < upper_right)).all(axis=1)
     return np.concatenate([grid[is_in_disk], edge[is_in_rectangle]])
-
-
-def _knots(low: float, high: float, cells: int) -> Array:
-    """Return the knots of a cubic spline on an interval with equal cells, shape (cells + 7,)."""
-    return np.concatenate([[low] * 3, np.linspace(low, high, cells + 1), [high] * 3])
-
-
-def _least_squares(
-    position: Array, values: Array, knots: tuple[Array, Array], fixed: int
-) -> "scipy.interpolate.NdBSpline":
-    """Fit a cubic spline by least squares with a penalty on the third differences of its coefficients.
-
-    Args:
-        position: Positions (x, y), shape (n, 2), mm.
-        values: Values at the positions, shape (n, ...).
-        knots: Knots along x and along y.
-        fixed: Number of coefficients at each end of each axis that are zero. With two such coefficients, the spline
-            and its slopes are zero on the edges.
-
-    Returns:
-        The spline, whose values have the shape of `values` without the first axis.
-    """
-    x_count, y_count = (axis_knots.size - 4 for axis_knots in knots)  # numbers of coefficients along x and y
-
-    # Values at the positions and weighted third differences, as matrices that multiply the coefficients
-    # (`design_matrix` omits the last columns if they are zero, so the shape is given here).
-    entries = scipy.interpolate.NdBSpline.design_matrix(position, knots, 3)
-    design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(position), x_count * y_count))
-    x_differences = kron(_third_differences(x_count), eye_array(y_count))
-    y_differences = kron(eye_array(x_count), _third_differences(y_count))
-    penalty = SMOOTHING * vstack([x_differences, y_differences])
-
-    # Only the coefficients that are not fixed are unknown.
-    is_free = np.zeros((x_count, y_count), dtype=bool)
-    is_free[fixed : x_count - fixed, fixed : y_count - fixed] = True
-    free = np.flatnonzero(is_free)
-    free_design = design[:, free]
-    free_penalty = penalty.tocsc()[:, free]
-
-    # Normal equations, whose matrix is positive definite and needs no pivoting
-    normal_matrix = (free_design.T @ free_design + free_penalty.T @ free_penalty).tocsc()
-    right_side = np.ascontiguousarray(free_design.T @ values.reshape(len(position), -1))
-    factors = splu(normal_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    coefficients = np.zeros((is_free.size, right_side.shape[1]))
-    coefficients[free] = factors.solve(right_side)
-    return scipy.interpolate.NdBSpline(knots, coefficients.reshape(x_count, y_count, *values.shape[1:]), 3)
-
-
-def _third_differences(count: int) -> dia_array:
-    """Return the matrix of the third differences of neighbouring coefficients, shape (count - 3, count)."""
-    return diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))
 
 
 def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:

@@ -36,7 +36,7 @@ Points on the rim may lie outside the film because of rounding.
 def deflection_field(
     film: Film, probe: Circle, forces: tuple[float, ...] = FORCES, *, distances: int = DISTANCES
 ) -> DeflectionField:
-    """Solve the film under presses with several forces at several distances from the centre.
+    """Compute the deflection of a film on rings about presses with several forces at several distances from the centre.
 
     Args:
         film: The film.
@@ -45,19 +45,21 @@ def deflection_field(
         distances: Number of distances from 0 to `MAX_DISTANCE`, at least 2.
 
     Returns:
-        Deflections on rings about each press.
+        Deflections on rings about each press. The first ring is the centre of the probe, and the last one is the rim of
+        the film.
 
     Raises:
         SolveError: If a press has no equilibrium.
     """
     press_distances = np.linspace(0.0, MAX_DISTANCE * film.radius, distances).tolist()
-    rings = np.concatenate([[0.0], np.geomspace(0.5 * probe.radius / film.radius, 1.0, RINGS - 1)])
+    smallest_ring = 0.5 * probe.radius / film.radius
+    rings = np.concatenate([[0.0], np.geomspace(smallest_ring, 1.0, RINGS - 1)])  # radii in film radii
     deflections = np.zeros((len(forces), distances, RINGS, ANGLES))
-    for column, distance in enumerate(track(press_distances, "solving the film", distances)):
+    for distance_index, distance in enumerate(track(press_distances, "solving the film", distances)):
         equilibrium: Equilibrium | None = None
-        for row, force in enumerate(forces):  # each solve starts from the equilibrium under the previous force
+        for force_index, force in enumerate(forces):  # each solve starts from the equilibrium under the previous force
             equilibrium = press(film, probe, (distance, 0.0), force, start=equilibrium)
-            deflections[row, column] = _deflection_on_rings(equilibrium, distance, rings)
+            deflections[force_index, distance_index] = _deflection_on_rings(equilibrium, distance, rings)
     return DeflectionField(
         film=film_to_dict(film),
         probe_radius_mm=probe.radius,
@@ -81,9 +83,9 @@ def _deflection_on_rings(equilibrium: Equilibrium, distance: float, rings: Array
         Deflection, shape (n_ring, n_angle), mm. It is zero at the rim.
     """
     film_radius = equilibrium.film.radius
-    inner_rings = np.minimum(rings, INNER_RADIUS)
-    complex_points = points_mm(film_radius, equilibrium.probe.reach, distance, inner_rings, ANGLES).ravel()
-    points = np.stack([complex_points.real, complex_points.imag], axis=1)
+    rings_in_mesh = np.minimum(rings, INNER_RADIUS)  # the last ring, at the rim, is replaced below
+    complex_points = points_mm(film_radius, equilibrium.probe.reach, distance, rings_in_mesh, ANGLES).ravel()
+    points = np.stack([complex_points.real, complex_points.imag], axis=1)  # x + iy becomes (x, y), mm
     deflection_mm = deflection(equilibrium, points).reshape(len(rings), ANGLES)
-    deflection_mm[-1] = 0.0
+    deflection_mm[-1] = 0.0  # the film is clamped at the rim
     return deflection_mm

@@ -15,28 +15,34 @@ NODE_COUNTS = (6, 6)
 """Number of distances and number of forces at which the derivatives are solved."""
 
 
-def solve_derivatives(film: ForwardMap, read: Reading, executor: Executor | None) -> ForwardMap:
-    """Solve presses in the domain of a forward map. The solves of all `NODE_COUNTS` presses take about ten seconds.
+def solve_derivatives(forward_map: ForwardMap, read: Reading, executor: Executor | None) -> ForwardMap:
+    """Compute derivatives of the stress at a few presses in the domain of a forward map, and store them in a new map.
+
+    The presses are solved again with the mesh of the forward map, which takes about ten seconds.
 
     Args:
-        film: Forward map of the film, whose probe is a circle. Its mesh and its readout are used.
+        forward_map: Forward map of the film, whose probe is a circle. Its mesh and its readout are used.
         read: Function that computes the derivatives of the stress at the nodes from a solved press.
         executor: Executor that runs the solves; None for this process.
 
     Returns:
-        Map whose table contains the values that `read` computes, shape (n_distance * n_force, n_value).
+        Copy of the forward map whose table contains the derivatives that `read` computes, in place of the stress, shape
+        (n_distance * n_force, n_value).
 
     Raises:
         SolveError: If a press has no equilibrium.
     """
-    sensor = film.sensor
-    family = Family.spread(film.domain, sensor.film.radius, NODE_COUNTS, period=0.0)
-    theory = replace(film.theory, stretching=True)  # the tangent of the equilibrium requires it
-    settings = SolveSettings(theory=theory, resolution=film.resolution, layer=film.layer)
+    sensor = forward_map.sensor
+    film = sensor.film
+    family = Family.spread(forward_map.domain, film.radius, NODE_COUNTS, period=0.0)  # a circle has no orientation
+    theory = replace(forward_map.theory, stretching=True)  # the tangent of the equilibrium requires it
+    settings = SolveSettings(theory=theory, resolution=forward_map.resolution, layer=forward_map.layer)
+
+    # At each distance, the presses with all forces are solved one after the other.
     chains = [
-        Chain(sensor.film, film.probe, distance, family.force, sensor.surface, settings, read)
+        Chain(film, forward_map.probe, distance, family.force, sensor.surface, settings, read)
         for distance in family.distance.tolist()
     ]
-    rows = solve_chains(chains, executor)
-    table = rows.reshape(-1, rows.shape[-1])
-    return replace(film, family=family, theory=theory, table=table)
+    derivatives = solve_chains(chains, executor)  # shape (n_distance, n_force, n_value)
+    table = derivatives.reshape(-1, derivatives.shape[-1])
+    return replace(forward_map, family=family, theory=theory, table=table)

@@ -105,10 +105,11 @@ class Family:
         largest_coordinate = float(distance_coordinate(domain.radius / film_radius))
         distance = film_radius * np.tanh(chebyshev_nodes(n_distance, 0.0, largest_coordinate))
 
-        min_log, max_log = np.log(domain.force_range)
-        force = np.array([domain.force_range[0]])
-        if max_log > min_log:
-            force = np.exp(chebyshev_nodes(n_force, min_log, max_log))
+        min_log_force, max_log_force = np.log(domain.force_range)
+        if max_log_force > min_log_force:
+            force = np.exp(chebyshev_nodes(n_force, min_log_force, max_log_force))
+        else:
+            force = np.array([domain.force_range[0]])
 
         # The rotations cover a full turn, with the same number of rotations in each period of the probe.
         symmetry_order = 1
@@ -127,13 +128,17 @@ class Family:
     def weights(self, distance: Array, force: Array, rotation: Array) -> Array:
         """Compute the weights of the nodes for the interpolation to presses.
 
+        The interpolation is polynomial in the distance coordinate and in the logarithm of the force (Lagrange), and
+        trigonometric in the rotation.
+
         Args:
             distance: Distances from the centre, shape (n,), mm.
             force: Forces, shape (n,), N.
             rotation: Rotations of the probe relative to the direction of the press, shape (n,), rad.
 
         Returns:
-            Shape (n, n_distance * n_force * n_rotation).
+            Weights, shape (n, n_distance * n_force * n_rotation). An interpolated value is the sum of the values at the
+            nodes, multiplied by these weights.
         """
         distance_nodes = distance_coordinate(self.distance / self.film_radius)
         press_coordinates = distance_coordinate(distance / self.film_radius)
@@ -142,27 +147,33 @@ class Family:
         force_weights = lagrange_values(force_nodes, barycentric_weights(force_nodes), np.log(force))
         rotation_weights = self._rotation_weights(rotation)
 
-        # The weight of a node is the product of its weights along the three axes.
-        products = distance_weights[:, :, None, None] * force_weights[:, None, :, None]
-        products = products * rotation_weights[:, None, None, :]
-        return np.asarray(products.reshape(distance.size, -1))
+        # The weight of a node is the product of its weights along the axes (distance, force, rotation).
+        distance_force_weights = distance_weights[:, :, None, None] * force_weights[:, None, :, None]
+        node_weights = distance_force_weights * rotation_weights[:, None, None, :]
+        return np.asarray(node_weights.reshape(distance.size, -1))
 
     def _rotation_weights(self, rotation: Array) -> Array:
-        """Compute the weights of the nodes for trigonometric interpolation (Dirichlet kernels).
+        """Compute the weights of the rotation nodes for trigonometric interpolation.
+
+        With N evenly spaced nodes, the weight of a node at the angular distance t is the Dirichlet kernel
+
+            (1 + 2 cos(t) + 2 cos(2 t) + ...) / N
+
+        with all harmonics up to N / 2. If N is even, the highest harmonic has the amplitude 1 in place of 2, because
+        its sine is zero at all nodes.
 
         Args:
-            rotation: Rotations of the presses, shape (n,), rad.
+            rotation: Rotations of the probe relative to the direction of the press, shape (n,), rad.
 
         Returns:
-            Shape (n, n_rotation).
+            Weights, shape (n, n_rotation). The weights of each press sum to 1.
         """
         n_rotation = self.rotation.size
         harmonics = np.arange(1, n_rotation // 2 + 1)
-
-        # With an even number of nodes, the sine of the highest harmonic is zero at all nodes.
-        factor = np.where(2 * harmonics == n_rotation, 1.0, 2.0)
-        phase = (rotation[:, None] - self.rotation)[..., None] * harmonics  # shape (n, n_rotation, n_harmonic)
-        return np.asarray((1.0 + np.cos(phase) @ factor) / n_rotation)
+        amplitudes = np.where(2 * harmonics == n_rotation, 1.0, 2.0)
+        angle_from_node = rotation[:, None] - self.rotation  # shape (n, n_rotation)
+        phase = angle_from_node[..., None] * harmonics  # shape (n, n_rotation, n_harmonic)
+        return np.asarray((1.0 + np.cos(phase) @ amplitudes) / n_rotation)
 
     def solve(self, sensor: Sensor, probe: Probe, settings: SolveSettings, executor: Executor | None) -> Array:
         """Solve the presses of the family.
@@ -188,8 +199,9 @@ class Family:
     def unfold(self, solved: Array, mesh: Template) -> Array:
         """Compute the stress of all orientations from that of the solved orientations, by the symmetry of the probe.
 
-        If a probe is rotated by one of its periods, the press is the same, but the mesh is rotated. The stress of each
-        further period is therefore that of the solved period, after a rotation of the elements and of the components.
+        If a probe is rotated by one of its periods, the press remains the same. The mesh, however, is rotated. The
+        stress of each further period is therefore that of the solved period, after a rotation of the elements and of
+        the components.
 
         Args:
             solved: Scaled stress in a frame that rotates with the probe, shape
@@ -197,17 +209,20 @@ class Family:
             mesh: Template of the mesh.
 
         Returns:
-            Shape (n_distance * n_force * n_rotation, n_element * n_local * 3), in the order of `weights`.
+            Scaled stress, shape (n_distance * n_force * n_rotation, n_element * n_local * 3), in the order of
+            `weights`.
         """
-        n_distance, n_rotation, n_force, _ = solved.shape
+        # The order of the axes becomes (distance, force, rotation), as in `weights`.
+        n_distance, n_rotation, n_force, n_value = solved.shape
         solved_period = np.moveaxis(solved, 1, 2).reshape(n_distance, n_force, n_rotation, mesh.n_element, -1, 3)
-        periods = []
+        stress_of_periods = []
         for period_index in range(self.symmetry_order):
-            rotated_elements = mesh.rotated(period_index, self.symmetry_order)
             angle = 2.0 * np.pi * period_index / self.symmetry_order
-            stress_of_elements = solved_period[..., rotated_elements, :, :]
-            periods.append(rotate_stress(stress_of_elements, -angle))
-        return np.asarray(np.concatenate(periods, axis=2).reshape(-1, solved.shape[-1]))
+            rotated_elements = mesh.rotated(period_index, self.symmetry_order)
+            reordered_stress = solved_period[..., rotated_elements, :, :]
+            stress_of_periods.append(rotate_stress(reordered_stress, -angle))
+        all_rotations = np.concatenate(stress_of_periods, axis=2)
+        return np.asarray(all_rotations.reshape(-1, n_value))
 
 
 class CheckPress(NamedTuple):
@@ -234,6 +249,8 @@ class CheckPress(NamedTuple):
 def check_presses(domain: Domain, count: int) -> list[CheckPress]:
     """Return presses that cover the distances and forces of a domain. The last press lies at the largest distance.
 
+    The square roots of Chebyshev nodes are used as distances, so that the presses cover the area of the disk.
+
     Args:
         domain: Presses that a family covers.
         count: Number of presses.
@@ -247,17 +264,21 @@ def check_presses(domain: Domain, count: int) -> list[CheckPress]:
         force = np.clip(np.exp(min_log + (max_log - min_log) * log_force_fraction), *domain.force_range)
         distance = float(domain.radius * relative_distance)
         # The golden angle (2.4 rad) distributes the directions evenly. The rotation changes by another angle.
-        presses.append(CheckPress(distance, angle=2.4 * index, force=float(force), rotation=0.7 * index))
+        angle = 2.4 * index
+        rotation = 0.7 * index
+        presses.append(CheckPress(distance, angle=angle, force=float(force), rotation=rotation))
     return presses
 
 
 def check_family(film: Film, probe: Probe, domain: Domain) -> None:
-    """Raise an error if some presses of a domain cannot exist.
+    """Raise an error if a forward map cannot cover a domain.
+
+    If the outermost press with the largest force can exist, all other presses of the domain can exist, too.
 
     Args:
         film: The film.
         probe: The probe.
-        domain: The presses.
+        domain: Largest distance of a press from the centre, and range of forces.
 
     Raises:
         SceneError: If the radius or the forces are not positive numbers, if the film is not axisymmetric, or if the
@@ -356,27 +377,28 @@ def solve_films(
     Returns:
         Values that `read` computes, shape (*grid.shape, n_value).
     """
+    # The values of the grid are dimensionless; see `FilmGrid`. Each chain begins with the largest force.
     radius = film.radius
     chains = []
     for distance, tension, thickness, reach in product(grid.distance, grid.tension, grid.thickness, grid.reach):
         grid_film = replace(film, pretension=float(tension) * film.young, thickness=float(thickness) * radius)
-        forces = grid.load[::-1] * film.young * grid_film.thickness * radius  # begins with the largest force
+        descending_forces = grid.load[::-1] * film.young * grid_film.thickness * radius
         probe = Circle(float(reach) * radius)
-        chains.append(Chain(grid_film, probe, float(distance) * radius, forces, surface, settings, read))
-    ascending_load = solve_chains(chains, executor)[:, ::-1]
+        chains.append(Chain(grid_film, probe, float(distance) * radius, descending_forces, surface, settings, read))
+    values = solve_chains(chains, executor)[:, ::-1]  # the load ascends along the second axis
 
-    # The order of the solves is (distance, tension, thickness, reach, load); the load becomes the second axis.
+    # The order of the solves is (distance, tension, thickness, reach, load). In the grid, the load is the second axis.
     n_distance, n_load, n_tension, n_thickness, n_reach = grid.shape
-    load_last = ascending_load.reshape(n_distance, n_tension, n_thickness, n_reach, n_load, -1)
+    load_last = values.reshape(n_distance, n_tension, n_thickness, n_reach, n_load, -1)
     return np.moveaxis(load_last, 4, 1)
 
 
 def _solve_chain(chain: Chain) -> Array:
-    """Solve one chain, and return the values that `Chain.read` computes, shape (n_force, n_value)."""
-    equilibrium: Equilibrium | None = None
+    """Solve the presses of one chain, and return the values that `Chain.read` computes, shape (n_force, n_value)."""
+    position = (chain.distance, 0.0)
     values_of_forces = []
-    for force in chain.forces.tolist():
-        position = (chain.distance, 0.0)
+    equilibrium: Equilibrium | None = None
+    for force in chain.forces.tolist():  # each solve starts from the equilibrium under the previous force
         equilibrium = press(chain.film, chain.probe, position, force, chain.settings, start=equilibrium)
         values = chain.read(equilibrium, chain.surface)
         values_of_forces.append(values.ravel())

@@ -129,15 +129,19 @@ class FilmFamily:
         check_family(prior.sensor.coated_film, largest_probe, domain)
 
         # All solves have the mesh that the smallest probe needs.
-        middle_force = float(np.sqrt(force_range[0] * force_range[1]))
+        min_force, max_force = force_range
+        middle_force = float(np.sqrt(min_force * max_force))
         layer = layer_for(film, middle_force)
         settings = SolveSettings(theory=THEORY, layer=layer)
         resolution = needed_resolution(film, smallest_probe, (radius, 0.0), middle_force, settings)
         settings = replace(settings, resolution=resolution)
 
+        # Solve the presses of the grid, and decompose their stresses into modes.
         grid = FilmGrid.spread(limits, counts)
         stress = solve_films(film, surface, grid, settings, executor)
         coefficients, modes = decompose(stress, MAX_TRUNCATION_ERROR)
+
+        # The error is measured with the finished family, and is unknown (NaN) until then.
         family = cls(film.poisson, surface, limits, grid, resolution, layer, coefficients, modes, error=np.nan)
         error = _check_against_solves(family, prior, domain)
         if error > MAX_FAMILY_ERROR:
@@ -161,17 +165,17 @@ class FilmFamily:
             SceneError: If the film or the probe does not belong to the family.
         """
         film = sensor.film
-        film_numbers = {
+        film_parameters = {  # dimensionless coordinates of the film and its probe; see `AXES`
             "tension": film.pretension / film.young,
             "thickness": film.thickness / film.radius,
             "reach": probe.radius / film.radius,
         }
-        self._check_inside(sensor.coated_film, sensor.surface, film_numbers)
+        self._check_inside(sensor.coated_film, sensor.surface, film_parameters)
 
-        # The weight of each film of the grid is the product of its weights along the three axes.
-        tension_weights = self.grid.weights("tension", film_numbers["tension"])
-        thickness_weights = self.grid.weights("thickness", film_numbers["thickness"])
-        reach_weights = self.grid.weights("reach", film_numbers["reach"])
+        # The weight of each film of the grid is the product of its weights along the axes (tension, thickness, reach).
+        tension_weights = self.grid.weights("tension", film_parameters["tension"])
+        thickness_weights = self.grid.weights("thickness", film_parameters["thickness"])
+        reach_weights = self.grid.weights("reach", film_parameters["reach"])
         film_weights = np.einsum("t,h,r->thr", tension_weights, thickness_weights, reach_weights).ravel()
 
         # Sum over the films of the grid, separately for each press and each mode
@@ -180,6 +184,7 @@ class FilmFamily:
         press_coefficients = film_weights @ coefficients  # shape (n_distance * n_load, n_mode)
         table = press_coefficients @ self.modes
 
+        # Convert the dimensionless distances and loads of the grid into those of this film.
         force_unit = film.young * film.thickness * film.radius
         min_load, max_load = self.limits["load"]
         _, largest_distance = self.limits["distance"]
@@ -215,9 +220,10 @@ class FilmFamily:
             The values by their names. The coefficients and modes are rounded to integers. The value of "mode_scale" is
             the product of the scales of both, shape (n_mode, 1).
         """
-        bits = bits_of(self.coefficients, self.modes, MAX_BITS, EXTRA_BITS)
-        all_axes_but_mode = (0, 1, 2, 3, 4)
-        coefficients, coefficient_scale = quantised(self.coefficients, all_axes_but_mode, bits)
+        # All coefficients of a mode have one scale, and all values of a mode have one scale.
+        bits = bits_of(self.coefficients, self.modes, MAX_BITS, EXTRA_BITS)  # shape (n_mode,)
+        axes_of_grid = tuple(range(len(AXES)))
+        coefficients, coefficient_scale = quantised(self.coefficients, axes_of_grid, bits)
         modes, mode_scale = quantised(self.modes, 1, bits[:, None])
         imperfections = {} if self.imperfections is None else self.imperfections.to_arrays()
         return {
@@ -257,8 +263,9 @@ class FilmFamily:
                 axis: (float(smallest), float(largest))
                 for axis, (smallest, largest) in zip(AXES, arrays["limits"], strict=True)
             }
-            first_nodes = np.cumsum(arrays["grid_shape"])[:-1]  # of all axes but the first
-            axis_nodes = np.split(np.asarray(arrays["grid"], dtype=float), first_nodes)
+            # The nodes of all axes are stored in one array, one axis after the other.
+            axis_starts = np.cumsum(arrays["grid_shape"])[:-1]  # without the first axis, which starts at 0
+            axis_nodes = np.split(np.asarray(arrays["grid"], dtype=float), axis_starts)
             modes = arrays["modes"] * np.asarray(arrays["mode_scale"], dtype=float)
             imperfections = {
                 name.removeprefix(IMPERFECTION_PREFIX): array
@@ -280,13 +287,13 @@ class FilmFamily:
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise InputError(f"film family: expected the arrays that to_arrays gives ({error})") from error
 
-    def _check_inside(self, film: Film, surface: Surface, film_numbers: dict[str, float]) -> None:
+    def _check_inside(self, film: Film, surface: Surface, film_parameters: dict[str, float]) -> None:
         """Raise an error if a film does not belong to the family.
 
         Args:
             film: The film.
             surface: Surface in the thickness at which the stress is read.
-            film_numbers: Values of the film and its probe along the axes "tension", "thickness" and "reach".
+            film_parameters: Values of the film and its probe along the axes "tension", "thickness" and "reach".
 
         Raises:
             SceneError: If the film does not belong to the family.
@@ -299,8 +306,9 @@ class FilmFamily:
         if not film.is_axisymmetric:
             raise SceneError(f"film: expected an axisymmetric film, got {film.asymmetries}; use modes for these")
         _check_back(film)
-        for name, value in film_numbers.items():
+        for name, value in film_parameters.items():
             smallest, largest = self.limits[name]
+            # The absolute tolerance of 1e-15 is for limits of zero.
             is_above_smallest = value >= smallest * (1.0 - LIMIT_TOLERANCE) - 1e-15
             is_below_largest = value <= largest * (1.0 + LIMIT_TOLERANCE)
             if not (is_above_smallest and is_below_largest):
@@ -322,12 +330,16 @@ def _check_shapes(arrays: Mapping[str, Any]) -> None:
     grid_shape = tuple(int(count) for count in arrays["grid_shape"])
     coefficients = arrays["coefficients"]
     modes = arrays["modes"]
-    has_scales = arrays["mode_scale"].shape == (len(modes), 1)
-    has_coefficients = coefficients.shape == (*grid_shape, len(modes))
-    if not (has_coefficients and has_scales and len(grid_shape) == len(AXES)):
+    n_mode = len(modes)
+    grid_fits = len(grid_shape) == len(AXES)
+    coefficients_fit = coefficients.shape == (*grid_shape, n_mode)
+    scales_fit = arrays["mode_scale"].shape == (n_mode, 1)
+    if not (grid_fits and coefficients_fit and scales_fit):
         raise ValueError(f"coefficients {coefficients.shape} and modes {modes.shape} do not fit {grid_shape}")
-    counts = len(arrays["limits"]), arrays["grid"].size, arrays["resolution"].size
-    if counts != (len(AXES), sum(grid_shape), len(fields(Resolution))):
+
+    counts = (len(arrays["limits"]), arrays["grid"].size, arrays["resolution"].size)
+    expected_counts = (len(AXES), sum(grid_shape), len(fields(Resolution)))
+    if counts != expected_counts:
         raise ValueError(f"limits, grid and resolution have {counts} numbers")
 
 
@@ -350,7 +362,7 @@ def _check_back(film: Film) -> None:
 def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) -> float:
     """Compute the largest relative error of the interpolated charges of presses on random films.
 
-    The charges are compared with those of direct solves.
+    One random press on each of `CHECK_COUNT` random films is also solved directly.
 
     Args:
         family: The family, from which the charges are interpolated.
@@ -358,14 +370,15 @@ def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) 
         domain: Presses on the films.
 
     Returns:
-        The largest error of one press on each of `CHECK_COUNT` films.
+        The largest of the errors; see `ForwardMap.relative_error`.
     """
     rng = np.random.default_rng(0)
     min_force, max_force = domain.force_range
     errors = []
     for index, parameters in enumerate(prior.draw(rng, CHECK_COUNT)):
         forward_map = family.forward_map(*prior.film(parameters))
-        # The positions cover the disk evenly, and the forces are uniform in the logarithm.
+        # The square root and the golden angle (2.4 rad) distribute the positions evenly over the disk. The forces are
+        # uniform in the logarithm.
         distance = domain.radius * np.sqrt((index + 1.0) / CHECK_COUNT)
         angle = 2.4 * index
         force = float(min_force * (max_force / min_force) ** rng.random())
@@ -390,7 +403,8 @@ def _limits_of(prior: FilmPrior, domain: Domain) -> FilmLimits:
     largest = dict(zip(prior.names, upper_bounds.tolist(), strict=True))
     film = prior.sensor.film
 
-    # The parameters "young" and "thickness" are logarithms of factors, and "probe_radius" is a difference in mm.
+    # In the prior, the parameters "young" and "thickness" are logarithms of factors, and "probe_radius" is a difference
+    # in mm. Young's modulus appears in two axes.
     min_thickness = film.thickness * np.exp(smallest["thickness"])
     max_thickness = film.thickness * np.exp(largest["thickness"])
     min_young = film.young * np.exp(smallest["young"])

@@ -51,7 +51,8 @@ class FilmGrid:
     def spread(cls, limits: FilmLimits, counts: Sequence[int]) -> "FilmGrid":
         """Distribute Chebyshev nodes between limits.
 
-        The Chebyshev nodes of each axis lie in the coordinate that `_interpolation_coordinate` returns.
+        On each axis, the coordinate of `_interpolation_coordinate` has Chebyshev nodes between those of the limits.
+        These nodes are converted back into values of the axis.
 
         Args:
             limits: Smallest and largest value along each axis.
@@ -86,9 +87,9 @@ class FilmGrid:
 def _interpolation_coordinate(axis: str, value: Array | float) -> Any:
     """Return the coordinate in which the stress is interpolated along an axis.
 
-    For the load and the reach, the coordinate is the logarithm of the value. For the tension, it is the logarithm of
-    the sum of the tension and `SOFTENING`. For the distance, it is `distance_coordinate`. The thickness is its own
-    coordinate.
+    For the load and the reach, the coordinate is the logarithm of the value. For the tension, the coordinate is the
+    logarithm of the sum of the tension and `SOFTENING`. For the distance, the coordinate is `distance_coordinate`. The
+    thickness is its own coordinate.
 
     Args:
         axis: One of `AXES`.
@@ -131,7 +132,7 @@ def bits_of(coefficients: Array, modes: Array, max_bits: int, extra_bits: float)
         extra_bits: Number of bits that each mode gets in addition, because the errors of many modes add up.
 
     Returns:
-        Shape (n_mode,).
+        Numbers of bits, shape (n_mode,).
     """
     largest_coefficient = np.abs(coefficients).reshape(-1, len(modes)).max(axis=0)
     largest_contribution = largest_coefficient * np.abs(modes).max(axis=1)
@@ -155,10 +156,11 @@ def quantised(values: Array, axis: int | tuple[int, ...], bits: Array | int) -> 
 
 
 def decompose(stress: Array, max_error: float) -> tuple[Array, Array]:
-    """Compute a low-rank decomposition of stresses (proper orthogonal decomposition).
+    """Compute a low-rank decomposition of stresses (proper orthogonal decomposition, Sirovich 1987).
 
-    The stress at each node is scaled by its root mean square. Otherwise the large stress under the probe would dominate
-    the stress at the electrodes.
+    Each stress becomes a weighted sum of a few modes: stress = coefficients @ modes. The stress at each node is first
+    divided by its root mean square. Otherwise the large stress under the probe would dominate the stress at the
+    electrodes.
 
     Args:
         stress: Scaled stresses of all presses, shape (..., n).
@@ -174,7 +176,8 @@ def decompose(stress: Array, max_error: float) -> tuple[Array, Array]:
     rms_of_values = np.repeat(rms_of_nodes, 3)  # a node has three components of the stress
     relative_stress = stress_of_presses / rms_of_values
 
-    # Singular value decomposition of the relative stress by the eigenvectors of its smaller Gram matrix
+    # Singular value decomposition of the relative stress by the eigenvectors of a Gram matrix. Of the two Gram
+    # matrices, of shape (n_press, n_press) and (n_value, n_value), the smaller one is used.
     has_fewer_presses = n_press < n_value
     vectors = relative_stress if has_fewer_presses else relative_stress.T
     gram_matrix = vectors @ vectors.T
@@ -182,11 +185,17 @@ def decompose(stress: Array, max_error: float) -> tuple[Array, Array]:
     eigenvalues = np.maximum(ascending_eigenvalues[::-1], 0.0)
     eigenvectors = ascending_eigenvectors[:, ::-1].T  # one eigenvector in each row
 
-    # The error of a truncation follows from the sum of the omitted eigenvalues.
+    # The error of a truncation follows from the sum of the omitted eigenvalues. Take the first number of modes with a
+    # sufficiently small error.
     relative_error = np.sqrt(np.maximum(1.0 - np.cumsum(eigenvalues) / eigenvalues.sum(), 0.0))
     n_mode = int(np.argmax(relative_error <= max_error)) + 1
-    modes = eigenvectors[:n_mode]
-    if has_fewer_presses:  # the eigenvectors are left singular vectors, from which the right ones are computed
-        modes = modes @ relative_stress / np.sqrt(eigenvalues[:n_mode, None])
+
+    # The modes are the right singular vectors.
+    if has_fewer_presses:
+        left_vectors = eigenvectors[:n_mode]
+        singular_values = np.sqrt(eigenvalues[:n_mode, None])
+        modes = left_vectors @ relative_stress / singular_values
+    else:
+        modes = eigenvectors[:n_mode]
     coefficients = relative_stress @ modes.T
     return coefficients.reshape(*stress.shape[:-1], n_mode), modes * rms_of_values

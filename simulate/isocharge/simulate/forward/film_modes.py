@@ -111,7 +111,7 @@ def _poisson_charges(press: PressedFilm) -> Array:
 
 
 def _shear_charges(press: PressedFilm) -> Array:
-    """Return the charges of a sensor that responds to the shear stress only, shape (n, n_electrode), pC per pC/N."""
+    """Return the charges that the shear stress causes per unit of d12, shape (n, n_electrode), pC per pC/N."""
     shear_sensor = replace(press.film.sensor, piezo=Piezo(0.0, 0.0, d12=1.0))
     return np.asarray(replace(press.film, sensor=shear_sensor).field_charges(press.contact, EVEN_FIELD)[..., 0])
 
@@ -221,7 +221,7 @@ class ModeMap:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
 
         Returns:
-            Shape (n, n_electrode, n_mode), pC per unit of the mode.
+            Derivatives, shape (n, n_electrode, n_mode), pC per unit of the mode.
 
         Raises:
             SceneError: If a press lies outside the domain.
@@ -232,15 +232,24 @@ class ModeMap:
         return np.stack([MODES[name].charges(press) for name in self.names], axis=2)
 
     def _field_charges(self, contact: Array) -> dict[str, tuple[Array, ...]]:
-        """Return the charges of the fields by kind of imperfection; see `PressedFilm.fields`."""
+        """Compute the charges of the stress fields, grouped by the kind of imperfection.
+
+        Args:
+            contact: Presses (x, y, F) in the domain of the map, shape (n, 3), mm and N.
+
+        Returns:
+            For each kind of imperfection, the charges of its fields, each of shape (n, n_electrode); see
+            `PressedFilm.fields`.
+        """
         if self.fields is None:
             return {}
         is_odd = IS_ODD[list(self.field_numbers)]
         charges = self.fields.field_charges(contact, is_odd)  # shape (n, n_electrode, n_field)
         charges_of_kind: dict[str, tuple[Array, ...]] = {}
-        for column, field_number in enumerate(self.field_numbers):
+        for field_index, field_number in enumerate(self.field_numbers):
             kind = KINDS[field_number]
-            charges_of_kind[kind] = (*charges_of_kind.get(kind, ()), charges[..., column])
+            previous_charges = charges_of_kind.get(kind, ())
+            charges_of_kind[kind] = (*previous_charges, charges[..., field_index])
         return charges_of_kind
 
 
@@ -312,57 +321,59 @@ class FilmModes:
         unknown = sorted(set(names) - set(MODES))
         if unknown:
             raise SceneError(f"modes: expected some of {', '.join(MODES)}, got {', '.join(unknown)}")
-        kinds = {MODES[name].field for name in names}
-        field_numbers = tuple(number for number, kind in enumerate(KINDS) if kind in kinds)
+        needed_kinds = {MODES[name].field for name in names}
+        field_numbers = tuple(number for number, kind in enumerate(KINDS) if kind in needed_kinds)
         fields = self._field_map(film, field_numbers) if field_numbers else None
         return ModeMap(tuple(names), film, fields, field_numbers)
 
-    def _field_map(self, film: ForwardMap, field_numbers: tuple[int, ...]) -> ForwardMap:
-        """Return a forward map whose table contains stress fields of one film.
+    def _field_map(self, forward_map: ForwardMap, field_numbers: tuple[int, ...]) -> ForwardMap:
+        """Return a copy of a forward map whose table contains some of the stress fields in place of the stress.
 
         Args:
-            film: Forward map of the film.
+            forward_map: Forward map of the film.
             field_numbers: Numbers of the fields, in the order of `FIELDS`.
 
         Returns:
             The map. Its table contains the values of all fields at one node, then those at the next node.
         """
-        properties = film.sensor.film
-        tension_weights = self.grid.weights("tension", properties.pretension / properties.young)
+        film = forward_map.sensor.film
+        tension_weights = self.grid.weights("tension", film.pretension / film.young)
         # Weighted sum over the tensions t, for each distance d, load l and component m of the decomposition. The axes
         # of the thickness and the reach have one node each.
         press_coefficients = np.einsum("t,dltm->dlm", tension_weights, self.coefficients[:, :, :, 0, 0])
 
+        # Select the fields, and order their values by node: (component, element, local node, field, stress component).
         n_component = len(self.parts)
-        mesh = template_for(film.probe, film.resolution)
+        mesh = template_for(forward_map.probe, forward_map.resolution)
         all_fields = self.parts.reshape(n_component, IS_ODD.size, mesh.n_element, -1, 3)
         fields = all_fields[:, list(field_numbers)]
         node_values = np.moveaxis(fields, 1, 3).reshape(n_component, -1)
         table = press_coefficients.reshape(-1, n_component) @ node_values
 
-        force_unit = properties.young * properties.thickness * properties.radius
+        # Convert the dimensionless distances, loads and probe radius of the grid into those of this film.
+        force_unit = film.young * film.thickness * film.radius
         family = Family(
-            domain=Domain(film.domain.radius, film.domain.force_range),
-            film_radius=properties.radius,
-            distance=self.grid.distance * properties.radius,
+            domain=Domain(forward_map.domain.radius, forward_map.domain.force_range),
+            film_radius=film.radius,
+            distance=self.grid.distance * film.radius,
             force=self.grid.load * force_unit,
             rotation=np.zeros(1),
             symmetry_order=1,
         )
-        probe = Circle(float(self.grid.reach[0]) * properties.radius)
-        return replace(film, probe=probe, family=family, table=table)
+        probe = Circle(float(self.grid.reach[0]) * film.radius)
+        return replace(forward_map, probe=probe, family=family, table=table)
 
     def to_arrays(self) -> dict[str, Any]:
         """Return the decomposition as arrays for a file. Coefficients and components are rounded to a few bits."""
-        all_axes_but_mode = (0, 1, 2, 3, 4)
-        coefficients, coefficient_scale = quantised(self.coefficients, all_axes_but_mode, SCALE_BITS)
+        axes_of_grid = tuple(range(len(AXES)))
+        coefficients, coefficient_scale = quantised(self.coefficients, axes_of_grid, SCALE_BITS)
 
-        # The components are divided by the size of the stress at each node, rounded to a power of two, which compresses
-        # well.
+        # The components are divided by the size of the stress at each node. This size is rounded to a power of two,
+        # which compresses well. The smallest positive number is added, because the size may be zero.
         n_component = len(self.parts)
         node_stress = self.parts.reshape(n_component, -1, 3)
         exact_node_size = np.sqrt((node_stress**2).sum(axis=(0, 2), keepdims=True)) + np.finfo(np.float32).tiny
-        node_size = np.float32(np.exp2(np.round(np.log2(exact_node_size))))
+        node_size = np.float32(np.exp2(np.round(np.log2(exact_node_size))))  # shape (1, n_node, 1)
         relative_parts = (node_stress / node_size).reshape(n_component, -1)
         bits = bits_of(self.coefficients, relative_parts, MAX_BITS, EXTRA_BITS)
         parts, part_scale = quantised(relative_parts, 1, bits[:, None])
@@ -401,8 +412,9 @@ class FilmModes:
             node_size = np.asarray(arrays["node_size"], dtype=float)
             if 3 * node_size.size != parts.shape[1]:
                 raise ValueError(f"{node_size.size} node sizes do not match {parts.shape[1]} values of a part")
-            axis_ends = np.cumsum(shape)[:-1]
-            grid = FilmGrid(*np.split(np.asarray(arrays["grid"], dtype=float), axis_ends))
+            # The nodes of all axes are stored in one array, one axis after the other.
+            axis_starts = np.cumsum(shape)[:-1]  # without the first axis, which starts at 0
+            grid = FilmGrid(*np.split(np.asarray(arrays["grid"], dtype=float), axis_starts))
             value_size = np.repeat(node_size, 3)  # each node has three components of the stress
             return cls(grid, coefficients.astype(float), parts * np.asarray(scale, dtype=float) * value_size)
         except (KeyError, ValueError, TypeError, AttributeError, IndexError) as error:

@@ -1,12 +1,12 @@
 """The forward map: the charges of many presses, computed from a few solves.
 
-The presses of one probe form a family. Its coordinates are the distance from the centre and the force. If the probe is
-not axisymmetric, the orientation is a third coordinate. Presses in other directions from the centre are obtained by a
-rotation of the film. In a frame that moves with the probe, the stress at the nodes of the mesh is a smooth function of
-the coordinates. The press is solved at Chebyshev nodes in the distance and in the logarithm of the force, and at evenly
-spaced orientations. For every other press, the stress field is interpolated, and the charges are integrated from the
-interpolated field. The electrodes therefore do not affect the interpolation, even if the probe lies on an electrode.
-When a map is built, its charges are compared with those of direct solves.
+The presses of one probe form a family. The coordinates of the family are the distance from the centre and the force. If
+the probe is not axisymmetric, the orientation is a third coordinate. Presses in other directions from the centre are
+obtained by a rotation of the film. In a frame that moves with the probe, the stress at the nodes of the mesh is a
+smooth function of the coordinates. The press is solved at Chebyshev nodes in the distance and in the logarithm of the
+force, and at evenly spaced orientations. For every other press, the stress field is interpolated, and the charges are
+integrated from the interpolated field. The electrodes therefore do not affect the interpolation, even if the probe lies
+on an electrode. When a map is built, its charges are compared with those of direct solves.
 """
 
 from concurrent.futures import Executor
@@ -31,6 +31,8 @@ from isocharge.simulate.forward.readout import (
     NEAR,
     ReadoutPoints,
     contact_charge,
+    electrode_distances,
+    electrode_gaps,
     touch_charge,
 )
 from isocharge.simulate.mechanics.scaling import amplitude_squared
@@ -140,7 +142,8 @@ class ForwardMap:
         layer = min(layer, widest_smooth_layer(template, probe, radius, film.radius))
         settings = replace(settings, resolution=resolution, layer=layer)
 
-        # Increase the number of nodes until the charges of the check presses are sufficiently accurate.
+        # Increase the number of nodes until the charges of the check presses are sufficiently accurate. The check
+        # presses are solved once, when the first map exists.
         checks = check_presses(domain, CHECK_COUNT)
         check_charges: list[Array] = []
         error = np.inf
@@ -171,7 +174,7 @@ class ForwardMap:
 
     @property
     def settings(self) -> SolveSettings:
-        """Theory and mesh of the solves. With these settings, a single press or another map can be solved.
+        """Theory and mesh of the solves. A single press or another map can be solved with these settings.
 
         The width of the thin rings remains "auto".
         """
@@ -201,10 +204,13 @@ class ForwardMap:
             SceneError: If a press lies outside the domain.
         """
         contact = as_contacts(contact, "forward map")
+
+        # Contacts without a force may lie anywhere. In the check, a valid contact replaces them.
         has_no_force = contact[:, 2] == 0.0
         min_force, _ = self.domain.force_range
-        valid_contact = (0.0, 0.0, min_force)  # replaces contacts without a force in the check
+        valid_contact = (0.0, 0.0, min_force)
         self.domain.check(np.where(has_no_force[:, None], valid_contact, contact), "forward map")
+
         orientation = np.broadcast_to(orientation, len(contact))
         charge = np.zeros((len(contact), len(self.electrodes)))
         pressed = np.flatnonzero(~has_no_force)
@@ -214,35 +220,42 @@ class ForwardMap:
     def derivatives(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F by central differences.
 
-        The differences also use presses that lie slightly outside the domain.
+        The probe keeps its described orientation. For presses at the edge of the domain, the differences also use
+        presses slightly outside.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
+            Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
 
         Raises:
             SceneError: If a press lies outside the domain.
         """
         contact = self.domain.check(contact, "forward map")
-        return differences(lambda moved: self._unchecked_charges(moved, np.zeros(len(moved))), contact)
+
+        def charges_without_rotation(moved_contact: Array) -> Array:
+            """Compute the charges of presses whose probe has no further rotation."""
+            no_rotation = np.zeros(len(moved_contact))
+            return self._unchecked_charges(moved_contact, no_rotation)
+
+        return differences(charges_without_rotation, contact)
 
     def relative_error(self, check: CheckPress, direct: Array) -> float:
         """Compute the largest relative difference between the charges of one press and those of a direct solve.
 
-        The difference is divided by the charge. A charge below `CHARGE_FLOOR` times the largest charge of the press is
-        replaced by this product.
+        The difference of each electrode is divided by its charge of the direct solve. If this charge is small, the
+        difference is divided by `CHARGE_FLOOR` times the largest charge of the press.
 
         Args:
             check: The press.
             direct: Charges of the direct solve, shape (n_electrode,), pC.
         """
         x, y = check.position
-        contact = np.array([[x, y, check.force]])
+        contact = np.array([[x, y, check.force]])  # a single press
         (interpolated,) = self.charges(contact, check.rotation)
-        scale = np.maximum(np.abs(direct), CHARGE_FLOOR * np.abs(direct).max())
-        return float((np.abs(interpolated - direct) / scale).max())
+        charge_scale = np.maximum(np.abs(direct), CHARGE_FLOOR * np.abs(direct).max())
+        return float((np.abs(interpolated - direct) / charge_scale).max())
 
     def field_charges(self, contact: Array, is_odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
         """Compute the charges of several stress fields that the table contains, for a circular probe.
@@ -257,7 +270,7 @@ class ForwardMap:
             readout: Integration points of the charges; None for the coarse rule of the electrodes.
 
         Returns:
-            Shape (n, n_electrode, n_field), pC.
+            Charges, shape (n, n_electrode, n_field), pC.
         """
         x, y, force = contact.T
         position = x + 1j * y
@@ -282,10 +295,11 @@ class ForwardMap:
             is_needed: Whether the charge of each electrode is needed, shape (n_electrode,).
 
         Returns:
-            Shape (n, n_force, n_electrode), pC. Charges that are not needed are zero.
+            Charges, shape (n, n_force, n_electrode), pC. Charges that are not needed are zero.
         """
+        # The stacked map has a single force and one even field for each force of the family.
         complex_position = position[:, 0] + 1j * position[:, 1]
-        stacked_map = self._stacked_forces  # has one even field for each force
+        stacked_map = self._stacked_forces
         first_force = stacked_map.family.force[0]
         is_odd = np.zeros(self.family.force.size, dtype=bool)
         orientation = np.zeros(1)  # the probe keeps its orientation for all presses
@@ -301,7 +315,8 @@ class ForwardMap:
         # All fields were multiplied by the stress unit of the first force. Replace it by the unit of each force.
         film = self.sensor.film
         unit_ratio = amplitude_squared(film, self.family.force) / amplitude_squared(film, first_force)
-        return np.asarray(np.concatenate(charges).swapaxes(1, 2) * unit_ratio[:, None])
+        charge_by_force = np.concatenate(charges).swapaxes(1, 2)  # shape (n, n_force, n_electrode)
+        return np.asarray(charge_by_force * unit_ratio[:, None])
 
     def pressure_charges(self, position: Array) -> Array:
         """Compute the charges that the contact pressure causes, divided by the force. Crosstalk is omitted.
@@ -310,13 +325,16 @@ class ForwardMap:
             position: Positions (x, y), shape (n, 2), mm.
 
         Returns:
-            Shape (n, n_electrode), pC/N.
+            Charges per force, shape (n, n_electrode), pC/N.
         """
         return self._pressure_charges(position[:, 0] + 1j * position[:, 1], np.zeros(len(position)))
 
     @cached_property
     def _stacked_forces(self) -> "ForwardMap":
-        """Map for one force, whose table contains the stress of every force as a field in single precision."""
+        """Map for a single force. Its table contains the stress under each force of the family as a separate field.
+
+        The table has single precision.
+        """
         n_distance = self.family.distance.size
         n_force = self.family.force.size
         n_rotation = self.family.rotation.size
@@ -334,7 +352,7 @@ class ForwardMap:
             orientation: Further rotation of the probe, shape (n,), rad.
 
         Returns:
-            Shape (n, n_electrode), pC.
+            Charges, shape (n, n_electrode), pC.
         """
         position = contact[:, 0] + 1j * contact[:, 1]
         charge = np.empty((len(contact), len(self.electrodes)))
@@ -353,7 +371,7 @@ class ForwardMap:
             orientation: Further rotation of the probe, shape (n,), rad.
 
         Returns:
-            Shape (n, n_electrode), pC.
+            Charges, shape (n, n_electrode), pC.
         """
         rules = self._rules(position)
         charge: Array = self._integrate_fields(position, force, orientation, EVEN_FIELD, rules)[..., 0]
@@ -368,7 +386,7 @@ class ForwardMap:
             orientation: Further rotation of the probe, shape (n,), rad.
 
         Returns:
-            Shape (n, n_electrode), pC/N.
+            Charges per force, shape (n, n_electrode), pC/N.
         """
         charge = np.zeros((position.size, len(self.electrodes)))
         if self.sensor.piezo.d33 == 0.0:
@@ -401,11 +419,12 @@ class ForwardMap:
             rules: Integration rules, each with the pairs of press and electrode that use it, shape (n, n_electrode).
 
         Returns:
-            Shape (n, n_electrode, n_field), pC.
+            Charges, shape (n, n_electrode, n_field), pC.
         """
+        # Interpolate the values of the fields at the nodes of the mesh for each press.
         film = self.sensor.film
         distance = np.abs(position)
-        direction = np.angle(position)
+        direction = np.angle(position)  # from the centre of the film to the press, rad
         rotation = orientation - direction  # of the probe relative to the direction of the press
         field = self.family.weights(distance, force, rotation).astype(self.table.dtype) @ self.table
         mesh = template_for(self.probe, self.resolution)
@@ -418,7 +437,7 @@ class ForwardMap:
         for readout, uses_rule in rules:
             for n_point in np.unique(readout.count):
                 press_index, electrode = np.nonzero(uses_rule & (readout.count == n_point))
-                points = readout.points[electrode, :n_point] @ np.array([1.0, 1j]) / film.radius
+                points = readout.points[electrode, :n_point] @ np.array([1.0, 1j]) / film.radius  # (x, y) to x + iy
                 weights = readout.weights[electrode, :n_point]
                 charge[press_index, electrode] = presses.scaled_charges(press_index, points, weights, is_odd)
         stress_unit = film.young * amplitude_squared(film, force)
@@ -449,12 +468,9 @@ class ForwardMap:
             Integration points and pairs of each rule. The pairs have the shape (n, n_electrode).
         """
         is_near = self._is_near(position)
-        relative_distances = []  # from the nearest part of each electrode, in radii of the part
-        for part_centres, part_radii in self.sensor.part_circles:
-            distance_of_parts = np.abs(position[:, None] - part_centres) / part_radii
-            relative_distances.append(distance_of_parts.min(axis=1))
-        is_distant = np.stack(relative_distances, axis=1) > FAR_DISTANCE
-        is_inner = self.sensor.film.radius - np.abs(position) >= MIN_CLAMP_DISTANCE * self.probe.reach
+        is_distant = electrode_distances(self.sensor, position) > FAR_DISTANCE
+        clamp_distance = self.sensor.film.radius - np.abs(position)
+        is_inner = clamp_distance >= MIN_CLAMP_DISTANCE * self.probe.reach  # shape (n,)
         is_far = ~is_near & is_distant & is_inner[:, None] & self._has_smooth_far_field
         is_between = ~is_near & ~is_far
         return (self._fine_readout, is_near), (self._coarse_readout, is_between), (self._far_readout, is_far)
@@ -466,19 +482,8 @@ class ForwardMap:
         return bool(ring_ratio <= MAX_RING_RATIO)
 
     def _is_near(self, position: Complexes) -> Booleans:
-        """Return for which presses an electrode is so close that it needs the fine rule.
-
-        Args:
-            position: Positions x + iy, shape (n,), mm.
-
-        Returns:
-            Shape (n, n_electrode).
-        """
-        gaps = []  # between the press and the nearest part of each electrode, mm
-        for part_centres, part_radii in self.sensor.part_circles:
-            gap_of_parts = np.abs(position[:, None] - part_centres) - part_radii
-            gaps.append(gap_of_parts.min(axis=1))
-        return np.asarray(np.stack(gaps, axis=1) < self.probe.reach + NEAR)
+        """Return whether electrodes are so near to presses x + iy that they need the fine rule, (n, n_electrode)."""
+        return np.asarray(electrode_gaps(self.sensor, position) < self.probe.reach + NEAR)
 
 
 def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check: CheckPress) -> Array:
@@ -491,7 +496,7 @@ def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check:
         check: The press.
 
     Returns:
-        Shape (n_electrode,), pC.
+        Charges, shape (n_electrode,), pC.
     """
     rotated_probe = probe.rotated(check.rotation)
     equilibrium = press(sensor.film, rotated_probe, check.position, check.force, settings)

@@ -43,26 +43,12 @@ class PressChunk:
         Returns:
             Charges over the unit of stress, shape (n_pair, n_field), pC/MPa.
         """
-        # Find the points in the mesh after the press has been rotated onto the positive x axis.
-        mesh = self.mesh
+        stress, is_mirrored = self._interpolated_stress(press_index, points, is_odd.size)
         direction = self.direction[press_index]
-        rotated_points = points * np.exp(-1j * direction)[:, None]
-        position, is_mirrored = mesh.into_meshed_half(rotated_points)
-        element, xi, eta = locate_points(self.placement[press_index], mesh, position)
-
-        # Interpolate the three stress components of all fields from the nodes of the element of each point.
-        n_component = 3 * is_odd.size
-        basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel()).astype(self.field.dtype)
-        # Shapes: (n_press, n_element, n_local, n_component), (n_pair * n_point, n_local, n_component), and
-        # (n_pair, n_point, n_component).
-        field_by_element = self.field.reshape(len(self.field), mesh.n_element, -1, n_component)
-        nodal_stress = field_by_element[press_index[:, None], element].reshape(*basis_values.shape, n_component)
-        stress = np.matmul(basis_values[:, None, :], nodal_stress).reshape(*position.shape, n_component)
-
-        frame_angle = direction if mesh.half else direction + self.probe_angle[press_index]
+        frame_angle = direction if self.mesh.half else direction + self.probe_angle[press_index]
         charge = np.empty((len(stress), is_odd.size))
         for field_index, odd in enumerate(is_odd):
-            field_stress = stress[..., 3 * field_index : 3 * field_index + 3]
+            field_stress = stress[:, :, field_index]
             # Reflection changes the sign of s12 of an even field, and of s11 and s22 of an odd field.
             sign_changes = slice(0, 2) if odd else slice(2, 3)
             field_stress[is_mirrored, sign_changes] *= -1.0
@@ -70,3 +56,32 @@ class PressChunk:
             # Sum over the points p and the stress components c of each pair k
             charge[:, field_index] = np.einsum("kpc,kpc->k", film_stress, weights)
         return charge
+
+    def _interpolated_stress(self, press_index: Integers, points: Complexes, n_field: int) -> tuple[Array, Booleans]:
+        """Interpolate the stress of all fields from the nodes of the mesh under each press to given points.
+
+        If only half of the film is meshed, points of the other half are reflected into the meshed half.
+
+        Args:
+            press_index: Index of the press of each pair, shape (n_pair,).
+            points: Points x + iy, shape (n_pair, n_point), in film radii.
+            n_field: Number of fields.
+
+        Returns:
+            Stress (s11, s22, s12) in the frame of the mesh, shape (n_pair, n_point, n_field, 3), and whether each point
+            was reflected, shape (n_pair, n_point).
+        """
+        # Find the points in the mesh after the press has been rotated onto the positive x axis.
+        mesh = self.mesh
+        rotated_points = points * np.exp(-1j * self.direction[press_index])[:, None]
+        position, is_mirrored = mesh.into_meshed_half(rotated_points)
+        element, xi, eta = locate_points(self.placement[press_index], mesh, position)
+
+        # Interpolate the values of all fields from the nodes of the element of each point.
+        n_value = 3 * n_field  # values at a node
+        basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel()).astype(self.field.dtype)
+        field_by_element = self.field.reshape(len(self.field), mesh.n_element, -1, n_value)
+        nodal_stress = field_by_element[press_index[:, None], element]  # shape (n_pair, n_point, n_local, n_value)
+        flat_stress = nodal_stress.reshape(*basis_values.shape, n_value)  # shape (n_pair * n_point, n_local, n_value)
+        stress = np.matmul(basis_values[:, None, :], flat_stress)
+        return stress.reshape(*position.shape, n_field, 3), is_mirrored

@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.common.errors import SensorError
 from isocharge.simulate.numerics.interpolation import gauss_line, gauss_square
 from isocharge.simulate.numerics.polygon import gauss_polygon, gauss_quadrilateral
@@ -93,14 +93,15 @@ class ReadoutPoints:
             Points for n_electrode * n_line lines, ordered by electrode. The weights are per width of the line,
             pC/(MPa mm).
         """
-        position, line_weights = gauss_line(LINE_POINTS)
+        # The Gauss points divide a line from its start (0) to its end (1).
+        relative_position, line_weights = gauss_line(LINE_POINTS)
         start = lines[:, :, :1]  # shape (n_electrode, n_line, 1, 2)
-        direction = lines[:, :, 1:] - start
-        points = start + position[:, None] * direction  # shape (n_electrode, n_line, LINE_POINTS, 2)
+        start_to_end = lines[:, :, 1:] - start
+        points = start + relative_position[:, None] * start_to_end  # shape (n_electrode, n_line, LINE_POINTS, 2)
         placed_points = sensor.calibration.place(points.reshape(-1, LINE_POINTS, 2))
 
         # Weight of a point: gain * length that the point represents * charge per area and stress (s11, s22, s12)
-        length = np.linalg.norm(direction, axis=3)  # shape (n_electrode, n_line, 1)
+        length = np.linalg.norm(start_to_end, axis=3)  # shape (n_electrode, n_line, 1)
         point_length = length * line_weights  # shape (n_electrode, n_line, LINE_POINTS)
         amplified_length = sensor.gains[:, None, None] * point_length
         charge_per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
@@ -136,14 +137,15 @@ def _layout_points(electrodes: tuple[Electrode, ...], readout: Readout, per_side
         Points and areas. Electrodes with fewer points than others are filled up with points of the area zero.
     """
     rules = [electrode_rule(electrode, readout, per_side) for electrode in electrodes]
-    n_point = np.array([len(shares) for _, shares in rules])
-    points = np.zeros((len(electrodes), n_point.max(), 2))
-    areas = np.zeros((len(electrodes), n_point.max(), 3))
+    counts = np.array([len(shares) for _, shares in rules])
+    points = np.zeros((len(electrodes), counts.max(), 2))
+    areas = np.zeros((len(electrodes), counts.max(), 3))
     for index, electrode in enumerate(electrodes):
         electrode_points, shares = rules[index]
-        points[index, : n_point[index]] = electrode_points
-        areas[index, : n_point[index]] = electrode.area * shares
-    return ReadoutPoints(points, areas, n_point)
+        n_point = counts[index]
+        points[index, :n_point] = electrode_points
+        areas[index, :n_point] = electrode.area * shares
+    return ReadoutPoints(points, areas, counts)
 
 
 def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
@@ -176,12 +178,47 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
     return sensor.calibration.read(charge)
 
 
+def electrode_gaps(sensor: Sensor, position: Complexes) -> Array:
+    """Compute the gaps between positions and the circles around the nearest parts of the electrodes.
+
+    Args:
+        sensor: Sensor with the electrodes.
+        position: Positions x + iy, shape (n,), mm.
+
+    Returns:
+        Gaps, shape (n, n_electrode), mm. A gap is negative if the position lies in the circle.
+    """
+    gaps = []
+    for part_centres, part_radii in sensor.part_circles:
+        gap_of_parts = np.abs(position[:, None] - part_centres) - part_radii  # shape (n, n_part)
+        gaps.append(gap_of_parts.min(axis=1))
+    return np.stack(gaps, axis=1)
+
+
+def electrode_distances(sensor: Sensor, position: Complexes) -> Array:
+    """Compute the distances of positions from the nearest parts of the electrodes, in radii of the parts.
+
+    Args:
+        sensor: Sensor with the electrodes.
+        position: Positions x + iy, shape (n,), mm.
+
+    Returns:
+        Distances from the centres of the parts, shape (n, n_electrode), dimensionless.
+    """
+    distances = []
+    for part_centres, part_radii in sensor.part_circles:
+        distance_of_parts = np.abs(position[:, None] - part_centres) / part_radii  # shape (n, n_part)
+        distances.append(distance_of_parts.min(axis=1))
+    return np.stack(distances, axis=1)
+
+
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
     """Compute the charge that the contact pressure induces on the electrodes. The charge per area is d33 * mean(s33).
 
     The back of the film is free. Through the thickness, s33 changes from minus the contact pressure at the probe to
     zero at the back. The mean of s33 is therefore minus half of the contact pressure. Only the part of an electrode
-    under the footprint contributes. The negative d33 of PVDF results in a positive charge.
+    under the footprint contributes. The charge is therefore -d33 / 2 times the part of the force that acts on the
+    electrode. The negative d33 of PVDF results in a positive charge.
 
     Args:
         sensor: The sensor.
@@ -194,8 +231,8 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     """
     if sensor.piezo.d33 == 0.0:
         return np.zeros(len(sensor.electrodes))
-    position = complex(*at)
-    force_shares = []
+    position = complex(*at)  # x + iy
+    force_shares = []  # fraction of the force that acts on each electrode
     for electrode, (part_centres, part_radii) in zip(sensor.electrodes, sensor.part_circles, strict=True):
         # Only parts whose enclosing circle meets the footprint can contribute.
         near_parts = np.flatnonzero(np.abs(position - part_centres) < part_radii + probe.reach)
@@ -277,12 +314,14 @@ def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
     Returns:
         Points (x, y), shape (n, 2), mm, and the shares of each point in the means of s11, s22 and s12, shape (n, 3).
     """
-    position, line_shares = gauss_line(2 * per_side)
+    # The corners start at the lower left one and go anticlockwise, and so do the edges from each corner to the next.
+    relative_position, line_shares = gauss_line(2 * per_side)  # from 0 at the start of an edge to 1 at its end
     corners = np.array(electrode.corners)
     edges = np.roll(corners, -1, axis=0) - corners
-    lower, right, upper, left = corners[:, None] + position[:, None] * edges[:, None]
+    edge_points = corners[:, None] + relative_position[:, None] * edges[:, None]  # shape (4, n_edge_point, 2)
+    lower, right, upper, left = edge_points
 
-    # Each mean is over two edges, so each edge contributes half of the mean.
+    # Each mean is over two edges, so each edge contributes half of the mean. A row is (s11, s22, s12).
     half_shares = 0.5 * line_shares
     zero = np.zeros_like(line_shares)
     s11_shares = np.stack([half_shares, zero, zero], axis=1)

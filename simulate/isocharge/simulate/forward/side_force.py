@@ -5,8 +5,8 @@ A side force (Fx, Fy) of the probe on the film changes the charges to first orde
     dQ = jacobian @ (Fx, Fy).
 
 The stress fields of a side force along and across the direction of the press are solved with the tangent of the
-equilibrium (`solver.sensitivity`). They are solved at a few distances and forces, and interpolated as in a forward map.
-For side forces up to 0.2 of the force, the terms of second order are smaller than 1 % of dQ.
+equilibrium (`solver.sensitivity`). The fields are solved at a few distances and forces, and interpolated as in a
+forward map. For side forces up to 0.2 of the force, the terms of second order are smaller than 1 % of dQ.
 
 Example:
 
@@ -67,9 +67,9 @@ class SideForceMap:
                 f"side forces: expected a circular probe, got {film.probe.notation}; use `press(..., side_force=...)` "
                 "or `isocharge simulate point --side-force` for other probes"
             )
-        solved = solve_derivatives(film, _read_side_force, executor)
-        stress_table, holding = np.split(solved.table, [-1], axis=1)  # the last column is the holding force
-        return cls(film, replace(solved, table=stress_table), holding.ravel())
+        derivative_map = solve_derivatives(film, _read_side_force, executor)
+        stress_table, holding = np.split(derivative_map.table, [-1], axis=1)  # the last column is the holding force
+        return cls(film, replace(derivative_map, table=stress_table), holding.ravel())
 
     def jacobian(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to the side force (Fx, Fy) of the probe on the film.
@@ -78,7 +78,7 @@ class SideForceMap:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
 
         Returns:
-            Shape (n, n_electrode, 2), pC/N.
+            Derivatives, shape (n, n_electrode, 2), pC/N.
 
         Raises:
             SceneError: If a press lies outside the domain.
@@ -89,7 +89,8 @@ class SideForceMap:
         force_unit = side_force_unit(film, amplitude_squared(film, contact[:, 2]))
         charge_per_newton = scaled_charges / force_unit[:, None, None]
 
-        # Rotate the derivatives from the direction of the press and its perpendicular to x and y.
+        # Rotate the derivatives from the direction of the press and its perpendicular to x and y. Each derivative has
+        # the shape (n, n_electrode), and the angle has the shape (n, 1).
         along_press, across_press = np.moveaxis(charge_per_newton, 2, 0)
         angle = np.arctan2(contact[:, 1], contact[:, 0])[:, None]
         x_derivative = np.cos(angle) * along_press - np.sin(angle) * across_press
@@ -98,7 +99,10 @@ class SideForceMap:
         return np.stack([calibration.read(x_derivative), calibration.read(y_derivative)], axis=2)
 
     def friction_forces(self, contact: Array, coefficient: float) -> Array:
-        """Compute the side forces of a probe with friction on a vertical stage; see `solver.friction`.
+        """Compute the side forces of a probe with friction on a vertical stage.
+
+        The side force is the holding force, which prevents the film from slipping. Its magnitude is limited to the
+        coefficient of friction times the force of the press; see `solver.friction`.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
@@ -116,7 +120,8 @@ class SideForceMap:
         force = contact[:, 2]
         orientation = np.zeros(1)  # a circular probe has no orientation
         weights = self.fields.family.weights(distance, force, orientation)
-        relative_holding_force = weights @ self.holding
+        relative_holding_force = weights @ self.holding  # holding force over the force of the press
+        # Unit vector from the centre to the press. The bound avoids a division by zero at the centre.
         direction = contact[:, :2] / np.maximum(distance, 1e-12)[:, None]
         holding_force = (relative_holding_force * force)[:, None] * direction
         return limited(holding_force, coefficient * force)
@@ -129,7 +134,7 @@ class SideForceMap:
             coefficient: Coefficient of friction, dimensionless.
 
         Returns:
-            Shape (n, n_electrode), pC.
+            Changes of the charges, shape (n, n_electrode), pC.
 
         Raises:
             SceneError: If a press lies outside the domain, or the coefficient is not valid.
@@ -139,7 +144,7 @@ class SideForceMap:
 
     @cached_property
     def _readout(self) -> ReadoutPoints:
-        """Integration rule for the electrodes. The rule is fine, because the fields change rapidly near the probe."""
+        """Integration rule for the electrodes. It has many points, because the fields change rapidly near the probe."""
         return ReadoutPoints.of(self.film.sensor, FINE)
 
 

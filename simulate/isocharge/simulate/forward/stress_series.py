@@ -1,6 +1,6 @@
 """Chebyshev series of the stress of a film under a round probe, for the playground.
 
-The module is also a command. It writes the file of the built-in film of 25 um:
+The module is also a command. The command writes the file of the built-in film of 25 um:
 
     python -m isocharge.simulate.forward.stress_series FILE.json
 """
@@ -45,10 +45,13 @@ are 5e-5 (root mean square) and 4e-4 (largest)."""
 
 
 def stress_series(forward_map: ForwardMap) -> StressSeries:
-    """Fit the series to the stress field of a forward map, which must have a round probe.
+    """Fit Chebyshev series to the logarithm of the stress s11 + s22 of a forward map.
+
+    For each press, the film is mapped conformally onto itself so that the probe becomes a circle about the centre. The
+    rings inside and outside this circle have separate series, because the stress has a kink at the edge of the probe.
 
     Args:
-        forward_map: Forward map of the film. The series covers its distances and forces.
+        forward_map: Forward map of the film, with a round probe. The series covers its distances and forces.
 
     Returns:
         Chebyshev coefficients of ln(stress) inside and outside the footprint.
@@ -64,16 +67,18 @@ def stress_series(forward_map: ForwardMap) -> StressSeries:
     forces_N = min_force_N * (max_force_N / min_force_N) ** (0.5 * (_nodes(N_FORCES) + 1.0))
     inner_fraction = 0.5 * (_nodes(N_INNER_RINGS) + 1.0)
     outer_fraction = 0.5 * (_nodes(N_OUTER_RINGS) + 1.0)
-    direction: Complexes = np.exp(1j * np.arccos(_nodes(N_ANGLES)))
-    for row, distance_mm in enumerate(distances_mm):
+    direction: Complexes = np.exp(1j * np.arccos(_nodes(N_ANGLES)))  # unit vectors x + iy
+    for distance_index, distance_mm in enumerate(distances_mm):
         shift, probe_ring = _automorphism(distance_mm / film.radius, forward_map.probe.reach / film.radius)
         inner_rings = probe_ring * np.sqrt(inner_fraction)
         outer_rings = probe_ring * (MAX_RING / probe_ring) ** outer_fraction
         inner_points_mm = film.radius * _image_points(inner_rings[:, None] * direction, shift)
         outer_points_mm = film.radius * _image_points(outer_rings[:, None] * direction, shift)
-        for column, force_N in enumerate(forces_N):
-            inner[row, column] = np.log(_stress_sum(forward_map, distance_mm, force_N, inner_points_mm))
-            outer[row, column] = np.log(_stress_sum(forward_map, distance_mm, force_N, outer_points_mm))
+        for force_index, force_N in enumerate(forces_N):
+            inner_stress = _stress_sum(forward_map, distance_mm, force_N, inner_points_mm)
+            outer_stress = _stress_sum(forward_map, distance_mm, force_N, outer_points_mm)
+            inner[distance_index, force_index] = np.log(inner_stress)
+            outer[distance_index, force_index] = np.log(outer_stress)
     return StressSeries(
         film=film_to_dict(film),
         probe_radius_mm=forward_map.probe.reach,
@@ -137,6 +142,8 @@ def _stress_sum(forward_map: ForwardMap, distance_mm: float, force_N: float, poi
 def _coefficients(values: Array) -> Array:
     """Compute the Chebyshev coefficients of the polynomial that has given values at the Chebyshev nodes of all axes.
 
+    The values are transformed along one axis after the other.
+
     Args:
         values: Values at the nodes. The number of nodes of each axis is its length.
 
@@ -145,7 +152,8 @@ def _coefficients(values: Array) -> Array:
     """
     coefficients = values
     for axis, count in enumerate(values.shape):
-        coefficients_from_values = np.linalg.inv(chebyshev.chebvander(_nodes(count), count - 1))
+        values_from_coefficients = chebyshev.chebvander(_nodes(count), count - 1)  # shape (count, count)
+        coefficients_from_values = np.linalg.inv(values_from_coefficients)
         transformed = np.tensordot(coefficients_from_values, coefficients, (1, axis))  # the axis becomes the first one
         coefficients = np.moveaxis(transformed, 0, axis)
     return coefficients

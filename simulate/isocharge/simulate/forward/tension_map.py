@@ -65,7 +65,7 @@ class TensionMap:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
 
         Returns:
-            Shape (n, n_electrode, 3), pC/MPa.
+            Derivatives, shape (n, n_electrode, 3), pC/MPa.
 
         Raises:
             SceneError: If a press lies outside the domain.
@@ -73,8 +73,10 @@ class TensionMap:
         contact = self.film.domain.check(contact, "temperature of the film")
         film = self.film.sensor.film
         field_charge = self.fields.field_charges(contact, TENSION_IS_ODD)
+        # The fields are derivatives with respect to the mean, the difference and the shear of the pretension along and
+        # across the direction of the press, in this unit.
         tension_unit = film.young * amplitude_squared(film, contact[:, 2]) + film.pretension
-        derivatives = np.moveaxis(field_charge / tension_unit[:, None, None], 2, 0)
+        derivatives = np.moveaxis(field_charge / tension_unit[:, None, None], 2, 0)  # shape (3, n, n_electrode)
         mean_derivative, press_difference_derivative, press_shear_derivative = derivatives
 
         # Rotate the derivatives with respect to the difference and the shear from the axes of the press to x and y.
@@ -101,7 +103,7 @@ class TensionMap:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
 
         Returns:
-            Shape (n, n_electrode), pC/K. Zero if the film has no expansion coefficients.
+            Changes, shape (n, n_electrode), pC/K. Zero if the film has no expansion coefficients.
 
         Raises:
             SceneError: If a press lies outside the domain.

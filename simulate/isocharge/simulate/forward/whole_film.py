@@ -66,12 +66,16 @@ def whole_film_map(
     film = sensor.film
     domain = Domain(outermost_distance(film, probe), force_range)
     check_family(sensor.coated_film, probe, domain)
+    # All presses are solved with the same theory and the same coarse mesh. The thin rings at the rim have the width for
+    # the geometric mean of the forces, unless the mesh of the outermost press needs narrower rings.
     theory = Theory(stretching=True, bending=True, pretensioned=film.pretension != 0.0)
-    middle_force = float(np.sqrt(force_range[0] * force_range[1]))
+    min_force, max_force = force_range
+    middle_force = float(np.sqrt(min_force * max_force))
     template = template_for(probe, COARSE_RESOLUTION)
     layer = min(layer_for(film, middle_force), widest_smooth_layer(template, probe, domain.radius, film.radius))
     settings = SolveSettings(theory=theory, resolution=COARSE_RESOLUTION, layer=layer)
+
     family = Family.spread(domain, film.radius, (DISTANCES, FORCES), probe.period, ROTATIONS)
-    solved = family.solve(sensor, probe, settings, executor)
-    table = family.unfold(solved, template)
+    solved_stress = family.solve(sensor, probe, settings, executor)
+    table = family.unfold(solved_stress, template)
     return ForwardMap(sensor, probe, family, theory, COARSE_RESOLUTION, layer, table, COARSE_ERROR)

@@ -87,7 +87,7 @@ class AmbiguousPairs:
 
     @property
     def summary(self) -> str:
-        """Sentence about the pair whose outer contact is nearest to the centre.
+        """Sentence about the pair whose outer contact is nearest to the centre, which is the first pair.
 
         The text is empty if there are no pairs.
         """
@@ -106,8 +106,8 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     """Find pairs of distant contacts whose charges differ by less than the noise.
 
     The first contacts are presses with the force `force` at the positions of a square lattice. For each first contact,
-    the candidates for the second contact are all other positions of the lattice, each with the force that fits best.
-    The best candidates are then improved by least squares.
+    all other positions of the lattice are candidates for the second contact. Each candidate has the force that fits
+    best. The best candidates are then improved by least squares.
 
     Args:
         charge_map: Charges as a function of the contact.
@@ -118,7 +118,8 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     Returns:
         The pairs, ordered by the distance of the outer contact from the centre.
     """
-    unit_lattice = lattice(places)
+    # First contacts, and the distance from which on a second contact counts as distant
+    unit_lattice = lattice(places)  # x + iy
     position = INNER_RADIUS * charge_map.domain.radius * np.stack([unit_lattice.real, unit_lattice.imag], axis=1)
     contact = np.column_stack([position, np.full(len(position), force)])
     charge = charge_map.charges(contact)
@@ -128,10 +129,11 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     if not first_index.size:
         return AmbiguousPairs.none()
 
+    # Improve the candidates for the second contacts, and select the pairs that are distant and have the same charges.
     first = contact[first_index]
     second, charge_difference = nearest_contact(charge_map, noise, charge[first_index], start)
-    distance = np.hypot(*(second - first)[:, :2].T)
-    is_distant = distance > min_distance[first_index]
+    x_difference, y_difference, _ = (second - first).T
+    is_distant = np.hypot(x_difference, y_difference) > min_distance[first_index]
     is_ambiguous = is_distant & (charge_difference < INDISTINGUISHABLE_SIGMAS)
     pairs = AmbiguousPairs(first[is_ambiguous], second[is_ambiguous], charge_difference[is_ambiguous])
     order = np.argsort(pairs.outer_radius, kind="stable")
@@ -142,6 +144,9 @@ def _candidates(
     charge_map: ChargeMap, noise: NoiseModel, position: Array, charge: Array, min_distance: Array
 ) -> tuple[Integers, Array]:
     """Find candidates for the second contacts of pairs on the lattice.
+
+    A position of the lattice is a candidate if its charges fit better than those of its neighbours. Each first contact
+    has at most `MAX_CANDIDATES` candidates.
 
     Args:
         charge_map: Charges as a function of the contact.
@@ -163,10 +168,11 @@ def _candidates(
         observed = np.broadcast_to(first_charge, charge.shape)
         log_force = profile.best(terms, observed, noise)
         predicted = profile.charge(log_force, terms)
-        chi2 = ((observed - predicted) ** 2 / noise.variance(predicted)).sum(axis=1)
+        chi2 = ((observed - predicted) ** 2 / noise.variance(predicted)).sum(axis=1)  # shape (n,)
 
         is_local_minimum = chi2 <= chi2[neighbours].min(axis=1)
-        is_distant = np.hypot(*(position - position[first_index]).T) > min_distance[first_index]
+        x_difference, y_difference = (position - position[first_index]).T
+        is_distant = np.hypot(x_difference, y_difference) > min_distance[first_index]
         candidates = np.flatnonzero(is_local_minimum & is_distant)
         best_candidates = candidates[np.argsort(chi2[candidates])[:MAX_CANDIDATES]]
         first_indices.append(np.full(best_candidates.size, first_index))
@@ -188,9 +194,12 @@ def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Arr
         n_electrode).
     """
     force_range = charge_map.domain.force_range
-    min_log, max_log = np.log(force_range)
-    log_nodes = chebyshev_nodes(FORCES, min_log, max_log) if max_log > min_log else np.array([min_log])
-    force_nodes = np.clip(np.exp(log_nodes), *force_range)
+    min_log_force, max_log_force = np.log(force_range)
+    if max_log_force > min_log_force:
+        log_nodes = chebyshev_nodes(FORCES, min_log_force, max_log_force)
+    else:
+        log_nodes = np.array([min_log_force])
+    force_nodes = np.clip(np.exp(log_nodes), *force_range)  # rounding may lead out of the range
     nodal_ratios = []
     for force in force_nodes:
         contact = np.column_stack([position, np.full(len(position), force)])

@@ -1,10 +1,10 @@
 """Cramer-Rao limit: the smallest errors of an unbiased estimator of a contact from noisy charges.
 
-With the Jacobian J = d(Q)/d(x, y, ln F, ...), the Fisher information is J' diag(i) J, where i is the information that
-one reading provides about its charge (`NoiseModel.information`). The covariance of an unbiased estimate is at least the
-inverse of the Fisher information (Kay 1993, chapter 3). An estimator that uses a prior may have smaller errors where
-the charges provide little information. The package isocharge.train computes the limit of such estimators, the Bayes
-limit.
+Let J = d(Q)/d(x, y, ln F, ...) be the Jacobian, and i the information that one reading provides about its charge
+(`NoiseModel.information`). The Fisher information is then J' diag(i) J. The covariance of an unbiased estimate is at
+least the inverse of the Fisher information (Kay 1993, chapter 3). An estimator that uses a prior may have smaller
+errors where the charges provide little information. The package isocharge.train computes the limit of such estimators,
+the Bayes limit.
 """
 
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ class CramerRao:
 
 
 def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Array | None = None) -> CramerRao:
-    """Compute the limits of contacts from charges and their derivatives.
+    """Compute the Cramer-Rao limits of contacts from charges and their derivatives.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC.
@@ -99,9 +99,9 @@ def _invert(information: Array) -> Array:
         Inverse matrices, shape (n, p, p).
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
-    parameter_scale = np.sqrt(np.maximum(diagonal, MIN_INFORMATION))
+    parameter_scale = np.sqrt(np.maximum(diagonal, MIN_INFORMATION))  # shape (n, p)
     matrix_scale = parameter_scale[:, :, None] * parameter_scale[:, None, :]
-    eigenvalues, eigenvectors = np.linalg.eigh(information / matrix_scale)
+    eigenvalues, eigenvectors = np.linalg.eigh(information / matrix_scale)  # the diagonal of this matrix is 1
     inverse_eigenvalues = 1.0 / np.maximum(eigenvalues, MIN_EIGENVALUE)
     # Inverse V diag(1 / eigenvalues) V' of each matrix n
     scaled_inverse = np.einsum("nik,nk,njk->nij", eigenvectors, inverse_eigenvalues, eigenvectors)

@@ -9,12 +9,12 @@ point have the same charges (Whitney 1944).
 The orientation is reversed between two contacts a and b if det(J(a)' W J(b)) < 0, with the weights W = 1 / sigma^2. For
 three electrodes, this determinant has the sign of det J(a) det J(b). With more electrodes, the criterion is reliable
 only for contacts that are close to each other. Between distant contacts, for example on both sides of an electrode, the
-map may turn by more than a right angle without being singular. A segment with reversed orientation is therefore
-bisected until it is shorter than `SEGMENT_LENGTH`, or until neither half has reversed orientation. A fold that is
-smaller than the grid is found by a search for the minima of the smallest singular value of J.
+map may turn by more than a right angle without a fold. A segment with reversed orientation is therefore bisected until
+it is shorter than `SEGMENT_LENGTH`, or until neither half has reversed orientation. A fold that is smaller than the
+grid is found by a search for the minima of the smallest singular value of J.
 
-If the electrodes lie on one circle, an isotropic film has a fold near this circle for any number of electrodes, because
-the charges hardly change if the press is moved to its mirror image in the circle.
+If the electrodes lie on one circle, an isotropic film has a fold near this circle for any number of electrodes. The
+reason is that the charges hardly change if the press is moved to its mirror image in the circle.
 
 Even without folds, two distant contacts may have the same charges; see `ambiguous_pairs`.
 """
@@ -56,7 +56,7 @@ def has_reversed_orientation(first: Array, second: Array) -> Booleans:
         second: J / sigma of the second contacts, shape (..., n_electrode, 3).
 
     Returns:
-        Shape (...).
+        Whether the orientation is reversed, shape (...).
     """
     first_directions = _unit_columns(first)
     second_directions = _unit_columns(second)
@@ -66,8 +66,10 @@ def has_reversed_orientation(first: Array, second: Array) -> Booleans:
 
 
 def _unit_columns(jacobian: Array) -> Array:
-    """Scale the columns of a matrix to unit length, so that rounding errors do not change the sign of its
-    determinant."""
+    """Scale the columns of a matrix to unit length.
+
+    Without this scaling, rounding errors could change the sign of the determinant.
+    """
     length = np.linalg.norm(jacobian, axis=-2, keepdims=True)
     return np.asarray(jacobian / np.maximum(length, np.finfo(float).tiny))
 
@@ -94,7 +96,8 @@ def singular_values(scaled: Array) -> Array:
     direction. At a fold the second singular value is zero.
 
     Args:
-        scaled: J / sigma, shape (n, n_electrode, 3).
+        scaled: J / sigma: the derivatives of the charges with respect to x, y and ln F, divided by the standard
+            deviations of the charges, shape (n, n_electrode, 3).
 
     Returns:
         Singular values in descending order, shape (n, 2), 1/mm.
@@ -135,10 +138,13 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
         noise: Noise of the readings.
     """
     search = _FoldSearch(charge_map, noise, force)
-    scaled = rings.per_ring(search.scaled(rings.position.reshape(-1, 2)))
+    scaled = rings.per_ring(search.scaled(rings.position.reshape(-1, 2)))  # shape (n_ring, n_angle, n_electrode, 3)
     weakest = search.weakest_positions(rings, scaled)
     points = np.concatenate([search.folds_between(rings, scaled), search.folds_about(weakest)])
-    ascending_distance = np.argsort(np.hypot(*points.T), kind="stable")
+
+    # Sort the folds by their distance from the centre.
+    x, y = points.T
+    ascending_distance = np.argsort(np.hypot(x, y), kind="stable")
     return Folds(points[ascending_distance], weakest)
 
 
@@ -164,6 +170,8 @@ class _FoldSearch:
     def folds_between(self, rings: Rings, scaled: Array) -> Array:
         """Find folds between neighbouring positions on the same ring or on neighbouring rings.
 
+        A fold lies between two positions at which the charge map has opposite orientations.
+
         Args:
             rings: Positions.
             scaled: J / sigma at all positions, shape (n_ring, n_angle, n_electrode, 3).
@@ -180,7 +188,7 @@ class _FoldSearch:
         return self._bisect(first, second)
 
     def _bisect(self, first: Array, second: Array) -> Array:
-        """Bisect segments. The charge map has opposite orientations at the two ends of each segment.
+        """Bisect segments until they are short. The charge map has opposite orientations at the two ends of a segment.
 
         In each round, a segment is replaced by the half in which the orientation is reversed, until it is shorter than
         `SEGMENT_LENGTH`.
@@ -198,19 +206,24 @@ class _FoldSearch:
             second_scaled = self.scaled(second)
         while len(first):
             middle = 0.5 * (first + second)
-            is_short = np.hypot(*(second - first).T) <= SEGMENT_LENGTH
+            x_length, y_length = (second - first).T
+            is_short = np.hypot(x_length, y_length) <= SEGMENT_LENGTH
             points.append(middle[is_short])
 
             middle_scaled = self.scaled(middle)
+            # The orientation may be reversed in neither half, because of rounding errors. Such a segment is dropped.
             in_first_half = has_reversed_orientation(first_scaled, middle_scaled)
             in_second_half = has_reversed_orientation(middle_scaled, second_scaled)
             remaining = ~is_short & (in_first_half | in_second_half)
-            use_second_half = (in_second_half & ~in_first_half)[remaining, None]
-            first = np.where(use_second_half, middle[remaining], first[remaining])
-            second = np.where(use_second_half, second[remaining], middle[remaining])
-            use_second_half = use_second_half[..., None]  # for matrices of shape (n, n_electrode, 3)
-            first_scaled = np.where(use_second_half, middle_scaled[remaining], first_scaled[remaining])
-            second_scaled = np.where(use_second_half, second_scaled[remaining], middle_scaled[remaining])
+            use_second_half = (in_second_half & ~in_first_half)[remaining]
+
+            # The middle replaces the first end or the second end of each remaining segment.
+            use_second_position = use_second_half[:, None]  # broadcasts with shape (n, 2)
+            first = np.where(use_second_position, middle[remaining], first[remaining])
+            second = np.where(use_second_position, second[remaining], middle[remaining])
+            use_second_matrix = use_second_half[:, None, None]  # broadcasts with shape (n, n_electrode, 3)
+            first_scaled = np.where(use_second_matrix, middle_scaled[remaining], first_scaled[remaining])
+            second_scaled = np.where(use_second_matrix, second_scaled[remaining], middle_scaled[remaining])
         return np.concatenate(points)
 
     def weakest_positions(self, rings: Rings, scaled: Array) -> Array:
@@ -225,11 +238,16 @@ class _FoldSearch:
         Returns:
             Positions of the minima, shape (n, 2), mm.
         """
-        n_ring, n_angle = scaled.shape[:2]
+        n_ring, n_angle, _, _ = scaled.shape
         scaled_of_positions = scaled.reshape(-1, *scaled.shape[2:])
-        smallest = singular_values(scaled_of_positions)[:, 1].reshape(n_ring, n_angle)
+        _, smaller_singular_value = singular_values(scaled_of_positions).T
+        smallest = smaller_singular_value.reshape(n_ring, n_angle)
+
+        # The neighbours are the 3 x 3 positions on the same ring and on the rings beside it. The angles are periodic.
         smallest_of_neighbours = scipy.ndimage.minimum_filter(smallest, 3, mode=("nearest", "wrap"))
         is_minimum = smallest == smallest_of_neighbours  # at least at the global minimum
+
+        # The first step of a search is the distance between neighbouring positions.
         spacing_on_ring = rings.distance * 2.0 * np.pi / n_angle
         spacing_between_rings = rings.distance[0]
         first_step = np.maximum(spacing_between_rings, spacing_on_ring)
@@ -246,10 +264,10 @@ class _FoldSearch:
         """
         circle_points = position[:, None] + 0.5 * SEGMENT_LENGTH * COMPASS  # shape (n, 8, 2)
         scaled = self.scaled(circle_points.reshape(-1, 2))
-        scaled = scaled.reshape(len(position), len(COMPASS), *scaled.shape[1:])
-        half = len(COMPASS) // 2
-        is_fold = has_reversed_orientation(scaled[:, :half], scaled[:, half:]).any(axis=1)
-        return np.asarray(position[is_fold])
+        scaled_on_circle = scaled.reshape(len(position), len(COMPASS), *scaled.shape[1:])
+        half = len(COMPASS) // 2  # the points i and i + half are opposite
+        is_reversed = has_reversed_orientation(scaled_on_circle[:, :half], scaled_on_circle[:, half:])  # shape (n, 4)
+        return np.asarray(position[is_reversed.any(axis=1)])
 
     def _minimise(self, start: Array, start_value: Array, first_step: Array) -> Array:
         """Find local minima of the smallest singular value by a compass search (Kolda, Lewis and Torczon 2003).
@@ -272,8 +290,9 @@ class _FoldSearch:
         for _ in range(MAX_STEPS):
             if not active.size:
                 break
-            neighbours = position[active, None] + step[active, None, None] * COMPASS  # shape (n_active, 8, 2)
-            neighbours = onto_disk(neighbours.reshape(-1, 2), self.radius)
+            # Best of the eight neighbours of each active search
+            compass_points = position[active, None] + step[active, None, None] * COMPASS  # shape (n_active, 8, 2)
+            neighbours = onto_disk(compass_points.reshape(-1, 2), self.radius)  # shape (n_active * 8, 2)
             neighbour_values = self.smallest_singular_value(neighbours).reshape(-1, len(COMPASS))
             best_direction = neighbour_values.argmin(axis=1)
             active_rows = np.arange(active.size)

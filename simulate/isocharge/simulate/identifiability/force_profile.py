@@ -37,20 +37,22 @@ class ForceProfile:
 
     @classmethod
     def of(cls, weights: Callable[[Array], Array], force_range: tuple[float, float]) -> "ForceProfile":
-        """Create a profile and tabulate its exponent.
+        """Create a profile, and tabulate the exponent with which the charges increase with the force.
+
+        The exponent is d ln(sum of the weights) / d ln F.
 
         Args:
             weights: Function from ln F, shape (n,), to weights, shape (n, n_term).
             force_range: Smallest and largest force, N. They may be equal.
         """
-        min_log, max_log = (float(end) for end in np.log(force_range))
-        if max_log > min_log:
-            log_forces = np.linspace(min_log, max_log, EXPONENT_NODES)
-        else:
-            log_forces = np.array([min_log - 1e-3, min_log + 1e-3])  # a difference quotient about the single force
+        min_log_force, max_log_force = np.log(force_range).tolist()
+        if max_log_force > min_log_force:
+            log_forces = np.linspace(min_log_force, max_log_force, EXPONENT_NODES)
+        else:  # two points for a difference quotient about the single force
+            log_forces = np.array([min_log_force - 1e-3, min_log_force + 1e-3])
         log_sum = np.log(weights(log_forces).sum(axis=1))
         exponent = np.gradient(log_sum, log_forces)
-        return cls(weights, (min_log, max_log), log_forces, exponent)
+        return cls(weights, (min_log_force, max_log_force), log_forces, exponent)
 
     def charge(self, log_force: Array, terms: Array) -> Array:
         """Compute the charges for logarithms of the force.
@@ -92,7 +94,8 @@ class ForceProfile:
         Returns:
             ln F within the range of the profile, shape (n,).
         """
-        log_force = np.full(len(charge), 0.5 * sum(self.log_range))
+        middle_log_force = 0.5 * sum(self.log_range)
+        log_force = np.full(len(charge), middle_log_force)
         for _ in range(STEPS):
             predicted = self.charge(log_force, terms)
             weighted = predicted / noise.variance(predicted)

@@ -90,7 +90,7 @@ class LimitMap:
         contact = rings.contacts(force)
         limits = limits_at(charge_map, contact, noise)
         largest, smallest = singular_values(scaled_derivatives(charge_map, contact, noise)).T
-        condition = largest / np.maximum(smallest, 1e-12 * largest)
+        condition = largest / np.maximum(smallest, 1e-12 * largest)  # at most 1e12, at a fold
         return cls(
             force,
             rings,
@@ -163,9 +163,13 @@ class Identification:
         """
         check_determined(len(forward_map.electrodes))
         charges = with_fast_derivatives(forward_map)
+
+        # Limits are computed for the smallest and the largest force, and for 1 N if it is between them.
         min_force, max_force = charges.domain.force_range
         middle_force = min(max(min_force, 1.0), max_force)
         forces = sorted({min_force, middle_force, max_force})
+
+        # Limits up to the search radius, and within the working area
         area = working_area(charges, noise, error=error)
         maps = _limit_maps(charges, noise, forces, charges.domain.radius)
         inner_maps = _limit_maps(charges, noise, forces, area.radius)
@@ -212,8 +216,8 @@ class Identification:
             )
         errors = []
         for limits in estimable:
-            statistics = limits.statistics()
-            errors.append(f"to {statistics['side_force_median_percent']:.2g} % of the force at {limits.force:g} N")
+            median_percent = limits.statistics()["side_force_median_percent"]
+            errors.append(f"to {median_percent:.2g} % of the force at {limits.force:g} N")
         return f"The side force of the probe can be estimated {', '.join(errors)} (median)."
 
     def to_dict(self) -> dict[str, Any]:
@@ -277,6 +281,9 @@ def identify(
 ) -> Identification:
     """Compute how well the charges of a sensor determine contacts.
 
+    The function solves a forward map, and finds the working area and the error limits within this area. It then finds
+    the presses outside the working area that cannot be noticed (the mirror region).
+
     Args:
         sensor: Sensor.
         probe: Probe that presses the film.
@@ -303,6 +310,7 @@ def identify(
         forward_map = map_to_search(sensor, probe, force_range, executor)
     else:
         forward_map = ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
+
     identification = Identification.of(forward_map, noise, error=error, executor=executor)
     area_radius = identification.area.radius
     mirror = mirror_region(sensor, probe, identification.charges, area_radius, noise, executor=executor)
@@ -312,8 +320,8 @@ def identify(
 def search_radius(sensor: Sensor, probe: Probe) -> float:
     """Return the radius of the search for the working area, mm.
 
-    The radius is the distance of the outermost corner of an electrode from the centre, but not more than
-    `MAX_SEARCH_RADIUS` allows. The working area is mostly bounded by a fold near the electrodes that surround it.
+    The radius is the distance of the outermost corner of an electrode from the centre. It is limited by
+    `MAX_SEARCH_RADIUS`. The working area is mostly bounded by a fold near the electrodes that surround it.
     """
     corners = [sensor.calibration.place(np.array(electrode.corners)) for electrode in sensor.electrodes]
     outermost = float(np.hypot(*np.concatenate(corners).T).max())
@@ -324,6 +332,8 @@ def map_to_search(
     sensor: Sensor, probe: Probe, force_range: tuple[float, float], executor: Executor | None = None
 ) -> ForwardMap:
     """Solve a forward map over the search radius. If the charges cannot be interpolated there, use a smaller radius.
+
+    The radius is multiplied by `RADIUS_REDUCTION` at most `MAX_REDUCTIONS` times. After that, an error is raised.
 
     Args:
         sensor: Sensor.

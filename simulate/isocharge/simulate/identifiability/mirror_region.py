@@ -79,11 +79,12 @@ class MirrorRegion:
         Returns:
             The mirror region, from presses in the middle of each sector of each ring.
         """
+        # Forces, and the middles of the rings and sectors between the working area and the edge of the map
         min_force, max_force = charges.domain.force_range
         forces = np.geomspace(max(min_force, max_force / FORCE_RATIO), max_force, FORCE_COUNT)
-        outer = whole_film.domain.radius
-        edges = np.linspace(radius, outer, N_RINGS + 1)
-        ring_distance = 0.5 * (edges[1:] + edges[:-1])
+        outer_radius = whole_film.domain.radius
+        ring_edges = np.linspace(radius, outer_radius, N_RINGS + 1)
+        ring_distance = 0.5 * (ring_edges[1:] + ring_edges[:-1])
         sector_angle = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
 
         # Presses with every combination of ring, sector and force
@@ -92,7 +93,7 @@ class MirrorRegion:
         contact = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), force])
         is_mirrored = has_mirror(within(charges, radius), whole_film.charges(contact), noise)
         share_of_forces = is_mirrored.reshape(N_RINGS, N_SECTORS, FORCE_COUNT).mean(axis=2)
-        return cls(radius, outer, forces, share_of_forces)
+        return cls(radius, outer_radius, forces, share_of_forces)
 
     @property
     def distance(self) -> Array:
@@ -142,7 +143,7 @@ def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
         noise: Noise of the readings.
 
     Returns:
-        Shape (n,).
+        Whether a press in the domain causes the charges of each row, shape (n,).
     """
     nearest_contact, residual = search(inside, charge, noise.sigma(charge), candidates=N_CANDIDATES)
     is_same_charge = np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS
@@ -187,6 +188,7 @@ def mirror_region(
     """
     if not 0.0 < radius < outermost_distance(sensor.film, probe):
         return None
-    round_probe = probe if probe.period == 0.0 else Circle(probe.reach)
+    is_round = probe.period == 0.0
+    round_probe = probe if is_round else Circle(probe.reach)
     whole_film = whole_film_map(sensor, round_probe, charges.domain.force_range, executor=executor)
     return MirrorRegion.of(charges, radius, whole_film, noise)

@@ -105,13 +105,13 @@ def _descend(
     Returns:
         Contacts (x, y, F), shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
+    # Centre and half width of the domain in (x, y, ln F)
     radius = INNER_RADIUS * charge_map.domain.radius
     force_range = charge_map.domain.force_range
-    min_log, max_log = np.log(force_range)
-    centre = charge_map.domain.centre  # (x, y, ln F)
-    half_width = np.array([radius, radius, 0.5 * (max_log - min_log)])
-    # The half width of ln F is zero if the map has a single force.
-    divisor = np.where(half_width > 0.0, half_width, 1.0)
+    min_log_force, max_log_force = np.log(force_range)
+    centre = charge_map.domain.centre
+    half_width = np.array([radius, radius, 0.5 * (max_log_force - min_log_force)])
+    divisor = np.where(half_width > 0.0, half_width, 1.0)  # the half width of ln F is zero if there is a single force
 
     def to_contact(unit_coordinates: Array) -> Array:
         """Convert unit coordinates into contacts (x, y, F), both of shape (k, 3)."""
@@ -120,14 +120,21 @@ def _descend(
         return np.column_stack([log_contact[:, :2], force])
 
     def residuals(rows: Integers, unit_coordinates: Array) -> tuple[Array, Array]:
-        """Return the residuals of some rows of the charges, shape (k, n_electrode), and their derivatives, shape (k, 3,
-        n_electrode)."""
+        """Compute the residuals (Q - Q(c)) / sigma of some rows of the charges, and their derivatives.
+
+        Args:
+            rows: Indices of the rows, shape (k,).
+            unit_coordinates: Contacts c in unit coordinates, shape (k, 3).
+
+        Returns:
+            Residuals, shape (k, n_electrode), and derivatives, shape (k, 3, n_electrode).
+        """
         predicted, slopes = linearised(charge_map, to_contact(unit_coordinates))
         sigma = sigma_of(rows, predicted)
         derivatives = -slopes * half_width / sigma[..., None]
         return (charge[rows] - predicted) / sigma, derivatives.swapaxes(1, 2)
 
-    log_start = np.column_stack([start[:, :2], np.log(start[:, 2])])
+    log_start = np.column_stack([start[:, :2], np.log(start[:, 2])])  # (x, y, ln F)
     unit_start = (log_start - centre) / divisor
     unit_solution, residual = minimise(residuals, unit_start, max_steps, min_change)
     return to_contact(unit_solution), residual
@@ -155,12 +162,15 @@ def search(
     Returns:
         Contacts and residuals of the best descent; see `explain`.
     """
+    # Charges of the candidates, and pairs of candidates that lie close together
     unit_candidates = _unit_candidates(candidates)
     candidate_contacts = charge_map.domain.to_contact(INNER_RADIUS * unit_candidates)
     candidate_contacts[:, 2] = np.clip(candidate_contacts[:, 2], *charge_map.domain.force_range)
     candidate_charges = charge_map.charges(candidate_contacts)
     positions = unit_candidates[:, :2]
     is_neighbour = scipy.spatial.distance.cdist(positions, positions) < START_SEPARATION
+
+    # For each row of charges, the candidates with the nearest charges
     nearest_candidates = []
     for chunk_start in range(0, max(len(charge), 1), CHUNK):  # without charges, there is one empty chunk
         chunk = slice(chunk_start, chunk_start + CHUNK)
@@ -172,6 +182,8 @@ def search(
         explain(charge_map, charge, sigma, candidate_contacts[index], min_change=min_change)
         for index in candidates_of_descents
     ]
+
+    # Choose the descent with the smallest residual for each row of charges.
     contacts = np.stack([contact for contact, _ in solutions])  # shape (starts, n, 3)
     residuals = np.stack([residual for _, residual in solutions])  # shape (starts, n, n_electrode)
     best_start = (residuals**2).sum(axis=2).argmin(axis=0)
@@ -180,7 +192,7 @@ def search(
 
 
 def _unit_candidates(count: int) -> Array:
-    """Return contacts that are evenly distributed over the domain, a quarter of them on the edge of the disk.
+    """Return contacts that are evenly distributed over the domain (Sobol sequence), a quarter of them on the edge.
 
     Args:
         count: Number of contacts.
@@ -189,16 +201,17 @@ def _unit_candidates(count: int) -> Array:
         Contacts in unit coordinates (x, y, ln F), in which the domain is the unit disk times [-1, 1], shape (count, 3).
     """
     radius_sample, angle_sample, force_sample = scipy.stats.qmc.Sobol(3, scramble=False).random(count).T
-    radius = np.sqrt(radius_sample)
-    radius[::4] = 1.0
+    radius = np.sqrt(radius_sample)  # uniform over the area of the disk
+    radius[::4] = 1.0  # every fourth contact lies on the edge
     angle = 2.0 * np.pi * angle_sample
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), 2.0 * force_sample - 1.0], axis=1)
+    log_force = 2.0 * force_sample - 1.0
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), log_force], axis=1)
 
 
 def _nearest_rows(
     charge: Array, sigma: Array, candidate_charges: Array, is_neighbour: Booleans, count: int
 ) -> Integers:
-    """For each row of charges, find the candidates with the nearest charges.
+    """Find the candidates with the nearest charges for each row of charges.
 
     Candidates that are neighbours of each other are not returned together. A few searches for the
     smallest distance are faster than sorting all distances.

@@ -62,12 +62,13 @@ class SideForceLimits:
             force: Force of the contacts, N.
             radius: Radius of the disk, mm.
         """
+        # Derivatives of the charges with respect to x, y, ln F, Fx / F and Fy / F
         contact = Rings.spread(radius, RING_COUNT, ANGLE_COUNT).contacts(force)
         charge, contact_jacobian = linearised(charge_map, contact)
-        relative_side_force_jacobian = force * side_force_map.jacobian(contact)  # with respect to Fx / F and Fy / F
+        relative_side_force_jacobian = force * side_force_map.jacobian(contact)
         jacobian = np.concatenate([contact_jacobian, relative_side_force_jacobian], axis=2)
         limits = cramer_rao(charge, jacobian, noise)
-        variance = np.diagonal(limits.covariance, axis1=1, axis2=2)
+        variance = np.diagonal(limits.covariance, axis1=1, axis2=2)  # shape (n, 5)
         *_, side_x_variance, side_y_variance = variance.T
         return cls(
             force=force,
@@ -116,8 +117,8 @@ def side_force_limits(
 ) -> tuple[SideForceLimits, ...]:
     """Compute the limits for each force.
 
-    The result is empty if the sensor has fewer than `MIN_ELECTRODES` electrodes or no working area, or if the probe is
-    not circular, because only circular probes have a side force map.
+    The result is empty if the sensor has fewer than `MIN_ELECTRODES` electrodes or no working area. It is also empty if
+    the probe is not circular, because only circular probes have a side force map.
 
     Args:
         forward_map: Forward map of the sensor.

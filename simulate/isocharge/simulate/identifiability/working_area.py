@@ -69,22 +69,27 @@ class WorkingArea:
 
     @property
     def summary(self) -> str:
-        """Description of the working area in a few sentences."""
-        low, high = self.force_range
-        parts = [f"Working area: up to {self.radius:.3g} mm from the centre, {low:g} to {high:g} N."]
+        """Description of the working area and of what limits it, in a few sentences."""
+        min_force, max_force = self.force_range
+        sentences = [f"Working area: up to {self.radius:.3g} mm from the centre, {min_force:g} to {max_force:g} N."]
         if self.error_radius < min(self.searched, self.fold_radius, self.pairs.radius):
-            parts.append(f"Farther out the position error exceeds {self.error:.3g} mm at {low:g} N.")
+            if self.unambiguous_radius > self.radius:
+                sentences.append(f"Up to {self.unambiguous_radius:.3g} mm, the charges determine the contact uniquely.")
+            sentences.append(
+                f"Beyond {self.radius:.3g} mm, the position error exceeds {self.error:.3g} mm at {min_force:g} N."
+            )
         if np.isfinite(self.fold_radius):
-            sides = "the fold" if self.electrodes == 3 else "the points where it loses rank"
-            parts.append(
-                f"The map folds {self.fold_radius:.1f} mm from the centre: contacts on both sides of {sides} give the "
+            # With more than three charges, the fold consists of single points.
+            fold = "the fold" if self.electrodes == 3 else "the points where it loses rank"
+            sentences.append(
+                f"The map folds {self.fold_radius:.1f} mm from the centre: contacts on both sides of {fold} give the "
                 "same charges, and no method can distinguish these contacts by one reading."
             )
         if len(self.pairs):
-            parts.append(self.pairs.summary)
+            sentences.append(self.pairs.summary)
         if self.bound == "search":
-            parts.append(f"The search ended at {self.searched:.3g} mm.")
-        return " ".join(parts)
+            sentences.append(f"The search ended at {self.searched:.3g} mm.")
+        return " ".join(sentences)
 
 
 def working_area(
@@ -92,8 +97,10 @@ def working_area(
 ) -> WorkingArea:
     """Find the working area within the domain of a charge map.
 
-    A forward map is first replaced by splines. Any other map, such as a fit to measured charges, is evaluated about
-    400,000 times, or 130,000 times without the search for ambiguous pairs.
+    The working area ends where the position error exceeds its limit, at the nearest fold, at the nearest ambiguous
+    pair, or at the edge of the domain. A forward map is first replaced by splines. Any other map, such as a fit to
+    measured charges, is evaluated about 400,000 times. Without the search for ambiguous pairs, it is evaluated 130,000
+    times.
 
     Args:
         charge_map: Charges as a function of the contact.
@@ -112,10 +119,13 @@ def working_area(
     forces = sorted({min_force, middle_force, max_force})
     rings = Rings.spread(searched)
 
+    # Distance of the nearest fold for any of the forces
     searches = [find_folds(charge_map, rings, force, noise) for force in forces]
     folds = np.concatenate([search.points for search in searches])
-    fold_radius = float(np.hypot(*folds.T).min(initial=np.inf))
+    fold_x, fold_y = folds.T
+    fold_radius = float(np.hypot(fold_x, fold_y).min(initial=np.inf))
 
+    # Distance at which the error first exceeds its limit, on the rings or at the positions with the largest errors
     error_radius = np.inf
     for force, search in zip(forces, searches, strict=True):
         ring_radius = _error_radius(charge_map, rings, force, noise, error)
@@ -124,6 +134,7 @@ def working_area(
     error_radius = _confirmed(charge_map, error_radius, forces, noise, error)
     pairs = find_ambiguous_pairs(charge_map, noise, min_force) if search_pairs else AmbiguousPairs.none()
 
+    # The smallest of these radii bounds the working area.
     radii: dict[Bound, float] = {
         "search": searched,
         "fold": fold_radius,
@@ -146,8 +157,7 @@ def working_area(
 
 
 def _confirmed(charge_map: ChargeMap, radius: float, forces: list[float], noise: NoiseModel, error: float) -> float:
-    """Evaluate the error again on rings within a radius, and reduce the radius if the error of a ring exceeds its
-    limit.
+    """Evaluate the position error again on finer rings within a radius, and reduce the radius if it exceeds its limit.
 
     Args:
         charge_map: Charges as a function of the contact.
@@ -162,12 +172,13 @@ def _confirmed(charge_map: ChargeMap, radius: float, forces: list[float], noise:
     if radius >= charge_map.domain.radius:
         return radius
     for _ in range(MAX_CONFIRMATIONS):
-        rounded = _round_down(radius)
-        if rounded <= 0.0:
+        rounded_radius = _round_down(radius)
+        if rounded_radius <= 0.0:
             break
-        rings = Rings.spread(rounded)
+        rings = Rings.spread(rounded_radius)
         confirmed_radius = min(_error_radius(charge_map, rings, force, noise, error) for force in forces)
-        if confirmed_radius >= rounded * (1.0 - 1e-9):
+        is_confirmed = confirmed_radius >= rounded_radius * (1.0 - 1e-9)
+        if is_confirmed:
             break
         radius = confirmed_radius
     return radius
@@ -194,12 +205,13 @@ def _error_radius(charge_map: ChargeMap, rings: Rings, force: float, noise: Nois
     first_exceeding = int(exceeding[0])
     if first_exceeding == 0:
         return 0.0
-    two_rings = [first_exceeding - 1, first_exceeding]
-    return float(np.interp(np.log(error), np.log(largest_error[two_rings]), rings.distance[two_rings]))
+    rings_around_limit = [first_exceeding - 1, first_exceeding]
+    log_errors = np.log(largest_error[rings_around_limit])
+    return float(np.interp(np.log(error), log_errors, rings.distance[rings_around_limit]))
 
 
 def _nearest_exceeding(charge_map: ChargeMap, position: Array, force: float, noise: NoiseModel, error: float) -> float:
-    """Return the smallest distance from the centre at which the error of a position exceeds its limit, mm; or infinity.
+    """Return the smallest distance (mm) from the centre at which the position error exceeds its limit, or infinity.
 
     Args:
         charge_map: Charges as a function of the contact.

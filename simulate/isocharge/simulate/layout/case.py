@@ -121,6 +121,7 @@ def read_goal(text: str) -> Goal:
     if text in get_args(NamedGoal):
         return cast(NamedGoal, text)
     try:
+        # An empty file also results in a ValueError, because it has no header line.
         header, *lines = read_whole(Path(text)).decode("utf-8-sig").splitlines()
         if header.replace(" ", "") != WEIGHT_MAP_HEADER:
             raise ValueError(f"the columns are {header!r}")
@@ -203,9 +204,13 @@ class DesignCase:
         self._check_kept_electrodes()
 
     def _check_kept_electrodes(self) -> None:
-        """Check the names of the kept electrodes.
+        """Check that the kept electrodes exist, leave room for a new one, and fit to the new squares.
 
-        For the readout 'edge', also check the side length of the new squares.
+        Kept electrodes must be at their nominal positions. With the readout 'edge', the new squares must have the same
+        side as the kept squares.
+
+        Raises:
+            InputError: If the kept electrodes do not satisfy these rules.
         """
         if len(set(self.keep)) < len(self.keep):
             raise InputError(f"keep: expected different names, got {', '.join(self.keep)}")
@@ -215,6 +220,7 @@ class DesignCase:
             )
         if self.kept_electrodes and self.sensor.calibration != Calibration():
             raise InputError(f"keep: {self.sensor.name} is calibrated; start from its layout without [calibration]")
+
         if self.sensor.readout != "edge":
             return
         for electrode in self.kept_electrodes:
@@ -227,7 +233,11 @@ class DesignCase:
 
     @property
     def square_side(self) -> float:
-        """Side of the new squares, mm."""
+        """Side of the new squares, mm.
+
+        If the side is not given, it is the side of the first square of the sensor, or `DEFAULT_SIDE` if the sensor has
+        no square.
+        """
         if self.side is not None:
             return float(self.side)
         squares = [electrode for electrode in self.sensor.electrodes if electrode.square]
@@ -270,22 +280,30 @@ class DesignCase:
         return self.goal.weigh(presses) if isinstance(self.goal, WeightMap) else np.ones(len(presses))
 
     def clearance(self, positions: Array) -> Array:
-        """Compute by how much the distances of single squares from the rim and the kept electrodes exceed the required
-        distances.
+        """Compute by how much single squares satisfy the distance rules.
+
+        A square must have the distance `rim` from the rim of the film, and the distance `gap` from the bounding boxes
+        of the kept electrodes.
 
         Args:
             positions: Centres of the squares, shape (n, 2), mm.
 
         Returns:
-            Excess distance, shape (n,), mm; negative if a rule is violated.
+            Smallest difference between an actual and a required distance, shape (n,), mm; negative if a rule is
+            violated.
         """
+        # The corner that is farthest from the centre of the film determines the distance from the rim.
         half_side = 0.5 * self.square_side
-        corner_distance = np.hypot(*(np.abs(positions) + half_side).T)
+        corner_x, corner_y = (np.abs(positions) + half_side).T
+        corner_distance = np.hypot(corner_x, corner_y)
         clearances = [self.sensor.film.radius - self.rim - corner_distance]
+
         for electrode in self.kept_electrodes:
-            for low, high in zip(*electrode.boxes, strict=True):
-                distance = np.maximum(low - positions, positions - high) - half_side
-                clearances.append(distance.max(axis=1) - self.gap)
+            lower_left_corners, upper_right_corners = electrode.boxes
+            for low, high in zip(lower_left_corners, upper_right_corners, strict=True):
+                # Gaps along x and y, shape (n, 2). A gap is negative if square and box overlap along this axis.
+                axis_gaps = np.maximum(low - positions, positions - high) - half_side
+                clearances.append(axis_gaps.max(axis=1) - self.gap)
         return np.asarray(np.min(clearances, axis=0))
 
     def pair_clearance(self, positions: Array, others: Array) -> Array:
@@ -321,7 +339,7 @@ class DesignCase:
         unused_names = [name for name in NAMES if name not in self.keep]
         squares = [
             Electrode.of_square(name, (x, y), self.square_side)
-            for name, (x, y) in zip(unused_names, anticlockwise.tolist(), strict=False)
+            for name, (x, y) in zip(unused_names, anticlockwise.tolist(), strict=False)  # some names remain unused
         ]
         electrodes = tuple(sorted((*self.kept_electrodes, *squares), key=lambda electrode: electrode.name))
         name = f"{self.sensor.name}-{self.electrodes}-over-{self.radius:g}mm"

@@ -67,11 +67,14 @@ LOG_FORCE_STEP = 0.05
 PRETENSION_STEP = 0.1
 """Step of the finite differences with respect to the pretension, MPa."""
 
+WIDE_RADIUS = 0.25
+"""Radius of the table above which more distances are solved, in film radii."""
+
 N_DISTANCES = 5
-"""Number of distances that are solved if the radius is at most a quarter of the film radius."""
+"""Number of distances that are solved for a radius of the table up to `WIDE_RADIUS`."""
 
 N_DISTANCES_WIDE = 8
-"""Number of distances that are solved if the radius is more than a quarter of the film radius."""
+"""Number of distances that are solved for a radius of the table above `WIDE_RADIUS`."""
 
 GAUSS_RULES = ((1.4, 10), (2.5, 4), (np.inf, 2))
 """Integration rules of squares.
@@ -123,20 +126,22 @@ class ChargeTable:
         Raises:
             SolveError: If an equilibrium is not reached.
         """
+        # All presses have the mesh that the outermost press needs.
         film = sensor.film
         settings = SolveSettings(theory=theory_for(sensor, probe, (force, force)), layer=layer_for(film, force))
         settings = replace(settings, resolution=needed_resolution(film, probe, (radius, 0.0), force, settings))
 
-        is_wide = radius > 0.25 * film.radius
+        # The distances are Chebyshev nodes in `distance_coordinate`, whose inverse is `tanh`.
+        is_wide = radius > WIDE_RADIUS * film.radius
         n_distance = N_DISTANCES_WIDE if is_wide else N_DISTANCES
         largest_coordinate = float(distance_coordinate(radius / film.radius))
         distance = film.radius * np.tanh(chebyshev_nodes(n_distance, 0.0, largest_coordinate))
         solve = partial(_stress_at, film, sensor.surface, probe, force, settings)
         solved = list(track(in_order(executor, solve, distance.tolist()), "solving the film", n_distance))
 
-        # From (n_distance, 6, n_node, 3) to (n_distance * 3, n_node * 6)
-        component_first = np.stack(solved).transpose(0, 3, 2, 1)
-        stress = component_first.reshape(3 * n_distance, -1).astype(np.float32)
+        # The axes (distance, column of a row, node, stress component) become (distance, component, node, column).
+        component_before_node = np.stack(solved).transpose(0, 3, 2, 1)
+        stress = component_before_node.reshape(3 * n_distance, -1).astype(np.float32)
         return cls(film.radius, probe, (sensor.piezo.d31, sensor.piezo.d32), distance, stress)
 
     def rows(self, presses: Array, centres: Array, side: float, others: tuple[Electrode, ...] = ()) -> Array:
@@ -156,8 +161,9 @@ class ChargeTable:
         chunks = []
         for start in range(0, len(presses), PRESS_CHUNK):
             pressed = _PressedFilm.of(self, presses[start : start + PRESS_CHUNK])
-            electrodes = [pressed.squares(centres, side), *(pressed.electrode(electrode) for electrode in others)]
-            chunks.append(np.concatenate(electrodes, axis=1))
+            square_rows = pressed.squares(centres, side)
+            other_rows = [pressed.electrode(electrode) for electrode in others]
+            chunks.append(np.concatenate([square_rows, *other_rows], axis=1))
         return np.concatenate(chunks)
 
 
@@ -191,28 +197,22 @@ class _PressedFilm:
             presses: Positions (x, y) of the presses, shape (n, 2), mm.
         """
         position = presses @ np.array([1.0, 1j])  # x + iy
-        distance = np.abs(position)
         direction = np.exp(1j * np.angle(position))
+        relative_distance = np.abs(position) / table.film_radius
 
-        # Piezoelectric coefficients in the frame of the press, from the rotation of the stress tensor
-        d31, d32 = table.piezo
-        mean = 0.5 * (d31 + d32)
-        half_difference = 0.5 * (d31 - d32)
-        double_angle = direction**2
-        s11_coefficient = mean + half_difference * double_angle.real
-        s22_coefficient = mean - half_difference * double_angle.real
-        s12_coefficient = -2.0 * half_difference * double_angle.imag
-        coefficients = np.stack([s11_coefficient, s22_coefficient, s12_coefficient], axis=1)
-
-        # Interpolation over the distance and sum over the components of the stress in one matrix product
+        # The stress is interpolated over the distance, and its components are multiplied by the piezoelectric
+        # coefficients and added. One matrix product does both.
         nodes = distance_coordinate(table.distance / table.film_radius)
-        coordinate = distance_coordinate(distance / table.film_radius)
+        coordinate = distance_coordinate(relative_distance)
         distance_weights = lagrange_values(nodes, barycentric_weights(nodes), coordinate)
+        coefficients = _piezo_in_press_frame(table.piezo, direction)
         weights = distance_weights[:, :, None] * coefficients[:, None, :]  # shape (n, n_distance, 3)
-        weights = weights.reshape(len(position), -1).astype(np.float32)
-        density = (weights @ table.stress).reshape(-1, len(COLUMNS))
+        flat_weights = weights.reshape(len(position), -1).astype(np.float32)
+        density = (flat_weights @ table.stress).reshape(-1, len(COLUMNS))
+
+        # Conformal map of each press, which transforms the circle of the probe into the circle |z| = rho
         relative_radius = np.full(len(position), table.probe.radius / table.film_radius)
-        pole, rho = automorphism_onto(distance / table.film_radius, relative_radius)
+        pole, rho = automorphism_onto(relative_distance, relative_radius)
         return cls(table, position, direction, pole, rho, density)
 
     def squares(self, centres: Array, side: float) -> Array:
@@ -232,8 +232,9 @@ class _PressedFilm:
         half_diagonal = np.sqrt(0.5) * side
         relative_distance = distance / (half_diagonal + self.table.probe.radius)
 
-        # Choose the integration rule of each pair of a press and a square, and compute the pairs with the same rule.
-        chosen_rule = np.searchsorted([largest for largest, _ in GAUSS_RULES], relative_distance)
+        # Choose the integration rule of each pair of a press and a square. Then compute all pairs with the same rule
+        # together, in chunks that limit the memory.
+        chosen_rule = np.searchsorted([largest_distance for largest_distance, _ in GAUSS_RULES], relative_distance)
         rows = np.empty((*distance.shape, len(COLUMNS)))
         for rule_index, (_, points_per_side) in enumerate(GAUSS_RULES):
             unit_points, weights = gauss_square(points_per_side)
@@ -256,16 +257,19 @@ class _PressedFilm:
             Rows with the columns `COLUMNS`, shape (n, 1, 6).
         """
         _, points_per_side = GAUSS_RULES[0]  # the finest rule
-        points, weights = electrode_rule(electrode, "area", points_per_side)
+        points, component_weights = electrode_rule(electrode, "area", points_per_side)
+        weights = component_weights[:, 0]  # the weights of s11, s22 and s12 are equal
         n_chunk = math.ceil(len(self.presses) * len(points) / POINT_CHUNK)
         means = []
-        for chunk in np.array_split(np.arange(len(self.presses)), n_chunk):
-            chunk_points = np.broadcast_to(points, (len(chunk), *points.shape))
-            means.append(self.means(chunk, chunk_points, weights[:, 0]))
+        for press_chunk in np.array_split(np.arange(len(self.presses)), n_chunk):
+            chunk_points = np.broadcast_to(points, (len(press_chunk), *points.shape))
+            means.append(self.means(press_chunk, chunk_points, weights))
         return electrode.area * np.concatenate(means)[:, None]
 
     def means(self, press_index: Integers, points: Array, weights: Array) -> Array:
         """Compute weighted means of the charge per area and its derivatives.
+
+        The values at the points are interpolated from the polar grid of each press.
 
         Args:
             press_index: Indices of the presses, shape (k,).
@@ -279,16 +283,11 @@ class _PressedFilm:
         direction = self.direction[press_index]
         complex_points = points @ np.array([1.0, 1j])  # x + iy
         points_in_press_frame = complex_points / direction[:, None]
-        row, column = self._grid_coordinates(press_index, points_in_press_frame)
-        rows, row_weights = _row_weights(row)
-        columns, column_weights = cubic_weights(column, ANGLES, periodic=True)
+        nodes, node_weights = self._nodes_around(press_index, points_in_press_frame, weights)
 
-        # Nodes of the grid around each point and their weights, shape (k, n_point, n_row, n_column)
-        first_row = press_index[:, None, None, None] * (INNER_ROWS + OUTER_ROWS)
-        nodes = (first_row + rows[..., None]) * ANGLES + columns[..., None, :]
-        node_weights = weights[:, None, None] * row_weights[..., None] * column_weights[..., None, :]
+        # Sum over the nodes around all points of each mean
         flat_weights = node_weights.reshape(n_mean, 1, -1).astype(np.float32)
-        node_density = self.density[nodes.reshape(n_mean, -1)]
+        node_density = self.density[nodes.reshape(n_mean, -1)]  # shape (k, n_point * n_row * n_column, 6)
         mean: Array = np.matmul(flat_weights, node_density)[:, 0].astype(float)
 
         # The derivatives with respect to x and y are rotated from the frame of the press to the frame of the film.
@@ -299,8 +298,29 @@ class _PressedFilm:
         mean[:, y_column] = position_derivative.imag
         return mean
 
+    def _nodes_around(self, press_index: Integers, points: Complexes, point_weights: Array) -> tuple[Integers, Array]:
+        """Return the nodes of the polar grids around points, and their weights for cubic interpolation.
+
+        Args:
+            press_index: Indices of the presses, shape (k,).
+            points: Points x + iy in the frame of the press, shape (k, n_point), mm.
+            point_weights: Weights of the points, by which the weights of the nodes are multiplied, shape (n_point,).
+
+        Returns:
+            Indices into `density`, and weights, each of shape (k, n_point, n_row, n_column).
+        """
+        row, column = self._grid_coordinates(press_index, points)
+        rows, row_weights = _row_weights(row)
+        columns, column_weights = cubic_weights(column, ANGLES, periodic=True)
+        first_row = press_index[:, None, None, None] * (INNER_ROWS + OUTER_ROWS)  # of the grid of each press
+        nodes = (first_row + rows[..., None]) * ANGLES + columns[..., None, :]
+        node_weights = point_weights[:, None, None] * row_weights[..., None] * column_weights[..., None, :]
+        return nodes, node_weights
+
     def _grid_coordinates(self, press_index: Integers, points: Complexes) -> tuple[Array, Array]:
-        """Compute row and column on the grid. Points beyond the rim are moved to the rim.
+        """Compute the fractional rows and columns of points on the polar grids.
+
+        Points beyond the rim are moved to the rim.
 
         Args:
             press_index: Indices of the presses, shape (k,).
@@ -313,7 +333,7 @@ class _PressedFilm:
         rho = self.rho[press_index, None]
         unit_points = points / self.table.film_radius
         unit_points = unit_points / np.maximum(np.abs(unit_points), 1.0)
-        z = (unit_points - pole) / (1.0 - pole * unit_points)
+        z = (unit_points - pole) / (1.0 - pole * unit_points)  # conformal map of the press
         radius = np.abs(z)
 
         # Rows are equally spaced in |z| within the circle, and in ln|z| outside; see `_grid_points`.
@@ -324,8 +344,31 @@ class _PressedFilm:
         return row, np.angle(z) * ANGLES / (2.0 * np.pi)
 
 
+def _piezo_in_press_frame(piezo: tuple[float, float], direction: Complexes) -> Array:
+    """Rotate the piezoelectric coefficients from the axes of the film into the frame of each press.
+
+    Args:
+        piezo: Coefficients d31 and d32, pC/N.
+        direction: Unit vector from the centre of the film to each press as a complex number, shape (n,).
+
+    Returns:
+        Charge per area and stress (s11, s22, s12) in the frame of the press, shape (n, 3), pC/N.
+    """
+    d31, d32 = piezo
+    mean = 0.5 * (d31 + d32)
+    half_difference = 0.5 * (d31 - d32)
+    double_angle = direction**2  # cosine and sine of twice the angle of the press
+    s11_coefficient = mean + half_difference * double_angle.real
+    s22_coefficient = mean - half_difference * double_angle.real
+    s12_coefficient = -2.0 * half_difference * double_angle.imag
+    return np.stack([s11_coefficient, s22_coefficient, s12_coefficient], axis=1)
+
+
 def _row_weights(row: Array) -> tuple[Integers, Array]:
     """Compute the rows and weights of cubic interpolation, separately on both sides of the circle of the probe.
+
+    The inner rows come first. Fractional rows up to half a row beyond the last inner row are interpolated from inner
+    rows only, and all others from outer rows only.
 
     Args:
         row: Fractional rows, any shape.
@@ -346,6 +389,8 @@ def _stress_at(
 ) -> Array:
     """Solve a press on the positive x axis, and compute the stress on the grid and its derivatives.
 
+    The derivatives are computed by finite differences between solved presses.
+
     Args:
         film: Film.
         surface: Surface at which the stress is read.
@@ -361,24 +406,32 @@ def _stress_at(
     unchanged_press = press(film, probe, (distance, 0.0), force, settings)
 
     def changed_stress(
-        x: float = 0.0, y: float = 0.0, log_force: float = 0.0, radius: float = 0.0, pretension: float = 0.0
+        x_change: float = 0.0,
+        y_change: float = 0.0,
+        log_force_change: float = 0.0,
+        radius_change: float = 0.0,
+        pretension_change: float = 0.0,
     ) -> Array:
-        """Return the stress on the grid for changed parameters, shape (n_node, 3), MPa."""
-        changed_film = replace(film, pretension=film.pretension + pretension)
-        changed_probe = Circle(probe.radius + radius)
-        changed_force = force * float(np.exp(log_force))
-        position = (distance + x, y)
+        """Return the stress on the grid after changes of some quantities, shape (n_node, 3), MPa.
+
+        The solve starts from the unchanged press.
+        """
+        changed_film = replace(film, pretension=film.pretension + pretension_change)
+        changed_probe = Circle(probe.radius + radius_change)
+        changed_force = force * float(np.exp(log_force_change))
+        position = (distance + x_change, y_change)
         changed_press = press(changed_film, changed_probe, position, changed_force, settings, start=unchanged_press)
         return touch_stress(changed_press, points, surface)
 
-    def central_difference(parameter: str, step: float) -> Array:
-        """Return the derivative of the stress with respect to a parameter of `changed_stress`."""
-        return (changed_stress(**{parameter: step}) - changed_stress(**{parameter: -step})) / (2.0 * step)
+    def central_difference(quantity: str, step: float) -> Array:
+        """Return the derivative of the stress with respect to "x", "y", "log_force" or "radius"."""
+        change = f"{quantity}_change"
+        return (changed_stress(**{change: step}) - changed_stress(**{change: -step})) / (2.0 * step)
 
     stress = touch_stress(unchanged_press, points, surface)
     length_step = RELATIVE_STEP * probe.radius
     # The pretension may be zero and cannot become negative, so its difference is one-sided.
-    pretension_derivative = (changed_stress(pretension=PRETENSION_STEP) - stress) / PRETENSION_STEP
+    pretension_derivative = (changed_stress(pretension_change=PRETENSION_STEP) - stress) / PRETENSION_STEP
     return np.stack(
         [
             stress,
@@ -405,12 +458,15 @@ def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Ar
     Returns:
         Points (x, y), shape (n_node, 2), mm.
     """
+    # Polar grid in the plane of z, with a small gap on both sides of the circle |z| = rho
     pole, rho = automorphism_onto(np.array(distance / film_radius), np.array(probe_radius / film_radius))
     inner_radii = rho * (1.0 - MARGIN) * np.linspace(0.0, 1.0, INNER_ROWS)
     outer_radii = (rho * (1.0 + MARGIN)) ** np.linspace(1.0, 0.0, OUTER_ROWS)
     radii = np.concatenate([inner_radii, outer_radii])
     directions = np.exp(2j * np.pi * np.arange(ANGLES) / ANGLES)
     z = radii[:, None] * directions
+
+    # Inverse of the conformal map z = (p - pole) / (1 - pole p)
     unit_points = ((z + pole) / (1.0 + pole * z)).ravel()
     points = film_radius * unit_points * (1.0 - 1e-12)  # the outermost points remain on the film despite round-off
     return np.stack([points.real, points.imag], axis=1)

@@ -35,7 +35,7 @@ NOT_SEARCHED = "folds and ambiguous pairs could not be looked for: the charges v
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """Lower limits of the position error of one layout. They are computed for the presses of a design case.
+    """Lower limits of the position error of one layout. The limits are computed for the presses of a design case.
 
     Attributes:
         presses: Positions of the presses on a square grid, shape (n, 2), mm.
@@ -109,7 +109,8 @@ class Design:
 def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     """Find the layout with the smallest position errors that has neither folds nor ambiguous pairs.
 
-    If all refined layouts are ambiguous, the layout with the smallest error is returned.
+    Random layouts are improved on a grid, and the best layouts are refined. The refined layouts are checked in the
+    order of their errors. If all of them are ambiguous, the layout with the smallest error is returned.
 
     Args:
         case: Design case.
@@ -134,7 +135,7 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     forward_map = _solve_forward_map(case, executor)
     candidates: list[tuple[Sensor, float, str]] = []
     for error, *coordinates in track(refined_layouts, "looking for folds and ambiguous pairs"):
-        centres = np.round(np.array(coordinates).reshape(-1, 2), DECIMALS)
+        centres = np.round(np.array(coordinates).reshape(-1, 2), DECIMALS)  # x and y of one square after the other
         sensor = case.layout(centres)
         summary = NOT_SEARCHED
         if forward_map is not None:
@@ -142,6 +143,8 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
         candidates.append((sensor, float(error), summary))
         if summary == UNAMBIGUOUS:
             break
+
+    # If the last candidate is unambiguous, it is chosen, and the others are refused. Otherwise the first one is chosen.
     n_refused = len(candidates) - 1 if summary == UNAMBIGUOUS else 0
     sensor, error, summary = candidates[n_refused]
     errors_before = error_map(case, table, case.sensor) if len(case.sensor.electrodes) >= 3 else None
@@ -150,7 +153,7 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
 
 
 def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMap | None:
-    """Build the forward map of the film over the default range of forces.
+    """Build the forward map of the film for the default range of forces, which is extended to the force of the case.
 
     The stress does not depend on the electrodes, so all layouts use the same map.
 
@@ -161,10 +164,10 @@ def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMa
     Returns:
         Map with the electrodes of the sensor of the case, or None if it does not reach its accuracy.
     """
-    low = min(DEFAULT_FORCE_RANGE[0], case.force)
-    high = max(DEFAULT_FORCE_RANGE[1], case.force)
+    default_min_force, default_max_force = DEFAULT_FORCE_RANGE
+    force_range = (min(default_min_force, case.force), max(default_max_force, case.force))
     try:
-        return ForwardMap.build(case.sensor, case.probe, case.radius, (low, high), executor=executor)
+        return ForwardMap.build(case.sensor, case.probe, case.radius, force_range, executor=executor)
     except SolveError:
         return None
 
@@ -181,17 +184,19 @@ def ambiguities(case: DesignCase, charges: ChargeMap) -> str:
     Returns:
         `UNAMBIGUOUS`, or a sentence about the folds and pairs.
     """
-    low, high = charges.domain.force_range
-    forces = sorted({low, case.force, high})
+    min_force, max_force = charges.domain.force_range
+    forces = sorted({min_force, case.force, max_force})
     rings = Rings.spread(case.radius)
-    folds = np.concatenate([find_folds(charges, rings, force, case.noise).points for force in forces])
-    pairs = sum(len(find_ambiguous_pairs(charges, case.noise, force)) for force in forces)
-    found = []
-    if len(folds):
-        found.append(f"the map folds {np.hypot(*folds.T).min():.1f} mm from the centre")
-    if pairs:
-        found.append(f"{pairs} pairs of contacts have the same charges")
-    return "; ".join(found) or UNAMBIGUOUS
+    fold_points = np.concatenate([find_folds(charges, rings, force, case.noise).points for force in forces])
+    pair_count = sum(len(find_ambiguous_pairs(charges, case.noise, force)) for force in forces)
+
+    findings = []
+    if len(fold_points):
+        x, y = fold_points.T
+        findings.append(f"the map folds {np.hypot(x, y).min():.1f} mm from the centre")
+    if pair_count:
+        findings.append(f"{pair_count} pairs of contacts have the same charges")
+    return "; ".join(findings) or UNAMBIGUOUS
 
 
 def error_map(case: DesignCase, table: ChargeTable, sensor: Sensor) -> ErrorMap:
@@ -206,7 +211,8 @@ def error_map(case: DesignCase, table: ChargeTable, sensor: Sensor) -> ErrorMap:
         Position errors for the noise alone, and for the noise and the nuisances, mm.
     """
     no_squares = np.empty((0, 2))
-    charge_rows = table.rows(case.fine_grid, no_squares, 1.0, sensor.electrodes)
+    unused_side = 1.0
+    charge_rows = table.rows(case.fine_grid, no_squares, unused_side, sensor.electrodes)
     error_by_noise = np.sqrt(ErrorModel.of(case.noise, NO_NUISANCES).squared(charge_rows))
     error_with_nuisances = np.sqrt(ErrorModel.of(case.noise, case.nuisances).squared(charge_rows))
     return ErrorMap(case.fine_grid, error_by_noise, error_with_nuisances)

@@ -3,8 +3,8 @@
 Electrodes on one circle give a press outside the circle nearly the charges of a press inside it (`mirror_region`). A
 further electrode at another distance from the centre has different charges under both presses. The search first finds
 pairs of contacts with the same charges: a press outside the working area, which cannot be noticed, and a contact inside
-it. For each position of the further square, the search then starts a descent from the inner contact of each pair. It
-counts the pairs for which the descent still finds a contact with the same charges. The mirror region of the best
+it. For each position of the further square, the search then starts a descent from the inner contact of each pair. The
+search counts the pairs for which the descent still finds a contact with the same charges. The mirror region of the best
 positions is computed by a search over the whole working area.
 """
 
@@ -165,17 +165,18 @@ def design_guard(case: DesignCase, *, executor: Executor | None = None) -> Guard
     shares = _estimated_shares(case, inner_map, outer_map, sensors)
 
     # Sort the sensors with nearly the smallest share by their position limits.
-    largest_share = shares.min() + SHARE_TOLERANCE
-    candidates = np.flatnonzero(shares <= largest_share)
-    limits = [PositionLimits.of(replace(inner_map, sensor=sensors[index]), case) for index in candidates]
+    accepted_share = shares.min() + SHARE_TOLERANCE
+    candidates = [sensors[index] for index in np.flatnonzero(shares <= accepted_share)]
+    limits = [PositionLimits.of(replace(inner_map, sensor=candidate), case) for candidate in candidates]
     order = np.argsort([limit.rms for limit in limits], kind="stable")
+    best_candidates = [candidates[index] for index in order[:MAX_CHECKED]]
 
     # The shares are estimates. Check the best sensors by a full search until one confirms its estimate.
     results: list[tuple[MirrorRegion, Sensor]] = []
-    for index in track(candidates[order[:MAX_CHECKED]].tolist(), "computing mirror regions"):
-        region = _mirror_region(case, inner_map, outer_map, sensors[index])
-        results.append((region, sensors[index]))
-        if region.total_share <= largest_share:
+    for candidate in track(best_candidates, "computing mirror regions"):
+        region = _mirror_region(case, inner_map, outer_map, candidate)
+        results.append((region, candidate))
+        if region.total_share <= accepted_share:
             break
     region_after, sensor = min(results, key=lambda result: result[0].total_share)
     return GuardDesign(
@@ -189,10 +190,12 @@ def design_guard(case: DesignCase, *, executor: Executor | None = None) -> Guard
 
 
 def _free_positions(case: DesignCase) -> Array:
-    """Return the positions of a square grid where a further square fits, shape (n, 2), mm.
+    """Return the positions at which a further square electrode fits, shape (n, 2), mm.
+
+    The positions are points of a regular grid over the film.
 
     Raises:
-        InputError: If there are none.
+        InputError: If no square fits.
     """
     film_radius = case.sensor.film.radius
     grid = square_grid(film_radius, film_radius / GRID_STEPS)
@@ -223,6 +226,10 @@ def _mirror_region(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMa
 def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMap, sensors: list[Sensor]) -> Array:
     """Estimate the share of presses outside the working area that cannot be noticed, for several guard electrodes.
 
+    A press is not noticed if some contact in the working area explains its charges. Presses that are noticed without a
+    guard electrode are noticed with any guard electrode. For the other presses, the search for a contact is repeated
+    with the charge of each guard electrode, from the contact that was found without it.
+
     Args:
         case: Radius of the working area and noise.
         inner_map: Accurate forward map of the working area.
@@ -230,20 +237,22 @@ def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: Forwar
         sensors: Sensors whose last electrode is the guard electrode.
 
     Returns:
-        Shape (n_sensor,), dimensionless.
+        Shares, shape (n_sensor,), dimensionless.
     """
+    # Contacts in the working area that best explain the charges of presses outside
     presses = _presses_outside(case, outer_map)
     charge = outer_map.charges(presses)
     inner_charges = ChargeSpline.of(inner_map)
     contact, residual = search(inner_charges, charge, case.noise.sigma(charge))
-    is_mirrored = (np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS) & is_interior(inner_charges.domain, contact)
+    is_explained = np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS
+    is_mirrored = is_explained & is_interior(inner_charges.domain, contact)
     if not is_mirrored.any():
         return np.zeros(len(sensors))
 
     mirrored_presses = presses[is_mirrored]
     shares = []
     for sensor in track(sensors, "comparing positions"):
-        guard_only = replace(case.sensor, electrodes=sensor.electrodes[-1:])
+        guard_only = replace(case.sensor, electrodes=sensor.electrodes[-1:])  # the guard electrode is the last one
         guard_charge = replace(outer_map, sensor=guard_only).charges(mirrored_presses)
         charge_with_guard = np.concatenate([charge[is_mirrored], guard_charge], axis=1)
         map_with_guard = JoinedMap(inner_charges, replace(inner_map, sensor=guard_only))
@@ -288,11 +297,18 @@ class JoinedMap:
 def _presses_outside(case: DesignCase, outer_map: ForwardMap) -> Array:
     """Return presses that are spread over the film outside the working area, shape (n, 3), mm and N.
 
-    Their forces repeat over those of the mirror region.
+    The presses have `N_FORCES` different forces in turn, in the range of the mirror region.
+
+    Args:
+        case: Radius of the working area.
+        outer_map: Forward map whose domain contains the presses.
     """
-    low, high = outer_map.domain.force_range
-    forces = np.geomspace(max(low, high / FORCE_RATIO), high, N_FORCES)
+    min_force, max_force = outer_map.domain.force_range
+    forces = np.geomspace(max(min_force, max_force / FORCE_RATIO), max_force, N_FORCES)
+
+    # Spread points over the whole disk, so many that about `N_OUTSIDE` of them lie outside the working area.
     outer_radius = outer_map.domain.radius
-    pattern = sunflower(round(N_OUTSIDE / (1.0 - (case.radius / outer_radius) ** 2))) * outer_radius
-    position = pattern[np.abs(pattern) > case.radius]
+    share_outside = 1.0 - (case.radius / outer_radius) ** 2
+    points = sunflower(round(N_OUTSIDE / share_outside)) * outer_radius  # x + iy, mm
+    position = points[np.abs(points) > case.radius]
     return np.stack([position.real, position.imag, np.resize(forces, position.size)], axis=1)

@@ -1,10 +1,11 @@
 """Lower limit of the position error of a layout, with nuisance parameters.
 
-Let A = d(charge) / d(x, y, ln F, nuisances) for all electrodes, W the diagonal matrix of the Fisher information that
-one reading provides about its charge, and P the inverse of the prior covariance. The Fisher information matrix of all
-parameters is B = A' W A + P. The Cramer-Rao limit of the position, with marginalised nuisances, is the block of the
-inverse of B that belongs to x and y. A further electrode adds a matrix a a' to B, where a is the row of sqrt(W) A that
-belongs to this electrode. The limit then changes according to Sherman and Morrison (1950):
+Let A = d(charge) / d(x, y, ln F, nuisances) be the derivatives for all electrodes. Let W be the diagonal matrix of the
+Fisher information that one reading provides about its charge, and P the inverse of the prior covariance. The Fisher
+information matrix of all parameters is B = A' W A + P. The Cramer-Rao limit of the position, with marginalised
+nuisances, is the block of the inverse of B that belongs to x and y. A further electrode adds a matrix a a' to B, where
+a is the row of sqrt(W) A that belongs to this electrode. The limit then changes according to Sherman and Morrison
+(1950):
 
     tr_xy (B + a a')^-1 = tr_xy B^-1 - |(B^-1 a)_xy|^2 / (1 + a' B^-1 a).
 """
@@ -95,8 +96,10 @@ def position_variance(inverse: Array) -> Array:
 
 
 def with_one_more(sensitivity: Array, candidates: Array) -> Array:
-    """Compute the squared errors of a layout to which one further electrode is added, for many candidates for this
-    electrode.
+    """Compute the squared position errors of a layout with one further electrode, for many candidates.
+
+    Each candidate changes the inverse information matrix by the formula of Sherman and Morrison; see the docstring of
+    this module.
 
     Args:
         sensitivity: Sensitivities of the electrodes of the layout, shape (n_press, n_electrode, 5).
@@ -106,8 +109,8 @@ def with_one_more(sensitivity: Array, candidates: Array) -> Array:
         Squared position errors, shape (n_press, n_candidate), mm^2.
     """
     # With the notation of the docstring of this module: `inverse` is B^-1, and each candidate is a vector a.
-    inverse = inverse_information(sensitivity)
-    inverse_times_candidate = inverse @ candidates
+    inverse = inverse_information(sensitivity)  # shape (n_press, 5, 5), in the order (x, y, ...)
+    inverse_times_candidate = inverse @ candidates  # shape (n_press, 5, n_candidate)
     squared_position_part = (inverse_times_candidate[:, :2] ** 2).sum(axis=1)  # |(B^-1 a)_xy|^2
     quadratic_form = (inverse_times_candidate * candidates).sum(axis=1)  # a' B^-1 a
     reduction = squared_position_part / (1.0 + quadratic_form)

@@ -127,22 +127,26 @@ def random_layouts(case: DesignCase) -> tuple[Array, list[Integers]]:
 def _random_layout(case: DesignCase, grid: Array, rng: np.random.Generator) -> Integers:
     """Choose random positions of the grid for the new squares, with the required distances between them.
 
+    The positions are tried in random order. A position is chosen if its square has the required distance from the
+    squares at all positions chosen before.
+
     Args:
         case: Design case.
         grid: Allowed positions, shape (n, 2), mm.
         rng: Random number generator.
 
     Returns:
-        Indices of the positions. There are fewer than `case.new_count` positions if no further square fits.
+        Indices of the positions, in the order in which they were chosen, shape (n_new,). There are fewer than
+        `case.new_count` indices if no further square fits.
     """
     chosen: list[int] = []
     for candidate in rng.permutation(len(grid)).tolist():
         if len(chosen) == case.new_count:
             break
-        clearance = case.pair_clearance(grid[[candidate]], grid[chosen])
+        clearance = case.pair_clearance(grid[[candidate]], grid[chosen])  # shape (1, len(chosen))
         if (clearance >= 0.0).all():
             chosen.append(candidate)
-    return np.array(chosen)
+    return np.array(chosen, dtype=np.intp)
 
 
 @dataclass(frozen=True)
@@ -202,14 +206,16 @@ class Search:
         """
         exchange = _Exchange.of(self, grid)
         results = [exchange.improve(layout) for layout in track(layouts, "exchanging")]
-        results.sort(key=lambda result: result[0])
+        results.sort(key=lambda result: result[0])  # by the error
+
+        # Two layouts count as different if their errors differ.
         finalists: list[Array] = []
-        last_value = 0.0
-        for value, indices in results:
-            is_different = value > last_value * (1.0 + MIN_DIFFERENCE)
+        last_error = 0.0
+        for error, indices in results:
+            is_different = error > last_error * (1.0 + MIN_DIFFERENCE)
             if is_different and len(finalists) < MAX_FINALISTS:
                 finalists.append(grid[indices])
-                last_value = value
+                last_error = error
         return finalists
 
     def value(self, positions: Array) -> float:
@@ -253,7 +259,7 @@ class Search:
             selection: Selection of presses.
 
         Returns:
-            Shape (n_error, 2 n_new), 1/mm.
+            Derivatives, shape (n_error, 2 n_new), 1/mm.
         """
         kept_rows = self.kept_rows[selection]
         n_new = len(positions)
@@ -284,7 +290,7 @@ class Search:
             positions: Centres of the new squares, shape (n_new, 2), mm.
 
         Returns:
-            Shape (n_rule, 2 n_new), dimensionless.
+            Derivatives, shape (n_rule, 2 n_new), dimensionless.
         """
         base = self.case.all_clearances(positions)
         steps = DIFFERENCE_STEP * np.eye(positions.size).reshape(-1, *positions.shape)
@@ -294,13 +300,16 @@ class Search:
     def refine(self, positions: Array) -> Array:
         """Improve a layout by small steps that satisfy the distance rules.
 
+        If a round does not improve the layout, the largest step is halved. The refinement ends when a round with a
+        small step brings no improvement.
+
         Args:
             positions: Centres of the new squares, shape (n_new, 2), mm.
 
         Returns:
             Minimised quantity of the refined layout, mm, followed by its coordinates, mm, shape (1 + 2 n_new,).
         """
-        step = FIRST_STEP
+        step = FIRST_STEP  # in units of the side of a square
         best_value = self.value(positions)
         for _ in range(MAX_ROUNDS):
             moved = self._refinement_round(positions, step * self.case.square_side)
@@ -315,8 +324,27 @@ class Search:
                 break
         return np.append(best_value, positions)
 
+    def _active_presses(self, positions: Array) -> Integers | slice:
+        """Select the presses whose errors a refinement bounds.
+
+        If the goal is the largest error, these are at most `MAX_ACTIVE` presses with nearly the largest error. For
+        other goals, all presses are selected.
+
+        Args:
+            positions: Centres of the new squares, shape (n_new, 2), mm.
+        """
+        if self.case.goal != "worst":
+            return ALL_PRESSES
+        squared_error = self.squared_errors(positions, ALL_PRESSES)
+        largest = np.argsort(-squared_error)[:MAX_ACTIVE]
+        active: Integers = largest[squared_error[largest] >= ACTIVE_ERROR**2 * squared_error.max()]
+        return active
+
     def _refinement_round(self, positions: Array, max_step: float) -> Array:
         """Run sequential quadratic programming for the presses that have the largest errors.
+
+        The variables are the coordinates of the squares and a bound of the logarithmic errors. The bound is minimised,
+        subject to the constraints that no error exceeds it and that the distance rules are satisfied.
 
         Args:
             positions: Centres of the new squares, shape (n_new, 2), mm.
@@ -325,13 +353,9 @@ class Search:
         Returns:
             Changed positions, shape (n_new, 2), mm.
         """
-        active: Integers | slice = ALL_PRESSES
-        if self.case.goal == "worst":
-            squared_error = self.squared_errors(positions, ALL_PRESSES)
-            largest = np.argsort(-squared_error)[:MAX_ACTIVE]
-            active = largest[squared_error[largest] >= ACTIVE_ERROR**2 * squared_error.max()]
+        active = self._active_presses(positions)
 
-        # The variables are the coordinates, followed by an upper bound of the logarithmic errors, which is minimised.
+        # The last variable is the bound of the logarithmic errors.
         def constraints(variables: Array) -> Array:
             """Return values that must not be negative: the bound minus the log errors, and the excess distances."""
             moved = variables[:-1].reshape(-1, 2)
@@ -339,7 +363,10 @@ class Search:
             return np.concatenate([bound - self._log_errors(moved, active), self.case.all_clearances(moved)])
 
         def constraint_jacobian(variables: Array) -> Array:
-            """Return the derivatives of the constraints with respect to the variables."""
+            """Return the derivatives of the constraints with respect to the variables.
+
+            The last variable, the bound, enters only the constraints of the errors, with the derivative 1.
+            """
             moved = variables[:-1].reshape(-1, 2)
             log_error_jacobian = self._log_error_jacobian(moved, active)
             clearance_jacobian = self._clearance_jacobian(moved)
@@ -349,8 +376,9 @@ class Search:
             return np.concatenate([coordinate_columns, bound_column], axis=1)
 
         start = np.append(positions, self._log_errors(positions, active).max())
-        gradient = np.append(np.zeros(positions.size), 1.0)
-        bounds = [*((x - max_step, x + max_step) for x in positions.ravel().tolist()), (None, None)]
+        gradient = np.append(np.zeros(positions.size), 1.0)  # of the minimised quantity, which is the last variable
+        coordinate_bounds = [(value - max_step, value + max_step) for value in positions.ravel().tolist()]
+        bounds = [*coordinate_bounds, (None, None)]
         solution = scipy.optimize.minimize(
             lambda variables: variables[-1],
             start,
@@ -389,17 +417,22 @@ class _Exchange:
         presses = case.search_presses
         no_squares = grid[:0]
         kept_rows = search.table.rows(presses, no_squares, case.square_side, case.kept_electrodes)
-        kept_sensitivity = search.model.sensitivity(kept_rows)
+        kept_sensitivity = search.model.sensitivity(kept_rows)  # shape (n_press, n_kept, 5)
         square_sensitivity = search.model.sensitivity(search.table.rows(presses, grid, case.square_side))
-        candidates = np.ascontiguousarray(square_sensitivity.swapaxes(1, 2))
+        candidates = np.ascontiguousarray(square_sensitivity.swapaxes(1, 2))  # shape (n_press, 5, n)
         is_allowed_pair = case.pair_clearance(grid, grid) >= 0.0  # shape (n, n)
         weights = case.weights(presses)
         power = WORST_POWER if case.goal == "worst" else RMS_POWER
 
         def mean_error(other_squares: Integers) -> Array:
-            """Return the mean for each position of one further square; see `_Exchange`."""
+            """Return the mean of the errors to the given power for each position of a further square; see `_Exchange`.
+
+            Args:
+                other_squares: Indices of the positions of the other new squares of the layout.
+            """
             others_sensitivity = candidates[:, :, other_squares].swapaxes(1, 2)
             layout_sensitivity = np.concatenate([kept_sensitivity, others_sensitivity], axis=1)
+            # Rounding can make the small difference in `with_one_more` negative.
             squared_error = np.maximum(with_one_more(layout_sensitivity, candidates), 1e-12)  # shape (n_press, n)
             mean = np.average(squared_error ** (0.5 * power), axis=0, weights=weights)
             is_allowed = is_allowed_pair[other_squares].all(axis=0)
@@ -410,6 +443,8 @@ class _Exchange:
 
     def improve(self, layout: Integers) -> tuple[float, Integers]:
         """Exchange squares until no exchange of a single square improves the layout.
+
+        In each sweep, every square in turn is moved to the position with the smallest mean error.
 
         Args:
             layout: Indices of the positions, shape (n_new,).
@@ -424,7 +459,7 @@ class _Exchange:
                 other_squares = np.delete(improved, square)
                 mean_error = self.mean_error(other_squares)
                 improved[square] = np.argmin(mean_error)
-            value = float(mean_error.min() ** (1.0 / self.power))
+            value = float(mean_error.min() ** (1.0 / self.power))  # after the exchange of the last square
             if value > best_value * (1.0 - MIN_SWEEP_GAIN):
                 break
             best_value = value

@@ -11,13 +11,13 @@ to a unit step of the touch charge with
 
     h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / film_time).
 
-The logarithm is valid from some milliseconds to days. A Prony series with two terms per decade approximates the
-logarithm, and Boltzmann's superposition principle gives the response to any touch charge. The exponential describes the
-cooling of the film when it is stretched, and its return to the initial temperature.
+The logarithm is valid for times from some milliseconds to days. A Prony series with two terms per decade approximates
+the logarithm, and Boltzmann's superposition principle gives the response to any touch charge. The exponential describes
+the cooling of the film when it is stretched, and its return to the initial temperature.
 
-The values of hum, offset, bias and mismatch in the built-in levels are plausible for an electric environment with
-little or with strong interference. They were not measured. The levels `clean` and `reference` contain only the
-memoryless noise of `measuring_chain.noise`.
+The built-in levels contain plausible values of hum, offset, bias and mismatch for electric environments with little or
+with strong interference. They were not measured. The levels `clean` and `reference` contain only the memoryless noise
+of `measuring_chain.noise`.
 """
 
 import math
@@ -125,6 +125,7 @@ class Amplifier:
         Returns:
             The measurement, with the properties of each channel.
         """
+        # The order of these calls determines the random numbers of each property.
         tau = self.tau * (1.0 + self.tau_mismatch * rng.standard_normal(electrodes))
         gain = 1.0 + self.gain_mismatch * rng.standard_normal(electrodes)
         bias = self.bias * rng.choice([-1.0, 1.0], electrodes)
@@ -138,7 +139,7 @@ class Amplifier:
 
 @dataclass
 class Measurement:
-    """Running measurement. It is called with successive blocks of touch charges and returns their readings.
+    """Running measurement, which is called with successive blocks of touch charges and returns their readings.
 
     Attributes:
         amplifier: Parameters of the measuring chain.
@@ -195,6 +196,9 @@ class Measurement:
     def __call__(self, charge: Array, charge_per_K: Array | None = None) -> Array:
         """Simulate the readings of the next block of touch charges.
 
+        The charges pass through the film (temperature, creep, pyroelectric charge), the amplifiers, the hum, the noise
+        and the converter, in this order. The state at the end of the block is stored for the next block.
+
         Args:
             charge: Touch charges, shape (n, electrodes), pC.
             charge_per_K: Change of the touch charges per kelvin of the film, because the pretension of a warm film is
@@ -205,7 +209,7 @@ class Measurement:
         """
         time = (self._readings + np.arange(len(charge))) / self.rate
         self._readings += len(charge)
-        temperature = self._temperature(time)[:, np.newaxis]
+        temperature = self._temperature(time)[:, np.newaxis]  # relative to the mean, shape (n, 1), K
         if charge_per_K is not None:
             charge = charge + charge_per_K * temperature
         film_charge = self._relaxed(charge) + self.pyro * temperature
@@ -233,6 +237,7 @@ class Measurement:
         changes = np.diff(charge, axis=0, prepend=self._touch_charge[np.newaxis])
         self._touch_charge = charge[-1]
 
+        # Time constants and amplitudes of the exponentials: those of the creep, then the thermoelastic effect
         time_constants = np.append(CREEP_TIMES, amplifier.film_time)
         creep_amplitudes = np.full(CREEP_TIMES.size, 0.5 * amplifier.creep)  # two terms per decade
         amplitudes = np.append(creep_amplitudes, amplifier.thermoelastic)
@@ -327,8 +332,10 @@ class Measurement:
         clipped = np.clip(output, -limit, limit)
         if not bits:
             return clipped
-        charge_per_code = 2.0 * limit / (1 << bits)
-        lowest_code = -(1 << (bits - 1))
-        highest_code = (1 << (bits - 1)) - 1
+
+        # The converter has 2^bits codes for the range from -limit to limit.
+        charge_per_code = 2.0 * limit / 2**bits
+        lowest_code = -(2 ** (bits - 1))
+        highest_code = 2 ** (bits - 1) - 1
         codes = np.clip(np.round(clipped / charge_per_code), lowest_code, highest_code)
         return np.asarray(codes * charge_per_code)

@@ -47,8 +47,8 @@ class NoiseModel:
     def information(self, charge: Array) -> Array:
         """Compute the Fisher information that one reading provides about its charge.
 
-        For a Gaussian whose mean and standard deviation both depend on the charge, the information is
-        (1 + 2 (d sigma / dQ)^2) / sigma^2 (Kay 1993, equation 3.31). Its inverse is the smallest variance of an
+        For a Gaussian whose mean and standard deviation both depend on the charge, the information is (1 + 2 (d sigma /
+        dQ)^2) / sigma^2 (Kay 1993, equation 3.31). The inverse of the information is the smallest variance of an
         unbiased estimate of the charge.
 
         Args:

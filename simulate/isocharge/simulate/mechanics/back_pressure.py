@@ -41,7 +41,8 @@ class BackPressure:
     def energy(self, deflection: Array) -> float:
         """Compute the energy of the pressures on the meshed part of the film for a deflection W, shape (n_node,).
 
-        The energy is infinite if the film displaces the whole volume of the air.
+        The result is the energy of the trapped air minus the work of the static pressure. The energy is infinite if the
+        film displaces the whole volume of the air.
         """
         volume = self._volume(deflection)
         static_work = self.groups.static_pressure * volume
@@ -53,10 +54,13 @@ class BackPressure:
     def forces(self, deflection: Array) -> Array:
         """Compute the derivatives of the energy with respect to W at the nodes, shape (n_node,).
 
+        The derivatives are infinite if the film displaces the whole volume of the air.
+
         Args:
             deflection: W at the nodes, shape (n_node,).
         """
-        compression = self.groups.compression * self._volume(deflection)  # V / V0
+        # At constant temperature, the pressure of the air increases by p0 x / (1 - x) with x = V / V0.
+        compression = self.groups.compression * self._volume(deflection)
         if compression >= 1.0:
             return np.full_like(deflection, np.inf)
         air_pressure = 0.0

@@ -68,33 +68,42 @@ class ElasticFilm:
         return self.groups.side_load != (0.0, 0.0)
 
     def energy(self, field: Array) -> float:
-        """Compute the potential energy Pi of a field, shape (n_node, 3)."""
-        elastic = self.membrane.energy(field)
+        """Compute the potential energy Pi of a field: the stored energy minus the work of the probe.
+
+        Args:
+            field: Scaled displacements (U1, U2, W), shape (n_node, 3).
+        """
+        in_plane = field[:, :2]
+        deflection = field[:, 2]
+        stored_energy = self.membrane.energy(field)
         if self.bending is not None:
-            elastic += self.bending.energy(field[:, 2])
+            stored_energy += self.bending.energy(deflection)
         if self.back is not None:
-            elastic += self.back.energy(field[:, 2])
-        work = self.groups.load * float(self.geometry.load @ field[:, 2])
+            stored_energy += self.back.energy(deflection)
+        work = self.groups.load * float(self.geometry.load @ deflection)
         if self.has_side_load:
-            work += float(self.geometry.load @ field[:, :2] @ np.array(self.groups.side_load))
-        return elastic - work
+            work += float(self.geometry.load @ in_plane @ np.array(self.groups.side_load))
+        return stored_energy - work
 
     def residual(self, field: Array) -> Array:
         """Compute the gradient of Pi: internal minus external forces at the nodes.
 
         Args:
-            field: Scaled displacements, shape (n_node, 3).
+            field: Scaled displacements (U1, U2, W), shape (n_node, 3).
 
         Returns:
-            Shape (n_node, 3).
+            Forces along (U1, U2, W), shape (n_node, 3).
         """
-        forces = self.membrane.forces(field)
+        deflection = field[:, 2]
+        element_forces = self.membrane.forces(field)  # shape (n_element, n_local, 3)
         if self.bending is not None:
-            forces[..., 2] += self.bending.forces(field[:, 2])
-        residual = np.stack([self.geometry.gather(forces[..., i]) for i in range(3)], axis=1)
+            element_forces[..., 2] += self.bending.forces(deflection)
+        residual = np.stack([self.geometry.gather(element_forces[..., i]) for i in range(3)], axis=1)
+
+        # Forces of the probe along W, of the pressure on the whole film, and of the probe in the plane
         residual[:, 2] -= self.groups.load * self.geometry.load
         if self.back is not None:
-            residual[:, 2] += self.back.forces(field[:, 2])
+            residual[:, 2] += self.back.forces(deflection)
         if self.has_side_load:
             residual[:, :2] -= np.outer(self.geometry.load, self.groups.side_load)
         return residual
@@ -134,7 +143,7 @@ class ElasticFilm:
             guard: Additional tension, in units of E_young A^2.
 
         Returns:
-            Shape (n_element, n_local, components, n_local, components).
+            Element matrices, shape (n_element, n_local, components, n_local, components).
         """
         tangent = Membrane(self.geometry, self.groups.stiffened(guard)).tangent(field)
         if self.bending is None:
@@ -146,10 +155,10 @@ class Membrane:
     """Stretching energy of the geometrically nonlinear membrane.
 
     The energy is integral( E' : C : E' / 2 + tau (tr E' - div U) ). The integral of div U over a clamped film is zero.
-    The term div U is subtracted, because its rounding errors would dominate the other terms for a large pretension.
-    With F_ia = d_ia + A^2 U_i,a for i = 1, 2 and F_3a = W,a, the variation of E' is sym(F_ia v_i,b) for all three
-    components of a test displacement v. The strain and the stress are derived by Bonet and Wood (2008, ch. 3 and 6),
-    and the scaling by Schwerin (1929).
+    The term div U is subtracted, because its rounding errors would dominate the other terms for a large pretension. Let
+    F_ia = d_ia + A^2 U_i,a for i = 1, 2, and F_3a = W,a. The variation of E' is then sym(F_ia v_i,b) for all three
+    components of a test displacement v. The strain and the stress are derived by Bonet and Wood (2008, chapters 3 and
+    6), and the scaling by Schwerin (1929).
     """
 
     def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
@@ -190,7 +199,7 @@ class Membrane:
             field: Scaled displacements, shape (n_node, 3).
 
         Returns:
-            Shape (n_element, n_point, 2, 3): the derivative, then the component.
+            Derivatives, shape (n_element, n_point, 2, 3): the derivative, then the component.
         """
         slope = self.geometry.stacked @ field[self.geometry.nodes]
         return slope.reshape(*self.geometry.gradient.shape[:3], 3)
@@ -210,15 +219,15 @@ class Membrane:
         return stretch
 
     def energy(self, field: Array) -> float:
-        """Compute the stretching energy of a field.
+        """Compute the stretching energy of a field; see the docstring of this class.
 
         Args:
-            field: Scaled displacements, shape (n_node, 3).
+            field: Scaled displacements (U1, U2, W), shape (n_node, 3).
 
         Returns:
             Energy of the meshed part of the film, dimensionless.
         """
-        slope = self._slope(field)
+        slope = self._slope(field)  # shape (n_element, n_point, 2, 3): the derivative, then the component
         elastic_strain = strain(slope, self.groups.amplitude2)
         energy_density = 0.5 * np.sum(elastic_strain * self._stress(elastic_strain), axis=-1)
 
@@ -235,7 +244,7 @@ class Membrane:
             field: Scaled displacements, shape (n_node, 3).
 
         Returns:
-            Shape (n_element, n_local, 3).
+            Forces, shape (n_element, n_local, 3).
         """
         geometry = self.geometry
         slope = self._slope(field)
@@ -259,19 +268,23 @@ class Membrane:
             field: Scaled displacements, shape (n_node, 3).
 
         Returns:
-            Shape (n_element, n_local, 3, n_local, 3), symmetric under exchange of the two pairs of node and component.
+            Second derivatives, shape (n_element, n_local, 3, n_local, 3), symmetric under exchange of the two pairs of
+            node and component.
         """
         geometry = self.geometry
         gradient = geometry.gradient
         slope = self._slope(field)
         stretch = self._stretch(slope)
+
+        # Total stress (S11, S22, S12) with the pretension, times the integration weights
         total_stress = self._stress(strain(slope, self.groups.amplitude2))
         total_stress[..., :2] += self.groups.tension
         if self.groups.anisotropy is not None:
             total_stress += self.groups.anisotropy.tension
         weighted_stress = _tensor(total_stress * geometry.weights[..., None])
 
-        # One block for each pair of components; the matrix is symmetric, so that half of the blocks are transposed.
+        # One block for each pair (i, j) of displacement components: the material part, and for i = j the part of the
+        # stress. The matrix is symmetric, so the blocks below the diagonal are transposed copies.
         n_element, _, _, n_local = gradient.shape
         transposed_gradient = np.ascontiguousarray(geometry.stacked.transpose(0, 2, 1))
         matrix = np.empty((n_element, 3, n_local, 3, n_local))
@@ -296,8 +309,9 @@ class Membrane:
             j: Displacement component of the slope, from 0 to 2.
 
         Returns:
-            Shape (n_element, n_point, 2, 2), with the indices a and b.
+            Second derivatives, shape (n_element, n_point, 2, 2), with the indices a and b.
         """
+        # Isotropic film
         poisson = self.groups.poisson
         plane_modulus = 1.0 / (1.0 - poisson**2)
         shear_modulus = 0.5 / (1.0 + poisson)
@@ -310,6 +324,8 @@ class Membrane:
         block[..., 1, 1] = plane_modulus * f_i2 * f_j2 + shear_modulus * f_i1 * f_j1
         block[..., 0, 1] = plane_modulus * poisson * f_i1 * f_j2 + shear_modulus * f_i2 * f_j1
         block[..., 1, 0] = plane_modulus * poisson * f_i2 * f_j1 + shear_modulus * f_i1 * f_j2
+
+        # Additional moduli of an orthotropic film and of a coat
         if self.groups.anisotropy is not None:
             i_derivative = _strain_derivative(f_i1, f_i2)
             j_derivative = _strain_derivative(f_j1, f_j2)
@@ -354,13 +370,17 @@ class Bending:
         """
         self.geometry = geometry
         self.stiffness = stiffness
+
+        # Matrix L of each element, shape (n_element, n_local, n_local)
         weights = np.repeat(geometry.weights, 2, axis=1)[..., None]  # one weight for each of both derivatives
         self._laplace = geometry.stacked.transpose(0, 2, 1) @ (weights * geometry.stacked)
+
+        # Diagonal of M at all nodes, including hanging nodes, and its factorisation if there are hanging nodes
         self._mass = replace(geometry, constraint=None).gather(geometry.mass)
         self._factor: SuperLU | None = None
 
     def laplacian(self, deflection: Array) -> Array:
-        """Compute the Laplacian of the deflection W.
+        """Compute the Laplacian -M^-1 L W of the deflection W; see the docstring of this class.
 
         Args:
             deflection: W at the nodes, shape (n_node,).
@@ -393,7 +413,7 @@ class Bending:
             deflection: W at the nodes, shape (n_node,).
 
         Returns:
-            Shape (n_element, n_local).
+            Forces, shape (n_element, n_local).
         """
         laplacian = self.laplacian(deflection)[self.geometry.nodes]
         return np.asarray(-self.stiffness * (self._laplace @ laplacian[..., None])[..., 0])
@@ -408,13 +428,16 @@ class Bending:
             Matrices for (U1, U2, W, mu), shape (n_element, n_local, 4, n_local, 4).
         """
         n_element, n_local = self.geometry.nodes.shape
+        mass = np.eye(n_local) * self.geometry.mass[:, None]  # M of each element, shape (n_element, n_local, n_local)
+        coupling = np.sqrt(self.stiffness) * (self._laplace - SHIFT * mass)  # symmetric
+
+        # Numbers of the unknowns of a node: 0 for U1, 1 for U2, 2 for W and 3 for mu. In memory, the values of one
+        # unknown at all nodes of an element lie side by side.
         matrix = np.zeros((n_element, 4, n_local, 4, n_local)).transpose(0, 2, 1, 4, 3)
         matrix[:, :, :3, :, :3] = tangent
-        mass = np.eye(n_local) * self.geometry.mass[:, None]
-        shifted = np.sqrt(self.stiffness) * (self._laplace - SHIFT * mass)
         matrix[:, :, 2, :, 2] += self.stiffness * (2.0 * SHIFT * self._laplace - SHIFT**2 * mass)
-        matrix[:, :, 2, :, 3] = shifted
-        matrix[:, :, 3, :, 2] = shifted
+        matrix[:, :, 2, :, 3] = coupling
+        matrix[:, :, 3, :, 2] = coupling
         matrix[:, :, 3, :, 3] = -mass
         return matrix
 

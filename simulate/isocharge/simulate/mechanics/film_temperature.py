@@ -7,7 +7,7 @@ along each axis of the film changes by
 
 and the pretension changes by the stress of this strain, with the plane-stress stiffness of the film. A drawn film
 expands more across the drawn direction than along this direction, so its tension becomes uneven. The temperature of a
-thin film follows that of the air within seconds. The temperature of a ring follows within many minutes.
+thin film follows that of the air within seconds. The temperature of a ring needs many minutes to follow.
 """
 
 from dataclasses import replace
@@ -23,6 +23,9 @@ from isocharge.simulate.sensor.sensor import Sensor
 
 def tension_change(film: Film, film_K: float, ring_K: float) -> Array:
     """Compute the change of the pretension that changes of the temperatures of film and ring cause.
+
+    The strain of the clamped film is the expansion of the ring minus the free expansion of the film. Its stress is the
+    change of the pretension.
 
     Args:
         film: The film. If it has no expansion coefficients, the result is zero.
@@ -46,8 +49,8 @@ def warmed(sensor: Sensor, film_K: float, ring_K: float = 0.0) -> Sensor:
 
     Args:
         sensor: The sensor at the temperatures for which it is described.
-        film_K: Difference between the temperature of the film and the temperature for which it is described, K.
-        ring_K: Difference between the temperature of the ring and the temperature for which it is described, K.
+        film_K: Temperature of the film minus the temperature for which the film is described, K.
+        ring_K: Temperature of the ring minus the temperature for which the ring is described, K.
 
     Raises:
         SensorError: If the film becomes so slack that it is outside the range of the simulator.
@@ -55,13 +58,13 @@ def warmed(sensor: Sensor, film_K: float, ring_K: float = 0.0) -> Sensor:
     film = sensor.film
     if film.expansion is None:
         return sensor
-    tension_11, tension_22, tension_12 = tension_change(film, film_K, ring_K).tolist()
-    pretension = film.pretension + 0.5 * (tension_11 + tension_22)
+    change_11, change_22, change_12 = tension_change(film, film_K, ring_K).tolist()
+    pretension = film.pretension + 0.5 * (change_11 + change_22)  # mean along x and y
     if film.expands_evenly:
         return replace(sensor, film=replace(film, pretension=pretension))
 
     # The deviator of the tension consists of half of its difference along x and y, and of its shear.
     half_difference, shear = film.deviator
-    warm_half_difference = half_difference + 0.5 * (tension_11 - tension_22)
-    warm_shear = shear + tension_12
+    warm_half_difference = half_difference + 0.5 * (change_11 - change_22)
+    warm_shear = shear + change_12
     return replace(sensor, film=replace(film, pretension=pretension, deviator=(warm_half_difference, warm_shear)))

@@ -93,7 +93,7 @@ class DimensionlessGroups:
         angle: float = 0.0,
         side_force: tuple[float, float] = (0.0, 0.0),
     ) -> "DimensionlessGroups":
-        """Compute the groups of a press.
+        """Compute the groups of a press, which is rotated onto the x axis.
 
         Args:
             film: The film.
@@ -105,6 +105,7 @@ class DimensionlessGroups:
         Returns:
             The groups, which describe the press completely.
         """
+        # Units of the force and of the pressure: E h a A^3 and E h A^3 / a
         amplitude2 = float(amplitude_squared(film, force))
         force_unit = film.young * film.thickness * film.radius * amplitude2**1.5
         pressure_unit = film.young * film.thickness * amplitude2**1.5 / film.radius
@@ -117,6 +118,7 @@ class DimensionlessGroups:
             side_unit = side_force_unit(film, amplitude2)
             side_load = (float(along_press / side_unit), float(across_press / side_unit))
 
+        # Ratio of the unit of the displaced volume, a^3 A, to the volume of the trapped air
         compression = 0.0
         if film.back_volume is not None:
             compression = film.radius**3 * amplitude2**0.5 / film.back_volume
@@ -152,7 +154,7 @@ class DimensionlessGroups:
     def height(self) -> float:
         """Approximate deflection of the centre in units of a A.
 
-        If the back of the film is vented and `of` computes the groups with bending, the approximate deflection is one.
+        The approximate deflection is one if the back of the film is vented and `of` computes the groups with bending.
         """
         linear = MEMBRANE_STIFFNESS * max(self.tension, 0.0) + PLATE_STIFFNESS * self.bending
         air = AIR_SHAPE * self.ambient_pressure * self.compression
@@ -166,8 +168,9 @@ class DimensionlessGroups:
         H^3 = (0.662)^3 p for a membrane without pretension (Hencky 1915), H = p / (4 tension) for a large pretension,
         and H = p / (64 bending) for a plate.
         """
-        air = 0.5 * np.pi * self.ambient_pressure * self.compression
-        linear = 4.0 * max(self.tension, 0.0) + 64.0 * self.bending + air
+        # Coefficients of the equation cubic H^3 + linear H = p. The trapped air also resists the deflection.
+        air_stiffness = 0.5 * np.pi * self.ambient_pressure * self.compression
+        linear = 4.0 * max(self.tension, 0.0) + 64.0 * self.bending + air_stiffness
         cubic = 1.0 / 0.662**3
         height = float(_root(linear / cubic, abs(self.static_pressure) / cubic))
         return float(np.copysign(height, self.static_pressure))
@@ -207,13 +210,14 @@ def _anisotropy(film: Film, amplitude2: float, angle: float) -> Anisotropy:
     Returns:
         Differences from the isotropic elasticity matrix and from the mean pretension.
     """
+    # The moduli are given in the axes of the film, and the tension in the axes x and y.
     rotation = stress_rotation(film.axis - angle)
     moduli = rotation @ orthotropic_moduli(film) @ rotation.T
 
     half_difference, shear_tension = film.deviator
-    deviator = np.array([half_difference, -half_difference, shear_tension])
-    tension = rotate_stress(deviator, -angle) / (film.young * amplitude2)
-    return Anisotropy(moduli, tension)
+    uneven_tension = np.array([half_difference, -half_difference, shear_tension])  # (T11, T22, T12) minus the mean
+    scaled_tension = rotate_stress(uneven_tension, -angle) / (film.young * amplitude2)
+    return Anisotropy(moduli, scaled_tension)
 
 
 def orthotropic_moduli(film: Film) -> Array:
@@ -231,6 +235,8 @@ def orthotropic_moduli(film: Film) -> Array:
     r = np.sqrt(film.young_ratio)
     difference_11 = plane_modulus * (r - 1.0)
     difference_22 = plane_modulus * (1.0 / r - 1.0)
+
+    # Without a given shear modulus, the shear modulus is that of an isotropic film.
     isotropic_shear = 0.5 / (1.0 + film.poisson)
     difference_12 = 0.0 if film.shear is None else film.shear / film.young - isotropic_shear
     return np.diag([difference_11, difference_22, difference_12])

@@ -1,9 +1,9 @@
 """The choice between the theories of the film, and estimates of the error that an omitted term causes.
 
-All theories are special cases of one formulation with two optional terms. The first term is *bending*. It matters near
-the rim and near the probe, and for the stress at the surface of the film. The distance up to which it matters is the
-bending length l = sqrt(D / N), with the bending stiffness D and the tension force N per length. If the pretension and
-the induced tension are small, bending carries the load. The second term is *stretching*, the effect of the induced
+All theories are special cases of one formulation with two optional terms. The first term is *bending*. Bending matters
+near the rim and near the probe, and for the stress at the surface of the film. Bending matters up to the distance l =
+sqrt(D / N), the bending length, where D is the bending stiffness and N the tension force per length. If the pretension
+and the induced tension are small, bending carries the load. The second term is *stretching*, the effect of the induced
 stress on the deflection. Without stretching the film is linear, and the charges are computed from the linear deflection
 in a second step. The pretension is always included. The terms determine the name of the theory::
 
@@ -143,6 +143,9 @@ def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
 def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
     """Estimate the relative error of a charge that is caused by the terms that a theory omits.
 
+    The estimates of the omitted stretching and of the omitted bending are added. A theory without stretching and
+    bending cannot describe a film without pretension. A theory without bending cannot describe a thick film.
+
     Args:
         film: The film.
         probe: The probe.
@@ -160,9 +163,9 @@ def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> f
         error += LOCAL_WEIGHT * induced_at_probe(film, probe, force)
     if not theory.bending:
         length = bending_length(film, force)
-        error += BENDING_WEIGHT * length + bending_at_probe(film, probe, force)
         if length > MAX_MEMBRANE_BENDING_LENGTH:
             return np.inf
+        error += BENDING_WEIGHT * length + bending_at_probe(film, probe, force)
     return error
 
 
@@ -185,7 +188,8 @@ def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Th
         Theory(stretching=True, bending=False, pretensioned=is_tense),
     )
     for theory in cheapest_first:
-        if film.has_back_pressure and not theory.stretching:  # linear theories have no pressure on the whole film
+        omits_back_pressure = film.has_back_pressure and not theory.stretching  # as do all linear theories
+        if omits_back_pressure:
             continue
         if modelling_error(film, probe, force, theory) <= 0.5 * accuracy:
             return theory
@@ -224,9 +228,13 @@ def theory_by_name(name: str, film: Film) -> Theory:
     """
     is_tense = film.pretension > 0.0
     options = [Theory(stretching, bending, is_tense) for stretching in (False, True) for bending in (False, True)]
-    matching = [theory for theory in options if name in (theory.name, theory.name.removeprefix("pre-tensioned "))]
-    if not matching:
-        raise SceneError(f"theory: expected one of {[theory.name for theory in options]}, got {name!r}")
-    if matching[0].name == "linear membrane":
-        raise SceneError("theory 'linear membrane': a film without pretension has no stiffness in it; set a pretension")
-    return matching[0]
+    for theory in options:
+        short_name = theory.name.removeprefix("pre-tensioned ")
+        if name not in (theory.name, short_name):
+            continue
+        if theory.name == "linear membrane":
+            raise SceneError(
+                "theory 'linear membrane': a film without pretension has no stiffness in it; set a pretension"
+            )
+        return theory
+    raise SceneError(f"theory: expected one of {[theory.name for theory in options]}, got {name!r}")

@@ -83,7 +83,7 @@ class Blocks:
     """
 
     def __init__(self, resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> None:
-        """Count the elements.
+        """Count the elements, and compute the local coordinates of their nodes.
 
         Args:
             resolution: Fineness of the mesh.
@@ -93,15 +93,21 @@ class Blocks:
         self.resolution = resolution
         self.topology = topology
         self.half = topology.fills_circle and not whole
+
+        # Each corner of the core polygon belongs to a quadrilateral of split x split elements and to 2 x split sectors.
         self.n_corner = topology.n_corner
         self.split = max(1, round(resolution.around / (2 * self.n_corner)))
         self.n_meshed = self.n_corner // 2 if self.half else self.n_corner
         self.n_sector = 2 * self.n_meshed * self.split
         self.n_quad = self.n_meshed * self.split**2
+
+        # Elements inside the innermost circle, then the rings from the circle to the rim
         self.n_layer = 2 if topology.is_curved and not topology.fills_circle else 1
         self.n_inner = self.n_quad + self.n_layer * self.n_sector
         self.n_ring = resolution.rings + resolution.rim
         self.n_element = self.n_inner + self.n_sector * self.n_ring
+
+        # Local coordinates of the nodes of an element, on a square grid
         line = lobatto_nodes(resolution.order)
         xi, eta = np.meshgrid(line, line, indexing="xy")
         self.xi = xi.ravel()
@@ -144,7 +150,7 @@ class Blocks:
         """
         corners = np.eye(self.n_corner + 1)[:-1]  # the weights of a corner are zero except for its own
         middles = 0.5 * (corners + np.roll(corners, -1, axis=0))  # of the edges after the corners
-        stops = [middles[-1]]
+        stops = [middles[-1]]  # middle, corner, middle, corner, ..., middle
         for corner, middle in zip(corners[: self.n_meshed], middles[: self.n_meshed], strict=True):
             stops += [corner, middle]
 
@@ -185,11 +191,14 @@ class Blocks:
             v_index: Index of the element along the side from the centroid to the middle of the edge after the corner.
             t_index: Index of the element along the side from the centroid to the middle of the edge before the corner.
         """
+        # Corners of the quadrilateral. A step from a middle to a corner, or back, is `split` points of the boundary.
         centroid = np.eye(self.n_corner + 1)[-1]
         start = 2 * self.split * corner
         middle_before = self.boundary[start]
         corner_point = self.boundary[start + self.split]
         middle_after = self.boundary[start + 2 * self.split]
+
+        # Corners of the element in the coordinates v and t of the quadrilateral, from 0 to 1
         v_inner = v_index / self.split
         v_outer = (v_index + 1) / self.split
         t_first = t_index / self.split
@@ -202,6 +211,9 @@ class Blocks:
     def rotated(self, steps: int, steps_per_turn: int) -> Integers:
         """Return the indices of the elements after a rotation of the probe that maps the mesh onto itself.
 
+        The quadrilaterals are numbered corner by corner. The sectors are numbered layer by layer, and in each layer
+        anticlockwise.
+
         Args:
             steps: Number of steps by which the probe is rotated.
             steps_per_turn: Number of steps in a full turn.
@@ -209,11 +221,12 @@ class Blocks:
         Returns:
             Index of the element that takes the place of each element, shape (n_element,).
         """
-        shift = steps * self.n_corner // steps_per_turn
+        corner_shift = steps * self.n_corner // steps_per_turn
+        sector_shift = 2 * self.split * corner_shift
         quads = np.arange(self.n_quad).reshape(self.n_meshed, -1)
         sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)
-        rotated_quads = np.roll(quads, -shift, axis=0)
-        rotated_sectors = np.roll(sectors, -2 * self.split * shift, axis=1)
+        rotated_quads = np.roll(quads, -corner_shift, axis=0)
+        rotated_sectors = np.roll(sectors, -sector_shift, axis=1)
         return np.concatenate([rotated_quads.ravel(), rotated_sectors.ravel()])
 
     def into_meshed_half(self, points: Complexes) -> tuple[Complexes, Booleans]:

@@ -8,7 +8,8 @@ the stiffness C_i and the volume share f_i. If E is the mean strain, the strain 
     E_i = E + N M_i^-1 (T E - N^T C_i E),   M_i = N^T C_i N,   T = (sum f_i M_i^-1)^-1 sum f_i M_i^-1 N^T C_i,
 
 and the mean stress is sum f_i C_i E_i. The energy and the charges therefore include the jump of the strain, although it
-lies within elements. The remaining error is of second order in the ratio of the width of the band to that of the coat.
+lies within elements. The remaining error is proportional to the square of the ratio of two widths: the width of the
+band and the width of the coat.
 """
 
 from dataclasses import dataclass
@@ -44,8 +45,8 @@ class Coating:
     def near(self, points: Complexes) -> Booleans:
         """Return for each point whether it may lie on the coat or near the coat. The result is only a fast estimate.
 
-        It is true for all points on the coat and in the band, and also for some points near the coat. It is false for
-        distant points.
+        The result is true for all points on the coat and in the band, and also for some points near the coat. The
+        result is false for distant points.
 
         Args:
             points: Film points x + iy, any shape, in film radii.
@@ -59,7 +60,7 @@ class Coating:
             points: Film points x + iy, shape (...), in film radii.
 
         Returns:
-            Shape (..., 3, 3).
+            Addition, shape (..., 3, 3).
         """
         laminate = self._laminate(points)
         # Sum over the phases i and the strain components b: f_i C_i E_i.
@@ -87,7 +88,7 @@ class Coating:
         return np.asarray(np.abs(points - middle) < np.abs(part - middle).max() + self.band_width)
 
     def _shares(self, points: Complexes) -> Array:
-        """For a small disk about each point, compute the share of its area that each layer covers.
+        """Compute the share that each layer of the coat covers of a small disk about each point.
 
         The diameter of the disk is the width of the band along the edges.
 
@@ -95,13 +96,13 @@ class Coating:
             points: Film points x + iy, shape (...), in film radii.
 
         Returns:
-            Shape (..., n_layer).
+            Covered area over the area of the disk, shape (..., n_layer).
         """
         radius = 0.5 * self.band_width
         disk_area = np.pi * radius**2
         shares = np.zeros((*points.shape, len(self.layers)))
         for layer_index, layer in enumerate(self.layers):
-            for part in layer:
+            for part in layer:  # the parts of a layer do not overlap
                 is_near = self._is_near(part, points)
                 shares[is_near, layer_index] += area_in_disk(part, points[is_near], radius) / disk_area
         return np.minimum(shares, 1.0)
@@ -122,9 +123,12 @@ class Coating:
         Returns:
             Components along x and y, each of the shape of `points`. Far from edges both are sqrt(1 / 2).
         """
+        # Differences of the covered share along x and along y, summed over the layers
         step = NORMAL_STEP * self.band_width
         difference_x = self._shares(points + step).sum(-1) - self._shares(points - step).sum(-1)
         difference_y = self._shares(points + 1j * step).sum(-1) - self._shares(points - 1j * step).sum(-1)
+
+        # Divide by the length, except where the share does not change.
         length = np.hypot(difference_x, difference_y)
         has_normal = length > 0.0
         normal_x = np.full_like(length, np.sqrt(0.5))
@@ -147,22 +151,34 @@ class Coating:
         # 0, 1, 2, ... layers.
         shares = -np.diff(self._shares(points), prepend=1.0, append=0.0)
 
-        # The matrix N converts the jump of the displacement derivative across the edge into a jump of the strain.
-        normal_x, normal_y = self._normal(points)
-        normal = np.zeros((*points.shape, 1, 3, 2))
-        normal[..., 0, 0, 0] = normal_x
-        normal[..., 0, 2, 1] = normal_x
-        normal[..., 0, 1, 1] = normal_y
-        normal[..., 0, 2, 0] = normal_y
-
-        n_layers = np.arange(len(self.layers) + 1)
-        stiffness = self.bare + n_layers[:, None, None] * self.added
+        # Matrices of the phases, with the axes (..., phase, row, column)
+        normal = self._normal_matrix(points)[..., None, :, :]  # N, which is the same for all phases
+        layer_count = np.arange(len(self.layers) + 1)
+        stiffness = self.bare + layer_count[:, None, None] * self.added  # C_i
         traction = normal.swapaxes(-1, -2) @ stiffness  # N^T C_i
         compliance = np.linalg.inv(traction @ normal)  # M_i^-1
-        weighted = shares[..., None, None] * compliance
+
+        # Sums over the phases, and the strain of each phase for a unit mean strain
+        weighted = shares[..., None, None] * compliance  # f_i M_i^-1
         common_traction = np.linalg.solve(weighted.sum(axis=-3), (weighted @ traction).sum(axis=-3))  # T
         strain = np.eye(3) + normal @ compliance @ (common_traction[..., None, :, :] - traction)
         return _Laminate(shares, stiffness, strain)
+
+    def _normal_matrix(self, points: Complexes) -> Array:
+        """Return the matrix N that converts the jump of the displacement derivative across an edge into a strain jump.
+
+        Args:
+            points: Film points x + iy, any shape, in film radii.
+
+        Returns:
+            Matrices, shape (..., 3, 2): the strain (E11, E22, 2 E12), then the component of the displacement.
+        """
+        normal_x, normal_y = self._normal(points)
+        zero = np.zeros_like(normal_x)
+        e11_row = np.stack([normal_x, zero], axis=-1)
+        e22_row = np.stack([zero, normal_y], axis=-1)
+        shear_row = np.stack([normal_y, normal_x], axis=-1)
+        return np.stack([e11_row, e22_row, shear_row], axis=-2)
 
 
 class _Laminate(NamedTuple):

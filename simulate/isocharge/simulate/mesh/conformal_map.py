@@ -35,6 +35,9 @@ BISECTION_STEPS = 40
 def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
     """Compute the parameters of the conformal map that maps the circle |z| = rho onto a given circle; see `placement`.
 
+    The map (z + c) / (1 + c z) adds arctanh(c) to arctanh(z) for points on the x axis. The map must convert -rho and
+    rho into the two points of the given circle on the x axis.
+
     Args:
         centre: Centre of the circle on the x axis, any shape, in film radii.
         radius: Radius of the circle, same shape, in film radii.
@@ -42,10 +45,10 @@ def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
     Returns:
         The parameter c of the map and rho, each of the shape of `centre`.
     """
-    outer = np.arctanh(centre + radius)
-    inner = np.arctanh(centre - radius)
-    c = np.tanh(0.5 * (outer + inner))
-    rho = np.tanh(0.5 * (outer - inner))
+    right_end = np.arctanh(centre + radius)
+    left_end = np.arctanh(centre - radius)
+    c = np.tanh(0.5 * (right_end + left_end))
+    rho = np.tanh(0.5 * (right_end - left_end))
     return c, rho
 
 
@@ -67,8 +70,8 @@ def distance_coordinate(distance: Array | float) -> Any:
 def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]:
     """Compute a circle on the film that encloses each footprint with a gap.
 
-    The centre of the circle is the centroid of the footprint, unless the circle would be too close to the rim. If it
-    would be too close, its centre is shifted towards the centre of the film as far as necessary. The shift is found by
+    The centre of the circle is the centroid of the footprint, unless the circle would be too close to the rim. In this
+    case, the centre of the circle is shifted towards the centre of the film as far as necessary. The shift is found by
     bisection.
 
     Args:
@@ -79,12 +82,13 @@ def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]
         Centre (on the x axis) and radius of the circles, each of shape (...), in film radii.
     """
     rim_gap = 1.0 - np.abs(outline).max(axis=-1)
-    largest_extent = 1.0 - OUTER_GAP_SHARE * rim_gap
+    largest_extent = 1.0 - OUTER_GAP_SHARE * rim_gap  # largest allowed distance of the circle from the centre
     centroid_radius = _enclosing_radius(outline, centroid)
     centroid_fits = centroid + centroid_radius <= largest_extent
     if np.all(centroid_fits):
         return centroid, centroid_radius
 
+    # Bisection for the largest position of the centre at which the circle fits
     lower_bound = np.zeros(centroid.shape)
     upper_bound = centroid.copy()
     for _ in range(BISECTION_STEPS):
@@ -137,20 +141,30 @@ def sector_angles(
     """
     origin = centroid[..., None] + 0j  # common origin of the rays
     ray_angle = _ray_angles(blocks, stops - origin, radius / reach)
-    ray = np.exp(1j * ray_angle)
-
-    # Intersections of the rays with the circle, relative to the centre of the circle
-    offset = origin - centre[..., None]
-    projection = (offset * np.conj(ray)).real
-    length = np.sqrt(projection**2 + radius[..., None] ** 2 - np.abs(offset) ** 2) - projection
-    intersection = offset + ray * length
+    ray: Complexes = np.exp(1j * ray_angle)  # unit vectors, shape (..., n_sector + 1)
+    offset: Complexes = np.asarray(origin - centre[..., None], dtype=complex)
+    intersection = _intersections_with_circle(offset, ray, radius[..., None])
 
     # Angles on the circle, which increase from one ray to the next
     first_angle = np.angle(intersection[..., :1])
     step = np.mod(np.angle(intersection[..., 1:] / intersection[..., :-1]), 2.0 * np.pi)
     film_angle = np.concatenate([first_angle, first_angle + np.cumsum(step, axis=-1)], axis=-1)
-    stretch = (1.0 + c_rho) / (1.0 - c_rho)
+    stretch = (1.0 + c_rho) / (1.0 - c_rho)  # of the conformal map along the circle
     return stretch_angles(film_angle, stretch)
+
+
+def _intersections_with_circle(origin: Complexes, ray: Complexes, radius: Array) -> Complexes:
+    """Return the points at which rays from inside a circle meet the circle. The centre of the circle is 0.
+
+    Args:
+        origin: Origins of the rays, x + iy.
+        ray: Unit vectors of the rays as complex numbers. The shapes of all arguments broadcast.
+        radius: Radii of the circles.
+    """
+    # The length t of a ray is the positive solution of |origin + t ray|^2 = radius^2.
+    projection = (origin * np.conj(ray)).real
+    length = np.sqrt(projection**2 + radius**2 - np.abs(origin) ** 2) - projection
+    return np.asarray(origin + ray * length)
 
 
 def _ray_angles(blocks: Blocks, stops: Complexes, radius_ratio: Array) -> Array:
@@ -164,6 +178,7 @@ def _ray_angles(blocks: Blocks, stops: Complexes, radius_ratio: Array) -> Array:
     Returns:
         Angles, shape (..., n_sector + 1), rad.
     """
+    # Equal angles that have the same mean as the angles of the stops
     stop_angle = np.unwrap(np.angle(stops), axis=-1)
     angle_from_first = np.linspace(0.0, 2.0 * np.pi / blocks.copies, stop_angle.shape[-1])
     mean_difference = np.mean(stop_angle[..., :-1] - angle_from_first[:-1], axis=-1)
@@ -234,17 +249,17 @@ def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
         layer: Width of all thin rings together, in the template plane, shape (...).
 
     Returns:
-        Shape (..., n_ring + 1).
+        Depths, shape (..., n_ring + 1).
     """
     even_edges = np.linspace(0.0, 1.0, resolution.rings + 1)
     if resolution.rim == 0:
         return np.broadcast_to(even_edges, (*rho.shape, even_edges.size))
 
     # A step of ln |z| in the template plane is a step of the depth times ln(rho).
-    thin_depth = np.minimum(-layer / np.log(rho), _max_thin_depth(resolution))[..., None]
+    thin_depth = np.minimum(-layer / np.log(rho), _max_thin_depth(resolution))[..., None]  # of all thin rings together
     edges_of_even_rings = even_edges * (1.0 - thin_depth)
     edges_of_thin_rings = 1.0 - thin_depth * 3.0 ** -np.arange(1.0, resolution.rim + 1)
-    edges_of_thin_rings[..., -1] = 1.0
+    edges_of_thin_rings[..., -1] = 1.0  # the last ring extends to the rim
     return np.concatenate([edges_of_even_rings, edges_of_thin_rings], axis=-1)
 
 
@@ -257,7 +272,7 @@ def widest_layer(resolution: Resolution, c: Array, rho: Array) -> Array:
         rho: Radius of the innermost circle in the template plane, shape (...).
 
     Returns:
-        Shape (...).
+        Widths, shape (...).
     """
     return np.asarray(-np.log(rho) * _max_thin_depth(resolution) * (1.0 - c) / (1.0 + c))
 

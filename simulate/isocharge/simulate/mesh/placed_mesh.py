@@ -65,7 +65,7 @@ class Geometry:
 
     @classmethod
     def build(cls, template: Template, points: Complexes, pressure: Pressure | None = None) -> "Geometry":
-        """Compute the integration rules of a mesh.
+        """Compute the integration rules of a mesh, and the forces of a unit load at its nodes.
 
         Args:
             template: Template of the mesh.
@@ -76,12 +76,14 @@ class Geometry:
         Returns:
             The integration rules.
         """
+        # Weights of the integration points and of the nodes
         rule = _quadrature(template.resolution.order)
         gradient, determinant = _film_gradient(rule.derivatives[:, None], points)
         weights = determinant * rule.weights
         node_jacobian = _jacobian(rule.node_derivatives[:, None], points)
         mass = node_jacobian.determinant * rule.node_weights
 
+        # Forces of the pressure at the nodes of the footprint, relative to the force on the whole film
         footprint = template.footprint
         if pressure is None:
             footprint_weights = weights[footprint]  # shape (n_footprint_element, n_point)
@@ -159,6 +161,8 @@ class PlacedMesh:
         geometry = Geometry.build(self.template, self.points, None if is_uniform else self._pressure)
         if self.coat is None:
             return geometry
+
+        # Add the stiffness of the coat at the integration points of the elements that it may cover.
         xi, eta, _ = gauss_reference_square(self.resolution.order + 1)
         basis_values = tensor_values(self.resolution.order, xi, eta)  # shape (n_point, n_local)
         quadrature_points = self.points @ basis_values.T  # shape (n_element, n_point)
@@ -187,8 +191,11 @@ class PlacedMesh:
         """
         circular_points = from_oval(points, self.oval)
         meshed_points, is_reflected = self.template.into_meshed_half(circular_points)
-        base_element, base_xi, base_eta = locate_points(self.placement.batch(), self.template, meshed_points[None])
-        element, xi, eta = self.template.within(base_element[0], base_xi[0], base_eta[0])
+        # `locate_points` expects one row of points for each placement. Here, there is a single placement.
+        (base_element,), (base_xi,), (base_eta,) = locate_points(
+            self.placement.batch(), self.template, meshed_points[None]
+        )
+        element, xi, eta = self.template.within(base_element, base_xi, base_eta)  # after splits of elements
         return element, xi, eta, is_reflected
 
     def gradient(self, element: Integers, xi: Array, eta: Array) -> Array:
@@ -200,7 +207,7 @@ class PlacedMesh:
             eta: Second local coordinate, shape (n,).
 
         Returns:
-            Shape (n, 2, n_local).
+            Derivatives, shape (n, 2, n_local).
         """
         _, derivatives = tensor_basis(self.resolution.order, xi, eta)
         gradient, _ = _film_gradient(derivatives[:, :, None, :], self.points[element])
@@ -213,7 +220,7 @@ class PlacedMesh:
             values: Values at the nodes, shape (n_element, n_local, k).
 
         Returns:
-            Shape (n_element, n_local, 2, k).
+            Derivatives, shape (n_element, n_local, 2, k).
         """
         gradient = self._node_gradient
         n_element, n_local, _, _ = gradient.shape
@@ -246,7 +253,10 @@ def place(
     Returns:
         The mesh, which is rotated so that the press lies on the positive x axis.
     """
-    template = template_for(probe, resolution, whole=whole or not film.is_axisymmetric)
+    needs_whole_mesh = whole or not film.is_axisymmetric
+    template = template_for(probe, resolution, whole=needs_whole_mesh)
+
+    # Rotate the press, the probe and the axis of an oval film so that the press lies on the positive x axis.
     x, y = at
     direction = float(np.arctan2(y, x))
     distance = np.array(np.hypot(x, y))
@@ -257,6 +267,8 @@ def place(
 
 def to_oval(points: Complexes, oval: complex) -> Complexes:
     """Map points of a circular film to an oval film. Points within `UNDEFORMED_RADIUS` remain unchanged.
+
+    Each point is displaced in the radial direction. At the rim, the relative displacement is e cos(2 (angle - alpha)).
 
     Args:
         points: Points x + iy, any shape, in film radii.
@@ -355,7 +367,7 @@ class _Jacobian(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _quadrature(order: int) -> _Quadrature:
-    """Return the integration rules for elements of an order."""
+    """Return the integration rules for elements of an order: at Gauss points, and at the nodes (Lobatto)."""
     xi, eta, weights = gauss_reference_square(order + 1)
     values, derivatives = tensor_basis(order, xi, eta)
     nodes = lobatto_nodes(order)
@@ -376,6 +388,7 @@ def _film_gradient(derivatives: Array, points: np.ndarray) -> tuple[Array, Array
         Derivatives with respect to (X1, X2), shape (n_element, n_point, 2, n_local), and the determinant of the
         Jacobian, shape (n_element, n_point).
     """
+    # Inverse of the 2 x 2 Jacobian: row X1 is (y_eta, -y_xi), and row X2 is (-x_eta, x_xi), over the determinant.
     jacobian = _jacobian(derivatives, points)
     determinant = jacobian.determinant
     adjugate = np.stack([jacobian.y_eta, -jacobian.y_xi, -jacobian.x_eta, jacobian.x_xi], axis=-1)
@@ -395,7 +408,8 @@ def _jacobian(derivatives: Array, points: np.ndarray) -> _Jacobian:
     Returns:
         Derivatives of x and y with respect to xi and eta, and their determinant.
     """
-    # Sum over the nodes n, for each local derivative k, element e and point p.
+    # Sum over the nodes n, for each local derivative k (xi or eta), element e and point p. The result is complex, like
+    # the points.
     tangent = np.einsum("kepn,en->kep", derivatives, points)
     x_xi, x_eta = tangent.real
     y_xi, y_eta = tangent.imag

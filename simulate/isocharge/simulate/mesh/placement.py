@@ -4,8 +4,8 @@ The disk automorphism
 
     Z = (z + c) / (1 + c z),   0 <= c < 1,
 
-is a conformal map of the unit disk onto itself. It maps points z of the template plane to film points Z, in film radii,
-with the probe on the positive x axis. The images of circles are circles. With
+is a conformal map of the unit disk onto itself. The map converts points z of the template plane into film points Z, in
+film radii, with the probe on the positive x axis. The images of circles are circles. With
 
     al = (atanh(p + R) + atanh(p - R)) / 2,   be = (atanh(p + R) - atanh(p - R)) / 2,   c = tanh al,   rho = tanh be
 
@@ -76,6 +76,9 @@ class Placement:
     ) -> Self:
         """Place a template under a press on the positive x axis.
 
+        The method determines the innermost circle, the conformal map that belongs to it, and the angles and depths of
+        the elements between this circle and the rim.
+
         Args:
             blocks: The elements, whose topology must be the topology of the probe.
             probe: The probe in the frame in which the press lies on the positive x axis.
@@ -84,6 +87,7 @@ class Placement:
             layer: Width of the thin rings at the rim, in film radii.
             rotation: Further rotation of the footprint, a number or of the shape of `distance`, rad.
         """
+        # Corners of the core polygon, followed by the centroid, which is real because the press lies on the x axis
         centroid = np.asarray(distance, dtype=float) / film_radius
         if probe.is_axisymmetric:
             rotation = 0.0
@@ -91,7 +95,8 @@ class Placement:
         core = centroid[..., None] + probe.core(film_radius) * rotation_factor[..., None]
         corners = np.concatenate([core, centroid[..., None]], axis=-1)
 
-        # `stops` are the corners of the footprint and the points half-way between them.
+        # `stops` are the corners of the footprint and the points half-way between them. The innermost circle is the
+        # footprint itself, or encloses it. `reach` is the largest distance of the inner blocks from its centre.
         stops: Complexes = np.asarray(corners @ blocks.boundary[:: blocks.split].T)
         if probe.topology.fills_circle:
             centre = centroid
@@ -105,6 +110,7 @@ class Placement:
                 boundary = probe.boundary(blocks.boundary_parameter[:: blocks.split])
                 stops = np.asarray(centroid[..., None] + boundary / film_radius * rotation_factor[..., None])
 
+        # Conformal map of the innermost circle, and the angles and depths of the elements around it
         c, rho = automorphism_onto(centre, radius)
         circle_angles = sector_angles(blocks, stops, reach, centroid, centre, radius, c * rho)
         template_layer = layer * (1.0 + c) / (1.0 - c)  # width of the thin rings in the template plane
@@ -157,7 +163,7 @@ class Placement:
         """Compute the film points of the nodes of every element for a single placement.
 
         Returns:
-            Shape (n_element, (order + 1)^2), in film radii.
+            Film points x + iy, shape (n_element, (order + 1)^2), in film radii.
         """
         inner_points = self._inner_element_points(blocks)
         ring_points = self._ring_element_points(blocks)
@@ -170,9 +176,9 @@ class Placement:
         straight sides. This method adds the curved sides.
 
         Returns:
-            Shape (n_inner, (order + 1)^2), in film radii.
+            Film points x + iy, shape (n_inner, (order + 1)^2), in film radii.
         """
-        radial, angular = _unit_coordinates(blocks)
+        radial, angular = _unit_coordinates(blocks)  # of the nodes of an element, from 0 to 1, shape (n_local,)
         corners = blocks.straight @ self.corners  # shape (n_inner, 4)
         a, b, c, d = corners.T[:, :, None]  # each of shape (n_inner, 1)
         inner_side = a + angular * (b - a)
@@ -194,8 +200,9 @@ class Placement:
         """Compute the film points of the nodes of the elements between the innermost circle and the rim.
 
         Returns:
-            Shape (n_ring * n_sector, (order + 1)^2), in film radii.
+            Film points x + iy, shape (n_ring * n_sector, (order + 1)^2), in film radii.
         """
+        # Depth of the nodes: 0 on the innermost circle, 1 on the rim
         radial, angular = _unit_coordinates(blocks)
         inner_depth = self.ring_depths[:-1, None]
         node_depth = inner_depth + radial * np.diff(self.ring_depths)[:, None]  # shape (n_ring, n_local)
@@ -204,10 +211,10 @@ class Placement:
         # The angle is interpolated over the depth between the innermost circle and the rim.
         circle_angle = self._node_circle_angles(blocks)  # shape (n_sector, n_local)
         rim_angle = self.rim_angles[:-1, None] + angular * np.diff(self.rim_angles)[:, None]
-        angle = (1.0 - depth) * circle_angle + depth * rim_angle
+        angle = (1.0 - depth) * circle_angle + depth * rim_angle  # shape (n_ring, n_sector, n_local)
         log_radius = (1.0 - depth) * np.log(self.rho)
-        points = self.to_film(np.exp(log_radius + 1j * angle))
-        return points.reshape(-1, radial.size)
+        template_points = np.exp(log_radius + 1j * angle)
+        return self.to_film(template_points).reshape(-1, radial.size)
 
     def _node_circle_angles(self, blocks: Blocks) -> Array:
         """Return the angles (rad) on the innermost circle for the nodes of each sector, shape (n_sector, n_local)."""

@@ -60,7 +60,7 @@ class QuadCorners(NamedTuple):
     def of_elements(self, element: Integers) -> "QuadCorners":
         """Select the corners of one element for each point.
 
-        The corners of all elements have the shape (n_point, n_element).
+        Each field of this object has the shape (n_point, n_element), with one row of elements for each point.
 
         Args:
             element: Index of the element of each point, shape (n_point,).
@@ -68,8 +68,13 @@ class QuadCorners(NamedTuple):
         Returns:
             Corners of these elements, each of shape (n_point,).
         """
-        point = np.arange(element.size)
-        return QuadCorners(*(corner[point, element] for corner in self))
+        row_of_point = np.arange(element.size)
+        return QuadCorners(
+            a=self.a[row_of_point, element],
+            b=self.b[row_of_point, element],
+            c=self.c[row_of_point, element],
+            d=self.d[row_of_point, element],
+        )
 
 
 def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
@@ -107,31 +112,49 @@ def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Comp
     Returns:
         Index of the element and its radial and angular coordinate from 0 to 1, each of shape (k, n).
     """
-    # Ring of each point, from the number of ring edges that the point has passed
-    with np.errstate(divide="ignore"):
+    # Depth of each point: 0 on the innermost circle, 1 on the rim
+    with np.errstate(divide="ignore"):  # the logarithm of the centre is infinite
         log_ratio = np.log(np.abs(template_points)) / np.log(placement.rho)[:, None]
     depth = np.clip(1.0 - log_ratio, 0.0, 1.0)
+
+    # Ring of each point, from the number of ring edges that the point has passed
     edges_between_rings = placement.ring_depths[:, None, 1:-1]  # shape (k, 1, n_ring - 1)
     ring = np.sum(edges_between_rings <= depth[..., None], axis=-1)
     inner_edge = np.take_along_axis(placement.ring_depths, ring, axis=1)
     outer_edge = np.take_along_axis(placement.ring_depths, ring + 1, axis=1)
     radial = (depth - inner_edge) / (outer_edge - inner_edge)
 
-    # Sector of each point, from the number of sides that the angle of the point has passed
-    angle = np.angle(template_points)
-    if not blocks.half:  # count the angle from the first side, up to a full turn
-        angle_of_side_0 = _side_angles(placement, np.zeros_like(ring), depth)
-        angle = angle_of_side_0 + np.mod(angle - angle_of_side_0, 2.0 * np.pi)
-    circle_angles = placement.circle_angles[:, None, 1:-1]  # of the sides between sectors, shape (k, 1, n_sector - 1)
-    rim_angles = placement.rim_angles[:, None, 1:-1]
-    side_angles = circle_angles + depth[..., None] * (rim_angles - circle_angles)
-    sector = np.sum(side_angles <= angle[..., None], axis=-1)
-    first_side_angle = _side_angles(placement, sector, depth)
-    last_side_angle = _side_angles(placement, sector + 1, depth)
-    angular = (angle - first_side_angle) / (last_side_angle - first_side_angle)
-
+    sector, angular = _locate_in_sectors(placement, blocks, np.angle(template_points), depth)
     element = blocks.n_inner + ring * blocks.n_sector + sector
     return element, radial, angular
+
+
+def _locate_in_sectors(placement: Placement, blocks: Blocks, angle: Array, depth: Array) -> tuple[Integers, Array]:
+    """Find the sectors of points between the innermost circle and the rim.
+
+    Args:
+        placement: One placement for each row of points.
+        blocks: The elements.
+        angle: Angles of the points in the template plane, shape (k, n), rad.
+        depth: Depths of the points, from 0 on the innermost circle to 1 on the rim, shape (k, n).
+
+    Returns:
+        Index of the sector, and the angular coordinate in the sector from 0 to 1, each of shape (k, n).
+    """
+    if not blocks.half:  # count the angle from the first side, up to a full turn
+        first_side = np.zeros(depth.shape, dtype=np.intp)
+        angle_of_first_side = _side_angles(placement, first_side, depth)
+        angle = angle_of_first_side + np.mod(angle - angle_of_first_side, 2.0 * np.pi)
+
+    # The index of the sector is the number of sides between sectors that the angle of the point has passed.
+    circle_angles = placement.circle_angles[:, None, 1:-1]  # shape (k, 1, n_sector - 1)
+    rim_angles = placement.rim_angles[:, None, 1:-1]
+    side_angles = circle_angles + depth[..., None] * (rim_angles - circle_angles)
+    sector: Integers = np.sum(side_angles <= angle[..., None], axis=-1)
+    side_before = _side_angles(placement, sector, depth)
+    side_after = _side_angles(placement, sector + 1, depth)
+    angular = (angle - side_before) / (side_after - side_before)
+    return sector, angular
 
 
 def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
@@ -166,6 +189,8 @@ def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> t
     Returns:
         Index of the element and its radial and angular coordinate from 0 to 1, each of shape (n,).
     """
+    # Distance of each point from the four sides of each element, shape (n, n_inner). The corners a and b are on the
+    # inner side of an element, c and d on its outer side.
     corners = _inner_corners(placement, blocks)
     point_column = points[:, None]
     distance_from_first_side = _distance_to_left(corners.a, corners.c, point_column)
@@ -173,11 +198,12 @@ def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> t
     distance_from_inner_side = _distance_to_left(corners.b, corners.a, point_column)
     distance_from_outer_side = _distance_to_left(corners.c, corners.d, point_column)
 
-    distance_from_outer_side[:, blocks.n_quad :] = np.inf  # the outer side is curved
+    # Ignore curved sides. With two layers, the boundary of the footprint decides between footprint and last layer.
+    distance_from_outer_side[:, blocks.n_quad :] = np.inf
     if blocks.n_layer == 2:
         centroid = placement.corners[:, -1]
         in_footprint = placement.probe.contains((points - centroid) / placement.rotation_and_scale)
-        distance_from_inner_side[:, blocks.last_layer] = np.inf  # the inner side is curved, too
+        distance_from_inner_side[:, blocks.last_layer] = np.inf
         distance_from_outer_side[~in_footprint, blocks.footprint] = -np.inf
         distance_from_outer_side[in_footprint, blocks.last_layer] = -np.inf
 
@@ -225,10 +251,14 @@ def _correct_sectors(
         rows = np.flatnonzero(is_outside & (first_element >= blocks.n_quad))
         if rows.size == 0:
             return
+
+        # Sector of each of these points in its layer
         row_corners = QuadCorners(*(corner[rows] for corner in corners))
         in_last_layer = first_element[rows] >= blocks.last_layer.start
         layer_start = np.where(in_last_layer, blocks.last_layer.start, blocks.n_quad)
         sector = first_element[rows] - layer_start
+
+        # Try the sectors on both sides, and keep a sector in which the local coordinates overshoot less.
         for signed_shift in (shift, -shift):
             candidate = layer_start + (sector + signed_shift) % blocks.n_sector
             candidate_corners = row_corners.of_elements(candidate)
@@ -274,6 +304,9 @@ def _invert_blend(
     placement: Placement, blocks: Blocks, points: Complexes, element: Integers, corners: QuadCorners
 ) -> tuple[Array, Array]:
     """Compute the local coordinates of points in given elements inside the innermost circle, by Newton's method.
+
+    The film point with the coordinates (radial, angular) is (1 - radial) * inner(angular) + radial * outer(angular),
+    where inner and outer are the two sides of the element.
 
     Args:
         placement: One placement for each point.
@@ -352,6 +385,7 @@ def _circle_in_sector(placement: Placement, sector: Integers, angular: Array) ->
     Returns:
         Points and derivatives, each of shape (n,), in film radii.
     """
+    # Angles of the first and the last side of the sector of each point
     first_angle = np.take_along_axis(placement.circle_angles, sector[:, None], axis=1)[:, 0]
     last_angle = np.take_along_axis(placement.circle_angles, (sector + 1)[:, None], axis=1)[:, 0]
     angle_range = last_angle - first_angle
@@ -383,7 +417,8 @@ def _boundary_in_sector(
     next_point = placement.boundary(parameter + PARAMETER_STEP)[:, 0]
     previous_point = placement.boundary(parameter - PARAMETER_STEP)[:, 0]
     parameter_derivative = (next_point - previous_point) / (2.0 * PARAMETER_STEP)
-    return point, parameter_derivative * parameter_range
+    angular_derivative = parameter_derivative * parameter_range
+    return point, angular_derivative
 
 
 def _overshoot(radial: Array, angular: Array) -> Array:

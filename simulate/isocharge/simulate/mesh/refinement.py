@@ -63,7 +63,8 @@ class RefinedTemplate(Template):
             low: Lower left corner (xi, eta) of each element in the original element, shape (n_element, 2).
             size: Lengths of the sides of each element in the original element, shape (n_element, 2).
         """
-        super().__init__(base.resolution, base.topology, not base.half)
+        is_whole = not base.half
+        super().__init__(base.resolution, base.topology, is_whole)
         self.base = base
         self.parent = parent
         self.low = low
@@ -71,11 +72,13 @@ class RefinedTemplate(Template):
         self.n_element = parent.size
         self.splits = np.column_stack([parent, low, size])
 
+        # Nodes of different elements at the same position under the sample press are the same node.
         points = self.from_base(sample_points(base)).ravel()
         self.n_node, node_number = _merge_coinciding(points)
         self.nodes: Integers = node_number.reshape(self.n_element, -1)
-        self.first_seen = np.unique(node_number, return_index=True)[1]
+        _, self.first_seen = np.unique(node_number, return_index=True)
 
+        # The rim consists of the outer sides of the elements of the last ring. A whole film has no line of symmetry.
         is_in_last_ring = parent >= base.n_element - base.n_sector
         parent_xi, _ = self._into_parent(self.xi, self.eta)
         is_on_outer_side = parent_xi > 1.0 - 1e-12
@@ -121,22 +124,21 @@ class RefinedTemplate(Template):
         found_element = np.zeros_like(element)
         position = np.stack([xi, eta])  # shape (2, n_point)
         for size in np.unique(self.size, axis=0):
-            cell_size = size[:, None]
-            elements_of_size = np.flatnonzero((self.size == size).all(axis=1))
-            element_cells = np.rint((self.low[elements_of_size].T + 1.0) / cell_size).astype(np.intp)
-            element_codes = self._cell_codes(self.parent[elements_of_size], element_cells)
-            order = np.argsort(element_codes)  # `searchsorted` needs sorted codes
-            candidates = elements_of_size[order]
-            candidate_codes = element_codes[order]
+            candidates, candidate_codes = self._elements_of_size(size)
 
+            # Codes of the cells that contain the points. The upper edge of an element, 1, belongs to its last cell.
+            cell_size = size[:, None]
             point_cells = np.floor((position + 1.0) / cell_size).astype(np.intp)
             last_cell = np.rint(2.0 / cell_size).astype(np.intp) - 1
             point_codes = self._cell_codes(element, np.clip(point_cells, 0, last_cell))
+
+            # Find equal codes; `searchsorted` may return the index after the last code.
             match = np.searchsorted(candidate_codes, point_codes)
             match = np.minimum(match, candidates.size - 1)
             is_match = candidate_codes[match] == point_codes
             found_element[is_match] = candidates[match[is_match]]
 
+        # Local coordinates from -1 to 1 in the found elements
         low = self.low[found_element].T
         half_size = 0.5 * self.size[found_element].T
         local_xi, local_eta = (position - low) / half_size - 1.0
@@ -160,12 +162,27 @@ class RefinedTemplate(Template):
         """Convert local coordinates, shape (n,), of all elements into those of the original elements.
 
         Returns:
-            Shape (2, n_element, n).
+            Local coordinates xi and eta, shape (2, n_element, n).
         """
         local = np.stack([xi, eta])[:, None]  # shape (2, 1, n)
         low = self.low.T[:, :, None]  # shape (2, n_element, 1)
         size = self.size.T[:, :, None]
         return low + 0.5 * size * (local + 1.0)
+
+    def _elements_of_size(self, size: Array) -> tuple[Integers, Integers]:
+        """Return the elements of one size, and the codes of their cells in ascending order.
+
+        Args:
+            size: Lengths of the sides in the original element, shape (2,).
+
+        Returns:
+            Indices of the elements and their codes, each of shape (n,).
+        """
+        elements = np.flatnonzero((self.size == size).all(axis=1))
+        cells = np.rint((self.low[elements].T + 1.0) / size[:, None]).astype(np.intp)
+        codes = self._cell_codes(self.parent[elements], cells)
+        order = np.argsort(codes)
+        return elements[order], codes[order]
 
     def _hanging_node_matrix(self, points: Complexes) -> csr_array:
         """Compute the matrix that converts the values at the regular nodes into the values at all nodes.
@@ -176,13 +193,14 @@ class RefinedTemplate(Template):
             points: Film points of the nodes of all elements under the sample press, shape (n_element * n_local,).
 
         Returns:
-            Shape (n_node, n_node). The columns of hanging nodes are zero.
+            Matrix, shape (n_node, n_node). The columns of hanging nodes are zero.
         """
         order = self.resolution.order
         sources = self._hanging_node_sources(points)
         hanging = np.array(list(sources), dtype=np.intp)
         regular = np.setdiff1d(np.arange(self.n_node), hanging)
 
+        # A regular node has the weight 1 in its own row. A hanging node has order + 1 weights in its row.
         row = np.concatenate([regular, np.repeat(hanging, order + 1)])
         column = np.concatenate([regular, *(side_nodes for side_nodes, _ in sources.values())])
         weight = np.concatenate([np.ones(regular.size), *(weights for _, weights in sources.values())])
@@ -232,12 +250,12 @@ class RefinedTemplate(Template):
             # Nodes at these positions; the distance is infinite where there is no node.
             coordinates = np.stack([candidate_points.real, candidate_points.imag], axis=-1)
             distance, nearest_node = node_tree.query(coordinates, distance_upper_bound=NODE_TOLERANCE)
-            for element, side, index in np.argwhere(np.isfinite(distance)):
-                node = int(nearest_node[element, side, index])
+            for element, side, position in np.argwhere(np.isfinite(distance)):
+                node = int(nearest_node[element, side, position])
                 side_nodes = nodes_on_sides[element, side]
                 is_node_of_large_element = node in side_nodes
                 if not is_node_of_large_element:
-                    sources[node] = side_nodes, weights[index]
+                    sources[node] = side_nodes, weights[position]
         return sources
 
 
@@ -264,6 +282,9 @@ def _merge_coinciding(points: Complexes) -> tuple[int, Integers]:
 def refine(mesh: PlacedMesh, lines: Complexes, finest: float) -> PlacedMesh:
     """Split the elements of a mesh along lines, until the elements on the lines are small enough.
 
+    An element is split if its longest side exceeds `finest` and its middle is close to a line; see `GRADING`. Each of
+    its sides is halved unless it is already short; see `MIN_SIDE_RATIO`.
+
     Args:
         mesh: Mesh of a whole film.
         lines: Points on the lines at distances below half of `finest`, rotated with the press, shape (n,), in film
@@ -289,7 +310,7 @@ def refine(mesh: PlacedMesh, lines: Complexes, finest: float) -> PlacedMesh:
         if not is_split.any():
             break
 
-        # Halve along xi first, then along eta. Each halving appends the second halves, which may be halved again.
+        # Halve along xi (axis 0) first, then along eta. The second halves are appended, and may be halved again.
         for axis in (0, 1):
             halved = is_split[:, axis]
             size[halved, axis] *= 0.5
@@ -350,6 +371,7 @@ def _edges(parts: tuple[Complexes, ...], finest: float) -> Complexes:
     Returns:
         Points x + iy, shape (n,), in the unit of the corners.
     """
+    edge_distance = 1e-3 * finest  # of a point just outside of an edge from this edge
     points = []
     points_just_outside = []
     for part in parts:
@@ -358,9 +380,9 @@ def _edges(parts: tuple[Complexes, ...], finest: float) -> Complexes:
             n_point = 2 + int(3.0 * length / finest)
             fraction_of_length = (np.arange(n_point) + 0.5) / n_point
             edge_points = start + fraction_of_length * (end - start)
-            outward_normal = -1j * (end - start) / length
+            outward_normal = -1j * (end - start) / length  # to the right of an anticlockwise edge
             points.append(edge_points)
-            points_just_outside.append(edge_points + 1e-3 * finest * outward_normal)
+            points_just_outside.append(edge_points + edge_distance * outward_normal)
     just_outside = np.concatenate(points_just_outside)
     is_inner_edge = np.any([min_edge_cross_product(part, just_outside) > 0.0 for part in parts], axis=0)
     return np.asarray(np.concatenate(points)[~is_inner_edge])

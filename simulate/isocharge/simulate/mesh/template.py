@@ -51,12 +51,14 @@ class Template(Blocks):
             whole: Whether to mesh the whole film although the footprint is symmetric.
         """
         super().__init__(resolution, topology, whole)
-        element_points = sample_points(self)
+        element_points = sample_points(self)  # x + iy in film radii, shape (n_element, n_local)
         all_points = element_points.ravel()
         rounded_points = np.round(all_points, 9)  # equal points may differ by rounding errors
         _, self.first_seen, node_number = np.unique(rounded_points, return_index=True, return_inverse=True)
         self.nodes: Integers = node_number.reshape(element_points.shape)
         self.n_node = self.first_seen.size
+
+        # Nodes on the rim, and on the line of symmetry of a half mesh
         node_points = all_points[self.first_seen]
         self.on_rim = np.abs(node_points) > 1.0 - 1e-9
         self.on_axis = (np.abs(node_points.imag) < 1e-9) & self.half
@@ -70,7 +72,7 @@ class Template(Blocks):
             values: Shape (n_original_element, n_local, ...).
 
         Returns:
-            Shape (n_element, n_local, ...).
+            Values, shape (n_element, n_local, ...).
         """
         return values
 
@@ -130,7 +132,7 @@ def sample_points(blocks: Blocks) -> Complexes:
         blocks: The elements.
 
     Returns:
-        Shape (n_element, (order + 1)^2), in film radii.
+        Film points x + iy, shape (n_element, (order + 1)^2), in film radii.
     """
     probe = _sample_probe(blocks.topology)
     placement = Placement.of(blocks, probe, np.array(SAMPLE_DISTANCE), 1.0, SAMPLE_LAYER)

@@ -81,6 +81,7 @@ def lattice(max_count: int) -> Complexes:
     Returns:
         Points in the order of their distance from the centre, shape (n,).
     """
+    # Integer coordinates of a square that contains the disk
     max_count = max(max_count, 1)
     half_side = int(np.sqrt(max_count / np.pi)) + 2
     line = np.arange(-half_side, half_side + 1)
@@ -92,11 +93,12 @@ def lattice(max_count: int) -> Complexes:
     n_radii = np.searchsorted(np.cumsum(point_counts), max_count, side="right")
     squared_radius = squared_radii[n_radii - 1]
 
+    # Sort the points by the distance, then by x and y, and scale the disk to the radius 1.
     is_inside = squared_distance <= squared_radius
     x = x_grid[is_inside]
     y = y_grid[is_inside]
     order = np.lexsort((y, x, squared_distance[is_inside]))
-    radius = max(np.sqrt(squared_radius), 1.0)
+    radius = max(np.sqrt(squared_radius), 1.0)  # 1 if the centre is the only point
     rounding_margin = 1.0 - 1e-15  # keeps the outermost points within the unit circle
     return np.asarray((x[order] + 1j * y[order]) / radius * rounding_margin)
 
@@ -111,18 +113,19 @@ def square_grid(radius: float, spacing: float) -> Array:
     Returns:
         Points (x, y), shape (n, 2).
     """
-    count = int(radius / spacing * (1.0 + ROUNDING))
-    line = spacing * np.arange(-count, count + 1)
-    x, y = (coordinate.ravel() for coordinate in np.meshgrid(line, line))
-    inside = np.hypot(x, y) <= radius * (1.0 + ROUNDING)
-    return np.asarray(np.stack([x, y], axis=1)[inside])
+    steps_to_edge = int(radius / spacing * (1.0 + ROUNDING))
+    line = spacing * np.arange(-steps_to_edge, steps_to_edge + 1)
+    x_grid, y_grid = np.meshgrid(line, line)
+    points = np.stack([x_grid.ravel(), y_grid.ravel()], axis=1)
+    is_inside = np.hypot(points[:, 0], points[:, 1]) <= radius * (1.0 + ROUNDING)
+    return np.asarray(points[is_inside])
 
 
 def sunflower(count: int) -> Complexes:
     """Return `count` points x + iy that are distributed evenly over the unit disk, shape (count,).
 
-    The points form the pattern of the seeds of a sunflower (Vogel 1979). They are ordered by the distance from the
-    centre.
+    The points form the pattern of the seeds of a sunflower (Vogel 1979). The points are ordered by the distance from
+    the centre.
     """
     number = np.arange(count)
     golden_angle = np.pi * (3.0 - np.sqrt(5.0))

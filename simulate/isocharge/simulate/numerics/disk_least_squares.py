@@ -60,7 +60,10 @@ All diagonal elements of the product are the mean of the diagonal of the 3 x 3 m
 def minimise(
     residuals: Residuals, start: Array, steps: int = MAX_STEPS, min_change: float = MIN_CHANGE
 ) -> tuple[Array, Array]:
-    """Find a local minimum of every problem by an iteration from a starting point.
+    """Find a local minimum of every problem by damped Gauss-Newton steps from a starting point.
+
+    The damping of a problem is reduced after a step that is accepted, and increased after a step that is rejected
+    because it increases |r|^2. A problem is finished if |r|^2 hardly changes, or if the damping exceeds `MAX_DAMPING`.
 
     Args:
         residuals: Function that evaluates the residuals of some of the problems.
@@ -76,7 +79,7 @@ def minimise(
     first_residual, first_slopes = residuals(active, point)
     residual = np.array(first_residual)
     slopes = np.array(first_slopes)
-    square = (residual**2).sum(axis=1)
+    square = (residual**2).sum(axis=1)  # |r|^2, shape (n,)
     damping = np.full(len(point), INITIAL_DAMPING)
     for _ in range(steps):
         if not active.size:
@@ -115,10 +118,13 @@ def bounded_step(unit: Array, residual: Array, slopes: Array, damping: Array | f
     Returns:
         Points after the step, shape (..., 3).
     """
+    # Damped normal equations. The addition to the trace avoids a singular matrix if all derivatives are zero.
     normal_matrix: Array = slopes @ slopes.swapaxes(-1, -2)  # J'J, shape (..., 3, 3)
     gradient: Array = (slopes @ residual[..., None])[..., 0]  # J'r, shape (..., 3)
     trace = normal_matrix[..., 0, 0] + normal_matrix[..., 1, 1] + normal_matrix[..., 2, 2] + 1e-12
     normal_matrix = normal_matrix + (damping * trace)[..., None, None] * MEAN_OF_DIAGONAL
+
+    # Points on the edge of the disk or at an end of the interval
     is_on_circle, is_at_end = _is_beyond(unit, 1.0 - EDGE_TOLERANCE)
     if np.count_nonzero(is_on_circle | is_at_end):
         normal_matrix, gradient = _restrict_to_edges(unit, normal_matrix, gradient, trace, is_on_circle, is_at_end)
@@ -164,6 +170,7 @@ def _restrict_to_edges(
     Returns:
         Modified matrices, shape (..., 3, 3), and modified gradients, shape (..., 3).
     """
+    # Unit vectors at each point: normal and tangent of the circle, and normal of the end of the interval
     radius = np.hypot(unit[..., 0], unit[..., 1])
     circle_normal = np.zeros_like(unit)
     circle_normal[..., :2] = unit[..., :2] / np.maximum(radius, EDGE_TOLERANCE)[..., None]

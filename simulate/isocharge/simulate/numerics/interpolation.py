@@ -32,9 +32,9 @@ def lobatto_nodes(order: int) -> Array:
 def lobatto_weights(order: int) -> Array:
     """Return the barycentric weights of `lobatto_nodes`, shape (order + 1,).
 
-    The weight of the node x_j is proportional to 1 / P_order(x_j) with the Legendre polynomial P_order. Except for
-    alternating signs, the weights are proportional to the square roots of the quadrature weights (Wang, Huybrechs and
-    Vandewalle 2014).
+    The weight of the node x_j is proportional to 1 / P_order(x_j) with the Legendre polynomial P_order. The magnitudes
+    of the weights are proportional to the square roots of the quadrature weights, and their signs alternate (Wang,
+    Huybrechs and Vandewalle 2014).
     """
     weights: Array = 1.0 / eval_legendre(order, lobatto_nodes(order))
     return _read_only(weights / np.abs(weights).max())
@@ -97,7 +97,7 @@ def barycentric_weights(nodes: Array) -> Array:
 
 
 def lagrange_values(nodes: Array, weights: Array, points: Array) -> Array:
-    """Evaluate the Lagrange polynomials of given nodes.
+    """Evaluate the Lagrange polynomials of given nodes by the barycentric formula (Berrut and Trefethen 2004).
 
     Args:
         nodes: Interpolation nodes, shape (n,).
@@ -107,7 +107,7 @@ def lagrange_values(nodes: Array, weights: Array, points: Array) -> Array:
     Returns:
         Value of each polynomial at each point, shape (m, n). Each row adds up to one.
     """
-    difference = points[:, None] - nodes[None, :]
+    difference = points[:, None] - nodes[None, :]  # shape (m, n)
     point_on_node, node_index = np.nonzero(np.abs(difference) < MIN_DIFFERENCE)
     difference[point_on_node, node_index] = 1.0  # avoids a division by zero; these rows are replaced below
 

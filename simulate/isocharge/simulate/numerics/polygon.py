@@ -42,11 +42,12 @@ def is_convex(corners: Array) -> bool:
     """
     edge = np.roll(corners, -1, axis=0) - corners
     next_edge = np.roll(edge, -1, axis=0)
-    turn = _cross(edge, next_edge)
+    turns_left = np.all(_cross(edge, next_edge) > 0.0)
+
+    # All corners of a convex polygon lie on the left of each edge or on the edge.
     offset = corners[None, :] - corners[:, None]  # from the start of each edge to each corner
     side = _cross(edge[:, None], offset)  # positive for corners on the left of the edge
-    turns_left = np.all(turn > 0.0)
-    is_on_left = side.min() >= -1e-9 * side.max()
+    is_on_left = side.min() >= -1e-9 * side.max()  # the tolerance is for rounding errors
     return bool(turns_left and is_on_left)
 
 
@@ -68,7 +69,7 @@ def _cross(first: Array, second: Array) -> Array:
 
 
 def overlap(first: Array, second: Array, within: float = 0.0) -> bool:
-    """Return whether two polygons overlap, or whether the distance between them is smaller than a given distance.
+    """Return whether two polygons overlap or are closer to each other than a given distance.
 
     Args:
         first: Corners (x, y), shape (n, 2).
@@ -79,7 +80,8 @@ def overlap(first: Array, second: Array, within: float = 0.0) -> bool:
     second_polygon = shapely.Polygon(second)
     if within > 0.0:
         return bool(shapely.distance(first_polygon, second_polygon) < within)
-    return bool(shapely.relate_pattern(first_polygon, second_polygon, "T********"))  # the interiors intersect
+    interiors_intersect = "T********"  # pattern of the dimensionally extended nine-intersection model
+    return bool(shapely.relate_pattern(first_polygon, second_polygon, interiors_intersect))
 
 
 def to_complex(corners: Array) -> Complexes:
@@ -96,8 +98,9 @@ def min_edge_cross_product(corners: Complexes, points: Complexes) -> Array:
     """Compute the smallest cross product over all edges of a convex polygon.
 
     The factors of each cross product are an edge and the vector from its start to the point. The cross product is the
-    length of the edge times the signed distance of the point from the line through the edge. It is positive if the
-    point lies on the left of the edge. The smallest cross product is therefore positive for points within the polygon.
+    length of the edge times the signed distance of the point from the line through the edge. The cross product is
+    positive if the point lies on the left of the edge. The smallest cross product is therefore positive for points
+    within the polygon.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n,).
@@ -153,6 +156,7 @@ def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float)
     chord_start = (chord_start_along + 1j * across) * direction
     chord_end = (chord_end_along + 1j * across) * direction
 
+    # Signed areas of the triangle inside the circle and of the sectors before and after it
     triangle = -0.5 * across * (chord_end_along - chord_start_along)
     angle_before_chord = np.angle(chord_start * np.conj(start))
     angle_after_chord = np.angle(end * np.conj(chord_end))
@@ -174,16 +178,19 @@ def gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:
         Points (x, y), shape (m, 2), and weights, shape (m,), which add up to one.
     """
     unit_points, unit_weights = gauss_square(count)
-    radial = unit_points[:, :1]  # 0 at the first corner, 1 on the opposite side
-    angular = unit_points[:, 1:]
+    radial = unit_points[:, :1]  # 0 at the first corner of a triangle, 1 on the opposite side; shape (count^2, 1)
+    angular = unit_points[:, 1:]  # 0 on the first side, 1 on the second side
+    first_corner = corners[0]
     points = []
     weights = []
     for second_corner, third_corner in pairwise(corners[1:]):
-        first_side = second_corner - corners[0]
-        second_side = third_corner - corners[0]
+        first_side = second_corner - first_corner
+        second_side = third_corner - first_corner
+        point_on_opposite_side = (1.0 - angular) * first_side + angular * second_side
+        points.append(first_corner + radial * point_on_opposite_side)
+
+        # The determinant of the Jacobian is the radial coordinate times twice the area of the triangle.
         double_area = float(_cross(first_side, second_side))
-        direction = (1.0 - angular) * first_side + angular * second_side
-        points.append(corners[0] + radial * direction)
         weights.append(unit_weights * radial[:, 0] * double_area)
     all_weights = np.concatenate(weights)
     return np.concatenate(points), all_weights / all_weights.sum()
@@ -217,9 +224,10 @@ def gauss_quadrilateral(corners: Array, count: int, length: float) -> tuple[Arra
     Returns:
         Points (x, y), shape (n, 2), and weights, shape (n,), which add up to the area of the polygon.
     """
+    # The corners (a, b, c, d) are the images of (0, 0), (1, 0), (1, 1) and (0, 1) in the coordinates (s, t).
     complex_corners = to_complex(corners)
     a, b, c, d = _four_corners(complex_corners)
-    s_side = max(abs(b - a), abs(c - d))  # the longer one of the two sides along the coordinate s of the square
+    s_side = max(abs(b - a), abs(c - d))  # the longer one of the two sides along s
     t_side = max(abs(d - a), abs(c - b))
     s_line, s_weights = _gauss_line_for(s_side, count, length)
     t, t_weights = _gauss_line_for(t_side, count, length)

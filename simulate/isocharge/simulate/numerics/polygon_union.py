@@ -1,8 +1,8 @@
 """Unions of polygons, divided into trapezoids for integration. Polygons are arrays of corners x + iy, anticlockwise.
 
-The library shapely (GEOS) computes unions and intersections. It has no equivalent for two functions of this module: the
-division into trapezoids, and the outline of a trace. The function `buffer` of shapely silently cuts off sharp bends,
-and converts a trace that crosses itself into a ring. With `trace_outline`, both errors can be detected.
+The library shapely (GEOS) computes unions and intersections. The library has no equivalent for two functions of this
+module: the division into trapezoids, and the outline of a trace. The function `buffer` of shapely silently cuts off
+sharp bends, and converts a trace that crosses itself into a ring. With `trace_outline`, both errors can be detected.
 """
 
 from collections.abc import Sequence
@@ -112,8 +112,8 @@ def _strip_ends(polygons: Sequence[Complexes]) -> Array:
 def _edges(region: shapely.Geometry) -> tuple[Complexes, Complexes]:
     """Return the start and end points x + iy of all edges of a region, including the edges of its holes."""
     parts = shapely.get_parts(region)
-    polygons = parts[shapely.get_dimensions(parts) == 2]
-    rings = [to_complex(shapely.get_coordinates(ring)) for ring in shapely.get_rings(polygons)]
+    polygons = parts[shapely.get_dimensions(parts) == 2]  # without points and lines where polygons only touch
+    rings = [to_complex(shapely.get_coordinates(ring)) for ring in shapely.get_rings(polygons)]  # closed
     start = np.concatenate([ring[:-1] for ring in rings])
     end = np.concatenate([ring[1:] for ring in rings])
     return start, end
@@ -140,6 +140,8 @@ def subdivide(part: Complexes, max_side: float) -> list[Complexes]:
     for i in range(n_s):
         for j in range(n_t):
             corners = np.array([grid[i, j], grid[i + 1, j], grid[i + 1, j + 1], grid[i, j + 1]])
+
+            # Omit corners that coincide with the previous corner, and cells without an area.
             previous_corners = np.roll(corners, 1)
             is_distinct = np.abs(corners - previous_corners) > MERGE_DISTANCE
             has_area = np.count_nonzero(is_distinct) > 2
@@ -161,10 +163,11 @@ def trace_outline(path: Complexes, width: float) -> Complexes:
     with np.errstate(divide="ignore", invalid="ignore"):
         sections = np.diff(path)
         normal = 1j * sections / np.abs(sections)  # to the left of each section
-        normal_before = np.append(normal[:1], normal)
+        normal_before = np.append(normal[:1], normal)  # at each point; the ends have a single section
         normal_after = np.append(normal, normal[-1:])
 
-        # The mitre is the displacement of a corner along the bisector of the normals before and after the point.
+        # The mitre is the displacement of a corner along the bisector of the normals before and after the point. The
+        # cosine is that of the angle of the bend.
         one_plus_cosine = 1.0 + (normal_before * np.conj(normal_after)).real
         one_plus_cosine = np.where(one_plus_cosine < MIN_BEND, np.nan, one_plus_cosine)
         mitre = 0.5 * width * (normal_before + normal_after) / one_plus_cosine

@@ -80,8 +80,10 @@ def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> Non
         title: Title of the axes.
     """
     corners = np.concatenate([polygon for electrode in sensor.electrodes for polygon in electrode.front])
-    outermost = float(np.hypot(*sensor.calibration.place(corners).T).max())
-    half_width = max(radius, outermost) + 0.7
+    corner_x, corner_y = sensor.calibration.place(corners).T
+    outermost = float(np.hypot(corner_x, corner_y).max())
+    margin_mm = 0.7
+    half_width = max(radius, outermost) + margin_mm
     limits = (-half_width, half_width)
     axes.set(xlim=limits, ylim=limits, xlabel="x, mm", ylabel="y, mm", aspect="equal", title=title)
 

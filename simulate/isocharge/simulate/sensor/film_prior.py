@@ -2,8 +2,8 @@
 
 The prior distribution is centred on the description in a sensor file. Before anything is measured, the properties of
 the film, its coefficients and the gains are uncertain by a few percent, and the positions of the electrodes by tenths
-of a millimetre. The pretension is almost unknown. Calibrations start from this prior distribution, virtual films are
-drawn from it, and networks for all films are trained with films from it.
+of a millimetre. The pretension is almost unknown. Calibrations start from this prior distribution. Virtual films and
+the films with which networks for all films are trained are drawn from the same distribution.
 
 `PARAMETERS` declares each parameter that all films have. The parameter vector also contains one gain for each
 electrode. Each parameter is a deviation from the sensor file, so it is zero for the described film. Only the parameter
@@ -129,7 +129,7 @@ class FilmParameter:
         return float(value if self.item is None else value[self.item])
 
     def changed(self, described: float, parameter: float, factor: float) -> float:
-        """Convert a parameter into the physical value.
+        """Convert a parameter into the physical value, according to the form of the parameter.
 
         Args:
             described: Physical value of the described film.
@@ -325,6 +325,7 @@ class FilmPrior:
         Returns:
             Parameters, shape (count, n_parameter).
         """
+        # Draw all parameters from normal distributions, and repeat this for values outside the bounds.
         lower_bounds, upper_bounds = self.bounds
         drawn = self.mean + self.std * rng.standard_normal((count, len(self.names)))
         is_outside = (drawn < lower_bounds) | (drawn > upper_bounds)
@@ -362,6 +363,7 @@ class FilmPrior:
             else:
                 attributes.setdefault(declaration.attribute, {})[declaration.item] = value
 
+        # The shift is collected by index, 0 for x and 1 for y. The calibration needs a tuple.
         calibration = changes["calibration"]
         shift = calibration["shift"]
         calibration["shift"] = (shift[0], shift[1])
@@ -410,6 +412,7 @@ class FilmPrior:
         ):
             if value != expected:
                 raise SensorError(f"{sensor.name}: {what}: expected those of {described.name}, {expected}, got {value}")
+
         components = _components_of(sensor, probe)
         try:
             values = [

@@ -194,6 +194,7 @@ class Electrode:
             other: The other electrode.
             within: Distance below which the electrodes also count as overlapping, mm.
         """
+        # Compare only polygons whose bounding boxes are near along both axes, shape (n_part, n_other_part, 2).
         low, high = self.boxes
         other_low, other_high = other.boxes
         are_near_along_axis = (low[:, None] <= other_high + within) & (other_low - within <= high[:, None])
@@ -283,7 +284,7 @@ class Sensor:
         Raises:
             SensorError: If a value is not allowed, or an electrode overlaps another one or the rim.
         """
-        object.__setattr__(self, "electrodes", _as_tuples(self.electrodes))
+        object.__setattr__(self, "electrodes", _as_tuples(self.electrodes))  # the dataclass is frozen
         for value, options in ((self.readout, get_args(Readout)), (self.surface, get_args(Surface))):
             if value not in options:
                 raise SensorError(f"expected one of {options}, got {value!r}")
@@ -325,6 +326,7 @@ class Sensor:
         """The film with the metal of the electrodes. If `coating` is zero, this is the film without electrodes."""
         if self.coating == 0.0:
             return self.film
+
         # The first layer is metal on the front or on the back. The second layer is metal on both sides, which is the
         # collecting area of electrodes with metal on the back.
         electrodes_of_all_metal = [
@@ -475,6 +477,7 @@ def check_polygon(where: str, polygon: Corners) -> None:
     if corners.ndim != 2 or not 3 <= len(corners) <= MAX_CORNERS or corners.shape[1] != 2:
         raise SensorError(f"{where}: expected 3 to {MAX_CORNERS} corners (x, y), got {shown(corners.tolist())}")
     is_finite = np.isfinite(corners).all()
+    # The test for a convex polygon is faster, and most polygons are convex.
     if not (is_finite and (is_convex(corners) or is_simple(to_complex(corners)))):
         raise SensorError(
             f"{where}: expected a polygon that does not cross itself, with its corners anticlockwise, got "

@@ -123,7 +123,8 @@ class SensorTable(Settings, frozen=True):
     def __post_init__(self) -> None:
         """Check the section `electrodes` and the names of the section `roles`.
 
-        The keys of `electrodes` are not declared, because they are the names of the electrodes.
+        The keys of `electrodes` are not declared, because they are the names of the electrodes. Only two keys have
+        another meaning: `SIDE` and `COATING` are numbers that apply to all electrodes.
 
         Raises:
             WrongKey: If a value has the wrong type, or a key is missing.
@@ -131,9 +132,13 @@ class SensorTable(Settings, frozen=True):
         for name, value in self.electrodes.items():
             if name not in (SIDE, COATING) and isinstance(value, float):
                 raise WrongKey(f"electrodes.{name}", "[x, y] in mm or a table", value)
-            if isinstance(value, PolygonTable) and bool(value.trace_mm) != (value.width_mm > 0.0):
-                missing = "width_mm" if value.trace_mm else "trace_mm"
-                raise WrongKey(f"electrodes.{name}.{missing}", "trace_mm and a width_mm above 0 together")
+            if isinstance(value, PolygonTable):
+                has_trace = bool(value.trace_mm)
+                has_width = value.width_mm > 0.0
+                if has_trace != has_width:
+                    missing = "width_mm" if has_trace else "trace_mm"
+                    raise WrongKey(f"electrodes.{name}.{missing}", "trace_mm and a width_mm above 0 together")
+
         coating = self.electrodes.get(COATING, 0.0)
         if not (isinstance(coating, float) and 0.0 <= coating <= MAX_COORDINATE_mm):
             raise WrongKey(f"electrodes.{COATING}", f"a number from 0 to {MAX_COORDINATE_mm:g}", coating)
@@ -212,7 +217,7 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
 
 
 def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
-    """Return a sensor as the tables of a sensor file. They can be written as JSON or TOML.
+    """Return a sensor as the tables of a sensor file. The tables can be written as JSON or TOML.
 
     If `sensor_from_dict` reads these tables, the result is the same sensor, except for rounding errors.
 
@@ -256,6 +261,8 @@ def film_to_dict(film: Film) -> dict[str, Any]:
     mean_tension = film.pretension
     tension_components = (mean_tension + half_difference, mean_tension - half_difference, shear_tension)
     tension_MPa = [tidy(component) for component in tension_components]
+
+    # The moduli along the axes are E1 = E r and E2 = E / r, with r^2 = E1 / E2.
     root_of_ratio = np.sqrt(film.young_ratio)
     young_GPa = [tidy(film.young * 1e-3 * root_of_ratio), tidy(film.young * 1e-3 / root_of_ratio)]
 
@@ -298,6 +305,8 @@ def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
         text.encode()
     except UnicodeEncodeError as error:
         raise SensorError(f"sensor {sensor.name!r}: a name cannot be encoded in UTF-8 ({error})") from error
+
+    # Read the text again, which raises an error if the file would not be valid.
     where = f"sensor {sensor.name!r}"
     sensor_from_dict(parse_toml(text, where, SensorError, dict[str, Any]), where)
     return text

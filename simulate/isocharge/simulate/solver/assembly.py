@@ -13,7 +13,7 @@ for odd fields.
 from functools import lru_cache
 
 import numpy as np
-from scipy.sparse import csc_matrix, eye_array, kron
+from scipy.sparse import csc_array, csc_matrix, csr_array, eye_array, kron
 from scipy.sparse.linalg import SuperLU, splu
 
 from isocharge.common.arrays import Array, Integers
@@ -46,7 +46,8 @@ class Assembly:
         self.odd = odd
         self.free = _free(mesh, components, odd)
 
-        # Local indices of the unknowns on the sides of an element and in its interior, component by component
+        # Local indices of the unknowns on the sides of an element and in its interior, component by component. The
+        # nodes of an element form a square grid.
         line = np.arange(mesh.resolution.order + 1)
         is_end = (line == line[0]) | (line == line[-1])
         is_on_side = (is_end[:, None] | is_end[None, :]).ravel()
@@ -54,27 +55,36 @@ class Assembly:
         n_local = is_on_side.size
         self._outer = (component * n_local + np.flatnonzero(is_on_side)).ravel()
         self._inner = (component * n_local + np.flatnonzero(~is_on_side)).ravel()
+
+        # Global indices of the unknowns of each element, which are numbered node by node
         unknown = (components * mesh.nodes[:, None] + component).reshape(len(mesh.nodes), -1)
         self.inner_global = unknown[:, self._inner]
         self.outer_global = unknown[:, self._outer]
 
-        # The skeleton consists of the free unknowns on sides.
+        # The skeleton consists of the free unknowns on sides. Fixed unknowns have the number -1.
         is_in_skeleton = np.zeros(self.free.size, dtype=bool)
         is_in_skeleton[self.outer_global.ravel()] = True
         self.skeleton = np.flatnonzero(is_in_skeleton & self.free.ravel())
         skeleton_number = np.full(self.free.size, -1, dtype=np.intp)
         skeleton_number[self.skeleton] = np.arange(self.skeleton.size)
         self._set_pattern(skeleton_number[self.outer_global])
-        self.constraint = None
-        if mesh.constraint is not None:
-            unknown_constraint = kron(mesh.constraint, eye_array(components)).tocsr()
-            skeleton_constraint = unknown_constraint[self.skeleton][:, self.skeleton]
-            is_regular = skeleton_constraint.diagonal() > 0.0  # the columns of hanging nodes are zero
-            self.constraint = skeleton_constraint[:, is_regular].tocsc()
+        self.constraint = None if mesh.constraint is None else self._skeleton_constraint(mesh.constraint)
         self._reorder()
 
+    def _skeleton_constraint(self, node_constraint: csr_array) -> csc_array:
+        """Return the matrix that computes all skeleton unknowns from those of nodes that are not hanging nodes.
+
+        Args:
+            node_constraint: Matrix that computes the values at all nodes from the values at nodes that are not hanging
+                nodes, shape (n_node, n_node). The columns of hanging nodes are zero.
+        """
+        unknown_constraint = kron(node_constraint, eye_array(self.components)).tocsr()
+        skeleton_constraint = unknown_constraint[self.skeleton][:, self.skeleton]
+        is_regular = skeleton_constraint.diagonal() > 0.0
+        return skeleton_constraint[:, is_regular].tocsc()
+
     def _set_pattern(self, skeleton_numbers: Integers) -> None:
-        """Compute the sparsity pattern of the skeleton matrix, and the position of each element matrix in it.
+        """Compute the sparsity pattern of the skeleton matrix, and the position of each element entry in it.
 
         Entries of fixed unknowns get a position after the last entry.
 
@@ -82,13 +92,15 @@ class Assembly:
             skeleton_numbers: Number of each outer unknown in the skeleton, -1 if it is fixed, shape (n_element,
                 n_outer).
         """
-        shape = (*skeleton_numbers.shape, skeleton_numbers.shape[1])
+        # Row and column of each entry of the element matrices in the skeleton matrix
+        n_element, n_outer = skeleton_numbers.shape
+        shape = (n_element, n_outer, n_outer)
         size = self.skeleton.size
         row = np.broadcast_to(skeleton_numbers[:, :, None], shape)
         column = np.broadcast_to(skeleton_numbers[:, None, :], shape)
         is_free = (row >= 0) & (column >= 0)
 
-        # One code for each entry. The order of the codes is that of the compressed sparse column format.
+        # One code for each row and column. The order of the codes is that of the compressed sparse column format.
         entry_codes = column[is_free] * size + row[is_free]
         codes, position = np.unique(entry_codes, return_inverse=True)
         positions = np.full(shape, codes.size, dtype=np.intp)
@@ -99,7 +111,11 @@ class Assembly:
         self._indptr = np.concatenate([[0], np.cumsum(entries_per_column)]).astype(np.int32)
 
     def _reorder(self) -> None:
-        """Renumber the skeleton unknowns so that the factorisation has little fill-in (minimum degree)."""
+        """Renumber the skeleton unknowns so that the factorisation has little fill-in (minimum degree).
+
+        If there are hanging nodes, only the columns of the constraint are renumbered, because the factorised matrix
+        contains only the unknowns of the other nodes.
+        """
         # The order is that of a matrix with this pattern and a dominant diagonal, which needs no pivoting.
         pattern = self._skeleton(np.ones(self._indices.size))
         dominant = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
@@ -112,7 +128,7 @@ class Assembly:
         pattern.data = np.arange(pattern.nnz)
         permuted = pattern[:, order][order]
         permuted.sort_indices()
-        new_position = np.append(np.argsort(permuted.data), permuted.nnz)
+        new_position = np.append(np.argsort(permuted.data), permuted.nnz)  # the last position is for fixed unknowns
         self._entry_positions = new_position[self._entry_positions]
         self._indices = permuted.indices
         self._indptr = permuted.indptr
@@ -129,10 +145,12 @@ class Assembly:
         """
         inner = self._inner
         outer = self._outer
-        n_unknown = matrix.shape[1] * self.components
+        n_local = matrix.shape[1]
+        n_unknown = n_local * self.components
         element_matrix = matrix.transpose(0, 2, 1, 4, 3).reshape(-1, n_unknown, n_unknown)  # component by component
 
-        # Static condensation: eliminate the interior unknowns of each element.
+        # Static condensation: eliminate the interior unknowns of each element. With the blocks A (interior), B
+        # (coupling) and C (outer), the Schur complement is C - B' A^-1 B.
         coupling = element_matrix[:, inner[:, None], outer]
         inverse = np.linalg.inv(element_matrix[:, inner[:, None], inner]).astype(float, copy=False)
         reduced = inverse @ coupling
@@ -188,7 +206,7 @@ class Factor:
         """
         assembly = self._assembly
         padded_right = np.zeros(assembly.free.shape)
-        padded_right[:, :3] = right
+        padded_right[:, :3] = right  # the auxiliary unknown of bending has no load
         flat_right = padded_right.ravel()
 
         # Eliminate the interior unknowns from the right-hand side.
@@ -229,7 +247,7 @@ def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:
         odd: Whether the fields are odd about the line of symmetry.
 
     Returns:
-        Shape (n_node, components).
+        Whether each unknown is free, shape (n_node, components).
     """
     component = np.arange(components)  # 0: U1, 1: U2, 2: W, 3: auxiliary unknown of bending
     is_displacement = component < 3

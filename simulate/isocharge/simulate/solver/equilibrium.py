@@ -100,10 +100,10 @@ def deflection(equilibrium: Equilibrium, points: Array) -> Array:
     mesh = equilibrium.mesh
     element, xi, eta, _ = _locate(equilibrium, points)
     basis_values = tensor_values(mesh.resolution.order, xi, eta)  # shape (n, n_local)
-    nodal_deflection = equilibrium.field[mesh.template.nodes[element], 2]
-    scaled_deflection = (basis_values * nodal_deflection).sum(axis=1)
-    unit = equilibrium.film.radius * np.sqrt(equilibrium.groups.amplitude2)
-    return np.asarray(unit * scaled_deflection)
+    nodal_field = equilibrium.field[mesh.template.nodes[element]]  # (U1, U2, W), shape (n, n_local, 3)
+    scaled_deflection = (basis_values * nodal_field[..., 2]).sum(axis=1)
+    deflection_unit = equilibrium.film.radius * np.sqrt(equilibrium.groups.amplitude2)
+    return np.asarray(deflection_unit * scaled_deflection)
 
 
 def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "middle") -> Array:
@@ -125,13 +125,16 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     groups = equilibrium.groups
     element, xi, eta, is_reflected = _locate(equilibrium, points)
 
-    # Strain of the mid-surface, then the strain of bending, and the jump of the strain at the edges of a coat
-    gradient = mesh.gradient(element, xi, eta)
+    # Strain of the mid-surface
+    gradient = mesh.gradient(element, xi, eta)  # derivatives of the basis functions, shape (n, 2, n_local)
     nodal_displacement = equilibrium.field[mesh.template.nodes[element]]
     total_strain = strain(gradient @ nodal_displacement, groups.amplitude2)
+
+    # Strain of bending from the second derivatives of W, and jump of the strain at the edges of a coat
     if surface != "middle":
         nodal_slope_of_deflection = node_slope(equilibrium)[element, :, :, 2]
-        total_strain += _bending_strain(equilibrium, surface, gradient @ nodal_slope_of_deflection)
+        second_derivatives = gradient @ nodal_slope_of_deflection
+        total_strain += _bending_strain(equilibrium, surface, second_derivatives)
     if mesh.coat is not None:
         total_strain = mesh.coat.film_strain(_rotated(equilibrium, points), total_strain)
 
@@ -170,12 +173,12 @@ def _induced_stress(equilibrium: Equilibrium, surface: Surface) -> Array:
     Returns:
         (S11, S22, S12) at the nodes in units of E_young A^2, shape (n_element, n_local, 3).
     """
-    slope = node_slope(equilibrium)
+    slope = node_slope(equilibrium)  # of (U1, U2, W)
     total_strain = strain(slope, equilibrium.groups.amplitude2)
     if surface != "middle":
         slope_of_deflection = slope[..., 2]
-        hessian = equilibrium.mesh.node_derivatives(slope_of_deflection)
-        total_strain += _bending_strain(equilibrium, surface, hessian)
+        second_derivatives = equilibrium.mesh.node_derivatives(slope_of_deflection)
+        total_strain += _bending_strain(equilibrium, surface, second_derivatives)
     return scaled_stress(total_strain, equilibrium.groups)
 
 
@@ -191,15 +194,18 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     Returns:
         Smallest and largest stress, MPa, tension positive.
     """
+    # Scaled stresses, without the mean pretension, which is added last
     groups = equilibrium.groups
-    deviator = np.zeros(3) if groups.anisotropy is None else groups.anisotropy.tension
-    smallest, largest = principal_stresses(_induced_stress(equilibrium, "middle") + deviator)
+    uneven_pretension = np.zeros(3) if groups.anisotropy is None else groups.anisotropy.tension
+    smallest, largest = principal_stresses(_induced_stress(equilibrium, "middle") + uneven_pretension)
     if equilibrium.theory.bending:
         for surface in ("top", "bottom"):
-            _, surface_stress = principal_stresses(_induced_stress(equilibrium, surface) + deviator)
-            largest = max(largest, surface_stress)
-    scale = equilibrium.film.young * groups.amplitude2
-    return scale * smallest + equilibrium.film.pretension, scale * largest + equilibrium.film.pretension
+            _, largest_at_surface = principal_stresses(_induced_stress(equilibrium, surface) + uneven_pretension)
+            largest = max(largest, largest_at_surface)
+
+    stress_unit = equilibrium.film.young * groups.amplitude2
+    mean_pretension = equilibrium.film.pretension
+    return stress_unit * smallest + mean_pretension, stress_unit * largest + mean_pretension
 
 
 def node_slope(equilibrium: Equilibrium) -> Array:
@@ -209,7 +215,7 @@ def node_slope(equilibrium: Equilibrium) -> Array:
         equilibrium: The solved press.
 
     Returns:
-        Shape (n_element, n_local, 2, 3): the derivative, then the component.
+        Derivatives, shape (n_element, n_local, 2, 3): the derivative, then the component.
     """
     mesh = equilibrium.mesh
     return mesh.node_derivatives(equilibrium.field[mesh.template.nodes])
@@ -236,14 +242,15 @@ def _bending_strain(equilibrium: Equilibrium, surface: Surface, hessian: Array) 
 
 
 def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, Array, Booleans]:
-    """Find the elements that contain points.
+    """Find the elements that contain points, and the local coordinates of the points in their elements.
 
     Args:
         equilibrium: The solved press.
         points: Points (x, y), shape (n, 2), mm.
 
     Returns:
-        Index of the element, xi, eta, and whether the point was reflected into the meshed half, each of shape (n,).
+        Index of the element, local coordinates xi and eta, and whether the point was reflected into the meshed half,
+        each of shape (n,).
 
     Raises:
         SceneError: If a point lies outside the film.
@@ -251,13 +258,13 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
     points = np.asarray(points, dtype=float)
     film = equilibrium.film
     distance = np.hypot(points[:, 0], points[:, 1])
-    rim: Array | float = film.radius
+    rim_distance: Array | float = film.radius  # from the centre, in the direction of each point
     if film.oval:
         angle = np.arctan2(points[:, 1], points[:, 0])
-        rim = film.radius * (1.0 + film.oval * np.cos(2.0 * (angle - film.oval_axis)))
-    outside = ~(distance <= rim * (1.0 + 1e-9))
-    if outside.any():
-        x, y = points[np.argmax(outside)]
+        rim_distance = film.radius * (1.0 + film.oval * np.cos(2.0 * (angle - film.oval_axis)))
+    is_outside = ~(distance <= rim_distance * (1.0 + 1e-9))  # also points that are not a number
+    if is_outside.any():
+        x, y = points[np.argmax(is_outside)]
         raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {film.radius:.4g} mm")
     return equilibrium.mesh.locate(_rotated(equilibrium, points))
 

@@ -72,14 +72,19 @@ def shape_error(mesh: PlacedMesh) -> float:
         The error, which is infinite if an element is folded.
     """
     geometry = mesh.geometry
-    if geometry.weights.min() <= 0.0 or geometry.mass.min() <= 0.0:
+    is_folded = geometry.weights.min() <= 0.0 or geometry.mass.min() <= 0.0
+    if is_folded:
         return np.inf
-    area = np.pi * (1.0 + 0.5 * abs(mesh.oval) ** 2)
-    return float(np.sqrt(abs(mesh.template.copies * geometry.weights.sum() / area - 1.0)))
+    film_area = np.pi * (1.0 + 0.5 * abs(mesh.oval) ** 2)  # in squared film radii
+    mesh_area = mesh.template.copies * geometry.weights.sum()
+    return float(np.sqrt(abs(mesh_area / film_area - 1.0)))
 
 
 def decay(mesh: PlacedMesh, slope: Array) -> float:
     """Compute the share of the highest polynomial modes of the elements in the slopes of the deflection.
+
+    The slopes of each element are expanded in products of Legendre polynomials. If the share of the highest degrees is
+    small, the mesh is fine enough.
 
     Args:
         mesh: Mesh of the press.
@@ -94,13 +99,15 @@ def decay(mesh: PlacedMesh, slope: Array) -> float:
     nodal_slope = slope.transpose(0, 2, 1).reshape(len(slope), 2, n_node, n_node)
     coefficients = nodes_to_modes @ nodal_slope @ nodes_to_modes.T
 
-    # Power of each mode, which is the square of its contribution to the slope; the norm of the Legendre polynomial of
-    # degree n is 1 / (2 n + 1).
-    norm = 1.0 / (2.0 * np.arange(n_node) + 1.0)
-    power = (coefficients**2 * np.outer(norm, norm)).sum(axis=1)
+    # Power of each mode in both slopes: the mean square of its contribution. The mean square of the Legendre polynomial
+    # of degree n is 1 / (2 n + 1).
+    mean_square = 1.0 / (2.0 * np.arange(n_node) + 1.0)
+    power = (coefficients**2 * np.outer(mean_square, mean_square)).sum(axis=1)  # shape (n_element, n_node, n_node)
     total_power = power.sum(axis=(1, 2))
     power_of_lower_modes = power[:, :-1, :-1].sum(axis=(1, 2))  # without the highest degree in xi or in eta
     highest_power = total_power - power_of_lower_modes
+
+    # The share of an element is sqrt(highest power / total power), and its weight is area * total power.
     area = mesh.geometry.weights.sum(axis=1)
     weighted_share = area * np.sqrt(np.maximum(highest_power, 0.0) * total_power)
     return float(np.sum(weighted_share) / max(np.sum(area * total_power), 1e-300))
@@ -143,9 +150,9 @@ def estimated_error(equilibrium: Equilibrium) -> float:
 def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     """Compute the largest relative difference between two equilibria of the same press.
 
-    The deflections, and the charges of square patches on a biaxial and on a uniaxial film, are compared. The patches
-    lie on rings about the centre of the film and around the footprint. The difference of the charges of a patch is
-    relative to the largest charge on its ring.
+    The function compares the deflections at the probe, and the charges of square patches on a biaxial and on a uniaxial
+    film. The patches lie on rings about the centre of the film and around the footprint. The difference of the charges
+    of a patch is relative to the largest charge on its ring.
 
     Args:
         one: First equilibrium.
@@ -154,16 +161,20 @@ def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     Returns:
         Relative difference, dimensionless.
     """
+    # Centres x + iy of the patches, shape (n_ring, PATCHES_PER_RING), mm
     film_radius = one.film.radius
     unit_circle = np.exp(2j * np.pi * np.arange(PATCHES_PER_RING) / PATCHES_PER_RING)
     rings_about_centre = film_radius * np.array(PATCH_RINGS)[:, None] * unit_circle
     ring_about_footprint = complex(*one.at) + one.probe.reach * unit_circle
     patch_centres = np.concatenate([rings_about_centre, ring_about_footprint[None]])
+
+    # Largest difference of the charges, relative to the largest charge on the same ring
     one_charge = _patch_charges(one, patch_centres)
     other_charge = _patch_charges(other, patch_centres)
     largest_on_ring = np.maximum(np.abs(other_charge).max(axis=1, keepdims=True), 1e-300)
     charge_difference = float((np.abs(one_charge - other_charge) / largest_on_ring).max())
 
+    # Difference of the deflections at the centroid of the footprint
     (one_depth,) = deflection(one, np.array([one.at]))
     (other_depth,) = deflection(other, np.array([one.at]))
     depth_difference = abs(float(one_depth / other_depth) - 1.0)
@@ -181,7 +192,7 @@ def _patch_charges(equilibrium: Equilibrium, centres: Array) -> Array:
         Charges in arbitrary units, shape (n_ring, n_patch, 2). Points outside the film do not contribute.
     """
     film_radius = equilibrium.film.radius
-    xi, eta, weights = gauss_reference_square(PATCH_POINTS)
+    xi, eta, weights = gauss_reference_square(PATCH_POINTS)  # coordinates from -1 to 1
     half_side = 0.5 * PATCH_SIDE * film_radius
     complex_points = (centres[:, :, None] + half_side * (xi + 1j * eta)).ravel()
     points = np.stack([complex_points.real, complex_points.imag], axis=1)
@@ -189,9 +200,12 @@ def _patch_charges(equilibrium: Equilibrium, centres: Array) -> Array:
     stress = np.zeros((len(points), 3))
     stress[is_on_film] = touch_stress(equilibrium, points[is_on_film])
 
-    # Mean over the integration points p of each patch; the weights of the reference square add up to 4.
+    # Mean over the integration points p, for each ring r, patch a and stress component c. The weights of the reference
+    # square add up to 4.
     patch_stress = stress.reshape(*centres.shape, -1, 3)
     mean_stress = np.einsum("rapc,p->rac", patch_stress, 0.25 * weights)
+
+    # On a uniaxial film, d31 is about ten times d32.
     s11 = mean_stress[..., 0]
     s22 = mean_stress[..., 1]
     biaxial_charge = s11 + s22

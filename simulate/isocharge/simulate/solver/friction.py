@@ -31,6 +31,9 @@ MAX_FRICTION = 1.0
 def holding_force(solved: Equilibrium) -> tuple[float, float]:
     """Compute the side force that prevents the mean in-plane displacement of the footprint, to first order.
 
+    The compliance of the film is the mean displacement of the footprint under a unit side load. The holding force is
+    the load whose displacement is opposite to that caused by the press.
+
     Args:
         solved: Press without a side force, solved with a theory that includes stretching.
 
@@ -40,12 +43,14 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
     mesh = solved.mesh
     geometry = mesh.geometry
     groups = solved.groups
-    components = 3 if groups.bending == 0.0 else 4
+    components = 3 if groups.bending == 0.0 else 4  # bending has an auxiliary unknown
     n_direction = 1 if mesh.template.half else 2  # a half template has no displacement across its symmetry line
+
+    # Mean in-plane displacement of the footprint since the contact; `load` contains the weights of the footprint
     field_before_contact = np.zeros_like(solved.field) if solved.rest is None else solved.rest.field
     slip = geometry.load @ (solved.field - field_before_contact)[:, :n_direction]
 
-    # Mean displacement of the footprint by a unit side load in each direction
+    # Mean displacement of the footprint by a unit side load in each direction, one column for each load
     compliance = np.empty((n_direction, n_direction))
     with single_threaded_blas():
         factor = factor_tangent(ElasticFilm(geometry, groups), assembly(mesh.template, components), solved.field)
@@ -59,12 +64,15 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
     scaled_force[:n_direction] = -np.linalg.solve(compliance, slip)
     x, y = solved.at
     rotation = np.exp(1j * np.arctan2(y, x))
-    force = complex(*scaled_force) * side_force_unit(solved.film, groups.amplitude2) * rotation
+    force = complex(*scaled_force) * side_force_unit(solved.film, groups.amplitude2) * rotation  # Fx + i Fy
     return float(force.real), float(force.imag)
 
 
 def friction_force(solved: Equilibrium, coefficient: float) -> tuple[float, float]:
-    """Compute the side force of a probe on a vertical stage; see the docstring of this module.
+    """Compute the side force of a probe on a vertical stage.
+
+    The side force is the holding force, limited to the coefficient of friction times the force of the press. The
+    docstring of this module describes the model.
 
     Args:
         solved: Press without a side force, solved with a theory that includes stretching.
@@ -97,7 +105,7 @@ def limited(holding: Array, largest: Array) -> Array:
         largest: Largest friction, shape (n,), N.
 
     Returns:
-        Shape (n, 2), N.
+        Forces, shape (n, 2), N.
     """
     size = np.maximum(np.hypot(holding[:, 0], holding[:, 1]), 1e-300)
     return np.asarray(holding * np.minimum(1.0, largest / size)[:, None])

@@ -115,15 +115,16 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
             f"probe: expected a reach of at least {MIN_PROBE_REACH:g} of the film's radius ({film.radius:.4g} mm), got "
             f"{probe.reach:.4g} mm"
         )
-    if not probe.farthest_distance(at) < film.radius * (1.0 - 1e-6):
+    farthest_distance = probe.farthest_distance(at)  # of a point of the footprint from the centre of the film
+    if not farthest_distance < film.radius * (1.0 - 1e-6):
         raise SceneError(
             f"probe off the film: centre ({at[0]:.4g}, {at[1]:.4g}) mm, farthest point of {probe.notation} "
-            f"{probe.farthest_distance(at):.4g} mm from the film's centre, film radius {film.radius:.4g} mm"
+            f"{farthest_distance:.4g} mm from the film's centre, film radius {film.radius:.4g} mm"
         )
-    rim_distance = film.radius - probe.farthest_distance(at)
-    needs_second_layer = probe.topology.is_curved and not probe.topology.fills_circle
+    rim_distance = film.radius - farthest_distance
     min_rim_distance = MIN_RIM_DISTANCE * probe.reach
-    if needs_second_layer and rim_distance < min_rim_distance:
+    is_curved_but_not_round = probe.topology.is_curved and not probe.topology.fills_circle
+    if is_curved_but_not_round and rim_distance < min_rim_distance:
         raise SceneError(
             f"{probe.notation} at ({at[0]:.4g}, {at[1]:.4g}) mm comes within {rim_distance:.3g} mm of the rim: "
             f"expected at least {min_rim_distance:.3g} mm, because the mesh around the footprint would be too thin; "
@@ -198,7 +199,7 @@ class LoadCase:
         start: PlacedMesh | None,
         side_force: tuple[float, float] = (0.0, 0.0),
     ) -> Self:
-        """Check a press, and replace the settings that are "auto".
+        """Check a press, and replace the theory and the width of the thin rings if they are "auto".
 
         Args:
             film: The film.
@@ -260,6 +261,8 @@ def place_coated(
     mesh = place(film, probe, at, resolution, layer, whole=whole)
     if film.coat is None:
         return mesh
+
+    # Outlines of the coat as complex numbers, in film radii, rotated with the press onto the x axis
     x, y = at
     angle = float(np.arctan2(y, x))
     rotation_and_scale = np.exp(-1j * angle) / film.radius
@@ -278,8 +281,8 @@ def place_coated(
 def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None) -> float:
     """Choose the width of the thin rings, in film radii.
 
-    The width is six bending lengths. If the starting equilibrium has the same mesh and a similar width, this width is
-    reused. The field of the equilibrium can then be the first iterate.
+    The width is `LAYER_WIDTH` bending lengths. If the starting equilibrium can have the same mesh and has a similar
+    width, its width is reused. The field of the equilibrium can then be the first iterate.
 
     Args:
         film: The film.
@@ -292,10 +295,14 @@ def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSetting
         Width of the thin rings, in film radii.
     """
     layer = layer_for(film, force)
-    if start is None or not MIN_LAYER_REUSE < start.layer / layer < MAX_LAYER_REUSE:
+    if start is None:
         return layer
-    is_same_mesh = settings.resolution in ("auto", start.resolution) and probe.topology == start.template.topology
-    return start.layer if is_same_mesh else layer
+    is_similar_width = MIN_LAYER_REUSE < start.layer / layer < MAX_LAYER_REUSE
+    may_have_same_resolution = settings.resolution in ("auto", start.resolution)
+    has_same_topology = probe.topology == start.template.topology
+    if is_similar_width and may_have_same_resolution and has_same_topology:
+        return start.layer
+    return layer
 
 
 def choose_mesh(case: LoadCase) -> PlacedMesh:
@@ -346,12 +353,17 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     # Any mesh under the press has the same conformal map, so a coarse mesh is sufficient here.
     coarse_resolution = Resolution(order=2, around=8, rings=1)
     placement = place(film, probe, case.at, coarse_resolution, layer=0.1).placement
-    stretch = _stretch(placement)
+
+    # If the circle around a footprint that is not circular does not fit on the film, it needs more elements around it.
     needed_radius = probe.farthest_distance(case.at) + CLEARANCE * probe.reach
     is_crowded = not probe.topology.fills_circle and needed_radius > film.radius
+
+    # A better accuracy requires a higher order. A small probe (rho) and the stretch of the conformal map require more
+    # rings.
     extra_order = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.accuracy)))
     first_order = 5 if case.theory.bending and film.coat is None else 4
-    rings = math.ceil(-1.3 * math.log(float(placement.rho)) + min(2.0 * math.log(stretch), 4.0))
+    rings_for_stretch = min(2.0 * math.log(_stretch(placement)), 4.0)
+    rings = math.ceil(-1.3 * math.log(float(placement.rho)) + rings_for_stretch)
     base = Resolution(
         order=first_order + extra_order,
         around=16 if is_crowded else 8,
@@ -366,13 +378,14 @@ def _thin_rings(placement: Placement, layer: float) -> int:
     """Return the number of thin rings at the rim.
 
     Each ring is a third as wide as the previous ring. In the template plane, the boundary layer of bending has its
-    largest width next to the probe. It has its smallest width on the far side of the film, where the conformal map
-    compresses it. The widths of the rings cover the range between these two widths.
+    largest width next to the probe. The boundary layer has its smallest width on the far side of the film, where the
+    conformal map compresses it. The widths of the rings cover the range between these two widths.
 
     Args:
         placement: Placement of the mesh under the press.
         layer: Width of the thin rings, in film radii.
     """
+    # Widths of the boundary layer in the template plane, relative to the depth of all rings in ln r
     stretch = _stretch(placement)
     total_depth = -float(np.log(placement.rho))
     largest_width = min(layer * stretch / total_depth, 1.0 / 8.0)

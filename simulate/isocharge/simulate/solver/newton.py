@@ -91,9 +91,9 @@ class NewtonResult:
 def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Array:
     """Compute the first iterate of Newton's method: Schwerin's deflection, and no in-plane displacement.
 
-    Schwerin's deflection is W = (3 / pi)^(1/3) (1 - r^(2/3)). It is exact for a membrane without pretension under a
-    point load if Poisson's ratio is 1/3 (Schwerin 1929). The radius r is measured in the template plane. For a film
-    with pretension or bending, the deflection is reduced.
+    Schwerin's deflection is W = (3 / pi)^(1/3) (1 - r^(2/3)). This deflection is exact for a membrane without
+    pretension under a point load if Poisson's ratio is 1/3 (Schwerin 1929). The radius r is measured in the template
+    plane. For a film with pretension or bending, the deflection is reduced.
 
     Args:
         z: Nodes in the template plane, shape (n_node,).
@@ -103,10 +103,12 @@ def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Ar
     Returns:
         Scaled displacements (U1, U2, W), shape (n_node, 3).
     """
+    # The term rho^2 rounds the tip of the deflection under the probe.
     shape = np.cbrt(1.0 + rho**2) - np.cbrt(np.abs(z) ** 2 + rho**2)
     field = np.zeros((z.size, 3))
     field[:, 2] = groups.height * shape
-    field[np.abs(z) > 1.0 - 1e-9] = 0.0
+    is_on_rim = np.abs(z) > 1.0 - 1e-9
+    field[is_on_rim] = 0.0
     return field
 
 
@@ -162,9 +164,9 @@ def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
 def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
     """Compute the residual without the forces of the induced stress.
 
-    The forces of the induced stress are cubic in the field, and the other forces are linear. At the amplitude a, they
-    therefore change the residual by r(a) = k a + c a^3. Two amplitudes determine the linear part k = (8 r(a) - r(2 a))
-    / (6 a).
+    The forces of the induced stress are cubic in the field, and the other forces are linear. A field with the amplitude
+    a therefore changes the residual by r(a) = k a + c a^3. Two amplitudes determine the linear part k = (8 r(a) - r(2
+    a)) / (6 a).
 
     Args:
         elastic: The discrete film.
@@ -173,7 +175,7 @@ def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
     Returns:
         Residual, shape (n_node, 3).
     """
-    amplitude = 0.01
+    amplitude = 0.01  # any amplitude gives the same linear part, except for rounding errors
     flat_residual = elastic.residual(np.zeros_like(field))
     single_change = elastic.residual(amplitude * field) - flat_residual
     double_change = elastic.residual(2.0 * amplitude * field) - flat_residual
@@ -184,6 +186,9 @@ def solve_newton(
     elastic: ElasticFilm, assembly: Assembly, start: Array, tolerance: float, local_below: float = GUARD_BELOW
 ) -> NewtonResult:
     """Solve for the equilibrium with Newton's method.
+
+    Each iteration factorises the tangent, takes one Newton step, and reuses the factorised tangent for further steps as
+    long as they reduce the residual.
 
     Args:
         elastic: The discrete film.
@@ -215,14 +220,14 @@ def solve_newton(
         if step_size <= ROUND_OFF:
             return iterate.result(True, iteration, f"converged to round-off in {iteration} steps")
 
-        # Take the full step if it is close to the equilibrium, and search the step length otherwise.
+        # Close to the equilibrium, take the full step if it halves the residual. Otherwise search the step length.
         next_iterate = _local_step(iterate, step) if relative_residual <= local_below else None
         if next_iterate is None:
             next_iterate = _line_search(iterate, _descent_step(iterate, assembly, step))
         if next_iterate is None:
             return iterate.result(False, iteration, "no step lowers the energy any more")
         iterate = _chord_steps(next_iterate, factor, relative_residual, tolerance)
-    raise AssertionError("the loop returns")
+    raise AssertionError("the loop returns")  # at the latest in its last iteration
 
 
 @dataclass(frozen=True)
@@ -345,10 +350,11 @@ def _chord_steps(iterate: _Iterate, factor: TangentFactor, residual_before: floa
 
 
 def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
-    """Return a step that is a descent direction of the energy.
+    """Return the Newton step if it is a descent direction of the energy, and a modified step otherwise.
 
-    If the given step is not a descent direction, a tension is added to the tangent. The tension is doubled until the
-    new step is a descent direction.
+    A step is a descent direction if its product with the residual, which is the gradient of the energy, is negative.
+    For a modified step, a tension is added to the tangent. The tension is doubled until the step is a descent
+    direction, at most `MAX_DESCENT_TRIALS` times.
 
     Args:
         iterate: Present iterate.
@@ -356,15 +362,18 @@ def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
         step: Newton step, shape (n_node, 3).
 
     Returns:
-        The step, shape (n_node, 3).
+        The step, shape (n_node, 3). After the largest number of trials, it may not be a descent direction.
     """
     elastic = iterate.elastic
-    tension = FIRST_DESCENT_TENSION * GUARD_TENSION * float(np.cbrt(elastic.groups.total_load)) ** 2
+    induced_tension = float(np.cbrt(elastic.groups.total_load)) ** 2
+    tension = FIRST_DESCENT_TENSION * GUARD_TENSION * induced_tension
     for _ in range(MAX_DESCENT_TRIALS):
-        is_descent_step = np.isfinite(step).all() and float(np.sum(step * iterate.residual)) < 0.0
-        if is_descent_step:
+        energy_slope = float(np.sum(step * iterate.residual))
+        is_descent_direction = np.isfinite(step).all() and energy_slope < 0.0
+        if is_descent_direction:
             break
-        step = factor_tangent(elastic, assembly, iterate.field, tension).solve(-iterate.residual)
+        stiffer_tangent = factor_tangent(elastic, assembly, iterate.field, tension)
+        step = stiffer_tangent.solve(-iterate.residual)
         tension *= 2.0
     return step
 
@@ -372,7 +381,8 @@ def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
 def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
     """Halve a step until it lowers the energy sufficiently (condition of Armijo).
 
-    If the change of the energy is not larger than its rounding errors, the step must lower the residual instead.
+    The energy must decrease by at least `ARMIJO_SHARE` times the decrease that the slope along the step predicts. If
+    the change of the energy is not larger than its rounding errors, the step must lower the residual instead.
 
     Args:
         iterate: Present iterate.
@@ -383,16 +393,17 @@ def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
     """
     elastic = iterate.elastic
     energy = elastic.energy(iterate.field)
-    slope = float(np.sum(step * iterate.residual))
+    energy_slope = float(np.sum(step * iterate.residual))  # along the step
     residual_norm = np.linalg.norm(iterate.residual[iterate.free])
-    length = 1.0
+    step_length = 1.0
     for _ in range(MAX_HALVINGS):
-        field = iterate.field + length * step
+        field = iterate.field + step_length * step
         energy_change = elastic.energy(field) - energy
-        lowers_energy = energy_change <= ARMIJO_SHARE * length * slope
-        if lowers_energy or abs(energy_change) <= ENERGY_ROUND_OFF * abs(energy):
+        lowers_energy = energy_change <= ARMIJO_SHARE * step_length * energy_slope
+        is_round_off = abs(energy_change) <= ENERGY_ROUND_OFF * abs(energy)
+        if lowers_energy or is_round_off:
             trial = _Iterate.at(elastic, iterate.free, field)
             if lowers_energy or np.linalg.norm(trial.residual[iterate.free]) < residual_norm:
                 return trial
-        length *= 0.5
+        step_length *= 0.5
     return None

@@ -124,9 +124,9 @@ def needed_resolution(
 def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equilibrium:
     """Solve on meshes of increasing order until the charges of two meshes agree within half of the accuracy.
 
-    The order is increased at most `MAX_EXTRA_ORDERS` times. If no equilibrium is found on a further mesh, the two
-    previous meshes are used. The result is the equilibrium on the finer one of them, and its error is the difference
-    between both. If two meshes have different equilibria, the status of the result is "failed".
+    The order is increased at most `MAX_EXTRA_ORDERS` times. If no equilibrium is found on the first or the second mesh,
+    the result is failed. If no equilibrium is found on a further mesh, the result is the equilibrium on the previous
+    mesh. If the last two meshes have different equilibria, the status of the result is "failed".
 
     Args:
         case: The press and its accuracy.
@@ -136,17 +136,22 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
         Equilibrium on the finest mesh. Its `proven_error` is the difference from the previous mesh.
     """
     solved = _solve(case, choose_mesh(case), start)
+    if solved.status != "converged":
+        return solved
     for _ in range(MAX_EXTRA_ORDERS):
-        if solved.status != "converged":
-            return solved
         resolution = solved.mesh.resolution
-        finer = _solve(case, case.place(replace(resolution, order=resolution.order + 1)), solved)
-        if finer.status != "converged" and solved.proven_error is not None:
+        finer_mesh = case.place(replace(resolution, order=resolution.order + 1))
+        finer = _solve(case, finer_mesh, solved)
+        iterations = solved.iterations + finer.iterations
+        if finer.status != "converged":
+            if solved.proven_error is None:  # only one mesh has an equilibrium, so its error is unknown
+                return replace(finer, iterations=iterations)
             break
-        error = relative_difference(solved, finer) if finer.status == "converged" else None
-        solved = replace(finer, iterations=solved.iterations + finer.iterations, proven_error=error)
-        if error is not None and error <= 0.5 * case.accuracy:
+        error = relative_difference(solved, finer)
+        solved = replace(finer, iterations=iterations, proven_error=error)
+        if error <= 0.5 * case.accuracy:
             break
+
     if solved.proven_error is not None and solved.proven_error > DIFFERENT_EQUILIBRIUM:
         order = solved.mesh.resolution.order
         return replace(
@@ -174,7 +179,8 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
     """
     if np.isinf(shape_error(mesh)):
         raise too_near_the_rim(case, mesh.resolution)
-    solver = assembly(mesh.template, 4 if case.theory.bending else 3)
+    components = 4 if case.theory.bending else 3  # bending has an auxiliary unknown
+    solver = assembly(mesh.template, components)
     elastic = _elastic(case, mesh.geometry, case.force)
     if case.theory.stretching:
         result = _solve_nonlinear(case, elastic, solver, mesh, start)
@@ -202,7 +208,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 
 
 def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
-    """Solve the film under the static pressure alone. Return the equilibrium of a press with this solution as `rest`.
+    """Solve the film under the static pressure alone, and store the solution as `rest` of the equilibrium of a press.
 
     Args:
         equilibrium: Equilibrium of the press.
@@ -282,7 +288,9 @@ def _solve_by_load_steps(
 ) -> NewtonResult:
     """Solve with increasing forces, after the solve with the full force has failed.
 
-    Each solve starts from the field of the previous force. If a solve fails, the next force is reduced.
+    Each solve starts from the field of the largest force with an equilibrium. The force is doubled after a solve. If a
+    solve fails, the factor is reduced to its square root. If the solve with the smallest force fails, no further force
+    is tried.
 
     Args:
         case: The press.
@@ -300,6 +308,7 @@ def _solve_by_load_steps(
     field = first_field
     force = FIRST_LOAD_SHARE * case.force
     for _ in range(MAX_LOAD_STEPS):
+        # A start from an equilibrium is close to the solution, so full Newton steps are allowed from the beginning.
         local_below = np.inf if solved_force else GUARD_BELOW
         result = solve_newton(_elastic(case, geometry, force), solver, field, case.tolerance, local_below)
         iterations += result.iterations
@@ -319,6 +328,9 @@ def _solve_by_load_steps(
 
 def _start_field(start: Equilibrium | None, template: Template, default: Array) -> Array:
     """Return the first iterate of Newton's method, shape (n_node, 3).
+
+    This is the field of the starting equilibrium if its mesh has the same elements. If the elements have another order,
+    the field is interpolated.
 
     Args:
         start: Equilibrium of a similar press; None if there is none.

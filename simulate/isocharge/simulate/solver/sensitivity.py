@@ -8,9 +8,9 @@ displacement by
 which costs one additional back substitution. Let alpha be the angle between an axis of the imperfection and the
 direction of the press. For an imperfection with two axes, the change is the sum of two fields with the factors cos(2
 alpha) and sin(2 alpha). With respect to a reflection in this direction, the first field is even and the second field is
-odd. Both fields are solved on the meshed half of the film. They have different fixed displacement components on the
-line of symmetry. The derivative dR/dm and the change of the stress are central differences of the residual and of the
-stress of a press.
+odd. Both fields are solved on the meshed half of the film. The two fields have different fixed displacement components
+on the line of symmetry. The derivative dR/dm and the change of the stress are central differences of the residual and
+of the stress of a press.
 """
 
 from collections.abc import Callable, Sequence
@@ -77,11 +77,13 @@ def _stiffness(angle: float) -> Change:
 
     def with_stiffness_ratio(solved: Equilibrium, log_ratio: float) -> Equilibrium:
         """Return the equilibrium of a film with this value of ln(E1 / E2)."""
+        # Change of the elasticity matrix over E, in the axes of the film and then in the frame of the press
         plane_modulus = 1.0 / (1.0 - solved.groups.poisson**2)
         change_along_axis_1 = 0.5 * log_ratio * plane_modulus
-        moduli_in_film_axes = np.diag([change_along_axis_1, -change_along_axis_1, 0.0])
+        change_in_film_axes = np.diag([change_along_axis_1, -change_along_axis_1, 0.0])
         rotation = stress_rotation(angle)
-        anisotropy = Anisotropy(moduli=rotation @ moduli_in_film_axes @ rotation.T, tension=np.zeros(3))
+        moduli_change = rotation @ change_in_film_axes @ rotation.T
+        anisotropy = Anisotropy(moduli=moduli_change, tension=np.zeros(3))
         return replace(solved, groups=replace(solved.groups, anisotropy=anisotropy))
 
     return with_stiffness_ratio
@@ -187,8 +189,8 @@ def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array
         surface: Surface in the thickness; see `touch_stress`.
 
     Returns:
-        Shape (n_element, n_local, 2, 3): the field, then the stress (S11, S22, S12). This is the order of the table
-        of a `ForwardMap` with several fields.
+        Changes, shape (n_element, n_local, 2, 3): the field, then the stress (S11, S22, S12). This is the order of the
+        table of a `ForwardMap` with several fields.
     """
     return np.moveaxis(_stress_changes(solved, SIDE_FORCE_FIELDS, surface), 0, 2)
 
@@ -203,13 +205,17 @@ def tension_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
         surface: Surface in the thickness; see `touch_stress`.
 
     Returns:
-        Shape (n_element, n_local, 3, 3): the field, then the stress (S11, S22, S12), as in `side_force_stress`.
+        Changes, shape (n_element, n_local, 3, 3): the field, then the stress (S11, S22, S12), as in
+        `side_force_stress`.
     """
     return np.moveaxis(_stress_changes(solved, TENSION_FIELDS, surface), 0, 2)
 
 
 def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: Surface) -> Array:
     """Compute the change of the scaled stress at the nodes that each field causes.
+
+    Even and odd fields have different fixed displacements on the line of symmetry, so each kind has its own
+    factorisation of the tangent.
 
     Args:
         solved: The solved press.
@@ -220,10 +226,12 @@ def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface:
         Change per unit of the imperfection, shape (n_field, n_element, n_local, 3).
     """
     with single_threaded_blas():
-        components = 3 if solved.groups.bending == 0.0 else 4
+        components = 3 if solved.groups.bending == 0.0 else 4  # bending has an auxiliary unknown
         elastic = ElasticFilm(solved.mesh.geometry, solved.groups)
-        assemblies = [assembly(solved.mesh.template, components, odd) for odd in (False, True)]
-        even_factor, odd_factor = (factor_tangent(elastic, solver, solved.field) for solver in assemblies)
+        even_assembly = assembly(solved.mesh.template, components, False)
+        odd_assembly = assembly(solved.mesh.template, components, True)
+        even_factor = factor_tangent(elastic, even_assembly, solved.field)
+        odd_factor = factor_tangent(elastic, odd_assembly, solved.field)
         changes = []
         for field in fields:
             factor = odd_factor if field.odd else even_factor
@@ -247,10 +255,11 @@ def _stress_change(solved: Equilibrium, field: StressField, solve: Callable[[Arr
     above = field.change(solved, STEP)
     below = field.change(solved, -STEP)
 
-    # Change of the displacements that restores the equilibrium after one positive step
-    force_above = ElasticFilm(above.mesh.geometry, above.groups).residual(above.field)
-    force_below = ElasticFilm(below.mesh.geometry, below.groups).residual(below.field)
-    displacement_change = -0.5 * solve(force_above - force_below)
+    # Change of the displacements that restores the equilibrium after one positive step. The change of the residual by
+    # one step is half of the difference.
+    residual_above = ElasticFilm(above.mesh.geometry, above.groups).residual(above.field)
+    residual_below = ElasticFilm(below.mesh.geometry, below.groups).residual(below.field)
+    displacement_change = -0.5 * solve(residual_above - residual_below)
 
     # Central difference of the stress
     equilibrium_above = replace(above, field=above.field + displacement_change)
@@ -259,7 +268,7 @@ def _stress_change(solved: Equilibrium, field: StressField, solve: Callable[[Arr
     stress_below = nodal_stress(equilibrium_below, surface)
     change = (stress_above - stress_below) / (2.0 * STEP)
     if above.mesh.oval != 0.0:
-        # The nodes move with the rim. Subtract the change of the stress by this displacement of the nodes.
+        # The nodes move with the rim. Subtract the change of the stress by this displacement of the nodes (x + iy).
         node_shift = (above.mesh.points - below.mesh.points) / (2.0 * STEP)
         stress_gradient = solved.mesh.node_derivatives(nodal_stress(solved, surface))
         x_contribution = node_shift.real[..., None] * stress_gradient[..., 0, :]

@@ -63,6 +63,8 @@ def stress_caution(film: Film, probe: Probe, force: float, limit: float = DEFAUL
 def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tuple[float, float]) -> float:
     """Compute the largest force of a range whose stress does not exceed a limit. The relative error is below 0.1 %.
 
+    The equation ln(stress / limit) = 0 is solved for ln F by the secant method.
+
     Args:
         film: The film.
         probe: The probe.

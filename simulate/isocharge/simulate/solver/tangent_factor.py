@@ -51,7 +51,7 @@ class _AirFactor:
 
 
 def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, guard: float = 0.0) -> TangentFactor:
-    """Factorise the tangent at a field.
+    """Factorise the tangent at a field, including the stiffness of trapped air.
 
     Args:
         elastic: The discrete film.
@@ -60,14 +60,14 @@ def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, guard
         guard: Additional tension; see `ElasticFilm.tangent`.
 
     Returns:
-        Factorisation of the tangent, including the stiffness of the trapped air.
+        Factorisation of the tangent.
     """
     film_factor = assembly.factor(elastic.tangent(field, guard))
-    has_air = elastic.back is not None and elastic.groups.compression != 0.0
-    if elastic.back is None or not has_air or assembly.odd:
+    has_no_air = elastic.back is None or elastic.groups.compression == 0.0
+    if elastic.back is None or has_no_air or assembly.odd:  # odd fields do not compress the air
         return film_factor
 
-    # Terms of the formula of Sherman and Morrison in the docstring of this module
+    # Formula of Sherman and Morrison in the docstring of this module: v = weights, y = response, c = air_stiffness
     weights = elastic.back.weights
     uniform_pressure = np.zeros_like(field)
     uniform_pressure[:, 2] = weights

@@ -4,8 +4,8 @@ A footprint is the area on which a probe presses. Points of a footprint are comp
 the centroid of the footprint.
 
 The mesh of a polygonal footprint consists of blocks with straight sides. A footprint with a smooth boundary is a
-subclass of `CurvedProbe`. Its mesh consists of blocks with straight sides in a core polygon inside the footprint, and
-of blocks with one curved side between the core polygon and the boundary.
+subclass of `CurvedProbe`. The mesh of such a footprint has blocks with straight sides in a core polygon inside the
+footprint, and blocks with one curved side between the core polygon and the boundary.
 """
 
 import math
@@ -71,12 +71,14 @@ class ProbeNotation:
         Raises:
             SceneError: If the notation is correct, but no such footprint can exist.
         """
+        # In `parameters`, such as "WIDTHxHEIGHT", each word in capitals stands for a number.
         pattern = self.pattern or re.sub("[A-Z]+", lambda _: NUMBER, self.parameters)
         match = re.fullmatch(rf"{self.name}:(?P<parameters>{pattern})(?:@(?P<degrees>{NUMBER}))?", text)
         if match is None:
             return None
         numbers = [float(number) for number in re.findall(NUMBER, match["parameters"])]
-        return self.build(numbers, float(np.deg2rad(float(match["degrees"] or 0.0))))
+        degrees = float(match["degrees"] or 0.0)
+        return self.build(numbers, float(np.deg2rad(degrees)))
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ class Probe(ABC):
     @property
     @abstractmethod
     def notation(self) -> str:
-        """Text that `parse_probe` converts back into this probe, lengths in mm, without the rotation."""
+        """Text that `parse_probe` converts back into this probe. It contains lengths in mm, but not the rotation."""
 
     @property
     @abstractmethod

@@ -58,6 +58,7 @@ class Finger(RoundProbe):
             corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
             at: Position of the centroid of the footprint as x + iy, mm.
         """
+        # Gauss rule on [-1, 1], mapped to levels t from 0 to 1. The weights of this interval are half as large.
         nodes, weights = np.polynomial.legendre.leggauss(PRESSURE_LEVELS)
         level = 0.5 * (nodes + 1.0)
         level_radius = self.radius * np.sqrt(1.0 - level**2)

@@ -60,10 +60,10 @@ class Polygon(Probe):
     )
 
     def __post_init__(self) -> None:
-        """Check that the corners form a convex polygon about the origin.
+        """Check that the corners form a convex polygon whose centroid is the origin.
 
         Raises:
-            SceneError: If the corners do not, or if the polygon is too small.
+            SceneError: If the corners do not form such a polygon, or if the polygon is too small.
         """
         corners = np.array(self.corners, dtype=float)
         is_table = corners.ndim == 2 and corners.shape[1:] == (2,)
@@ -90,6 +90,7 @@ class Polygon(Probe):
             angle: Rotation about the centroid, anticlockwise, rad.
             name: Kind of polygon in the notation.
         """
+        # Corners that are not valid are not shifted. The constructor reports them.
         points = np.asarray(corners, dtype=float)
         is_table = points.ndim == 2 and points.shape[0] >= 3 and points.shape[1] == 2
         if is_table and np.isfinite(points).all() and is_convex(points):
@@ -129,10 +130,13 @@ class Polygon(Probe):
     def notation(self) -> str:
         """Text that `parse_probe` converts back into this probe, without the rotation."""
         corners = np.array(self.corners)
-        if self.name == "rectangle":
-            return f"rectangle:{tidy(2.0 * corners[0, 0])}x{tidy(2.0 * corners[0, 1])}"
+        first_corner, second_corner, *_ = corners
+        if self.name == "rectangle":  # the first corner lies at (width / 2, height / 2)
+            half_width, half_height = first_corner
+            return f"rectangle:{tidy(2.0 * half_width)}x{tidy(2.0 * half_height)}"
         if self.name == "triangle":
-            return f"triangle:{tidy(float(np.linalg.norm(corners[1] - corners[0])))}"
+            side = float(np.linalg.norm(second_corner - first_corner))
+            return f"triangle:{tidy(side)}"
         return "polygon:" + ";".join(f"{tidy(x)},{tidy(y)}" for x, y in corners)
 
     @property
@@ -148,7 +152,8 @@ class Polygon(Probe):
     @property
     def period(self) -> float:
         """Smallest rotation that maps the polygon onto itself, rad."""
-        # A rotation that maps the polygon onto itself maps each corner to the corner that is `step` corners ahead.
+        # A rotation that maps the polygon onto itself maps each corner to the corner that is `step` corners ahead. The
+        # smallest such step divides the number of corners.
         corners = to_complex(np.array(self.corners))
         for step in range(1, corners.size):
             if corners.size % step != 0:

@@ -1,0 +1,87 @@
+"""Least-squares fit of a cubic spline of two variables, with a penalty for regions that few points affect."""
+
+import numpy as np
+import scipy  # scipy.interpolate is imported when it is used
+from scipy.sparse import csr_array, dia_array, diags_array, eye_array, kron, sparray, vstack
+from scipy.sparse.linalg import splu
+
+from isocharge.common.arrays import Array
+
+SMOOTHING = 5e-3
+"""Weight of the third differences of the coefficients in the fit, dimensionless.
+
+It determines the coefficients in regions without points.
+"""
+
+
+def spline_knots(low: float, high: float, cells: int) -> Array:
+    """Return the knots of a cubic spline on an interval with equal cells, shape (cells + 7,)."""
+    return np.concatenate([[low] * 3, np.linspace(low, high, cells + 1), [high] * 3])
+
+
+def fit_spline(position: Array, values: Array, knots: tuple[Array, Array], fixed: int) -> "scipy.interpolate.NdBSpline":
+    """Fit a cubic spline by least squares with a penalty on the third differences of its coefficients.
+
+    Args:
+        position: Positions (x, y), shape (n, 2), mm.
+        values: Values at the positions, shape (n, ...).
+        knots: Knots along x and along y.
+        fixed: Number of coefficients at each end of each axis that are zero. With two such coefficients, the spline
+            and its slopes are zero on the edges.
+
+    Returns:
+        The spline, whose values have the shape of `values` without the first axis.
+    """
+    # A cubic spline has 4 coefficients less than knots.
+    x_knots, y_knots = knots
+    x_count = x_knots.size - 4
+    y_count = y_knots.size - 4
+
+    # Only the coefficients that are not fixed are unknown.
+    is_free = np.zeros((x_count, y_count), dtype=bool)
+    is_free[fixed : x_count - fixed, fixed : y_count - fixed] = True
+    free = np.flatnonzero(is_free)
+    free_design = _design_matrix(position, knots)[:, free]
+    free_penalty = _penalty_matrix(x_count, y_count).tocsc()[:, free]
+
+    # Normal equations, whose matrix is positive definite and needs no pivoting
+    normal_matrix = (free_design.T @ free_design + free_penalty.T @ free_penalty).tocsc()
+    right_side = np.ascontiguousarray(free_design.T @ values.reshape(len(position), -1))
+    factors = splu(normal_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    coefficients = np.zeros((is_free.size, right_side.shape[1]))  # one column for each component of the values
+    coefficients[free] = factors.solve(right_side)
+    return scipy.interpolate.NdBSpline(knots, coefficients.reshape(x_count, y_count, *values.shape[1:]), 3)
+
+
+def _design_matrix(position: Array, knots: tuple[Array, Array]) -> csr_array:
+    """Return the matrix that computes the values of a cubic spline at positions from its coefficients.
+
+    Args:
+        position: Positions (x, y), shape (n, 2), mm.
+        knots: Knots along x and along y.
+
+    Returns:
+        Matrix, shape (n, x_count * y_count), with the numbers of coefficients along x and y.
+    """
+    x_knots, y_knots = knots
+    n_coefficient = (x_knots.size - 4) * (y_knots.size - 4)
+    entries = scipy.interpolate.NdBSpline.design_matrix(position, knots, 3)
+    # SciPy omits the last columns if they are zero, so the shape is given here.
+    return csr_array((entries.data, entries.indices, entries.indptr), shape=(len(position), n_coefficient))
+
+
+def _penalty_matrix(x_count: int, y_count: int) -> sparray:
+    """Return the matrix that computes the weighted third differences of coefficients along x and along y.
+
+    Args:
+        x_count: Number of coefficients along x, which is the first axis of the coefficients.
+        y_count: Number of coefficients along y.
+    """
+    x_differences = kron(_third_differences(x_count), eye_array(y_count))
+    y_differences = kron(eye_array(x_count), _third_differences(y_count))
+    return SMOOTHING * vstack([x_differences, y_differences])
+
+
+def _third_differences(count: int) -> dia_array:
+    """Return the matrix of the third differences of neighbouring coefficients, shape (count - 3, count)."""
+    return diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))
