@@ -1,7 +1,7 @@
 """Activation functions of hidden layers, and the names of these functions in NumPy, PyTorch, ONNX and C.
 
-`ACTIVATIONS` is the only list of these functions. The configuration of a training, the evaluations of a network, the
-ONNX export and the C export all read it.
+The dictionary `ACTIVATIONS` contains all of these functions. The configuration of a training, the evaluations of a
+network, the ONNX export and the C export read it.
 """
 
 from collections.abc import Callable

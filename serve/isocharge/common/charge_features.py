@@ -12,7 +12,7 @@ class ChargeFeatures:
     """Function that computes the inputs of the first layer of a network from charges Q.
 
     For positive charges the function is ln(clip(Q) / typical). If charges can have both signs, the function is
-    asinh(clip(Q) / typical) - mean, which is linear for small charges and logarithmic for large ones.
+    asinh(clip(Q) / typical) - mean. This function is linear for small charges and logarithmic for large charges.
 
     Attributes:
         typical_pC: Charge by which each charge is divided, shape (n_electrode,), pC, positive.

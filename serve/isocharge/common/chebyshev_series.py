@@ -26,14 +26,14 @@ class Series:
     def values(self, coordinates: Array) -> Array:
         """Evaluate the series and its derivatives with respect to the three coordinates.
 
-        The series is evaluated in chunks of `CHUNK_SIZE` points. For the points of each chunk, the terms are first
-        summed over the polynomials in x and y, and then over the polynomials in the logarithm of the force.
+        The series is evaluated in chunks of `CHUNK_SIZE` points. For each chunk, the terms are first summed over the
+        polynomials in x and y. They are then summed over the polynomials in the logarithm of the force.
 
         Args:
             coordinates: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.
 
         Returns:
-            Shape (n, 4, n_electrode): the value, then the three derivatives.
+            Values and derivatives, shape (n, 4, n_electrode): the value, then the three derivatives.
         """
         _, n_y, n_force, n_electrode = self.coefficients.shape
         n_chunk = len(coordinates) // CHUNK_SIZE + 1  # at least one; no chunk is longer than CHUNK_SIZE
@@ -55,10 +55,11 @@ class Series:
         """
         derivatives = [_derivative(self.coefficients, axis) for axis in range(3)]
         series_and_derivatives = np.stack([self.coefficients, *derivatives])
-        x_degree, y_degree = position_degrees(self.coefficients.shape[0] - 1)
+        degree = self.coefficients.shape[0] - 1
+        x_degree, y_degree = position_degrees(degree)  # degrees in x and y of each product, shape (n_term,)
 
         terms = series_and_derivatives[:, x_degree, y_degree]  # shape (4, n_term, force_degree + 1, n_electrode)
-        terms_first = terms.transpose(1, 2, 0, 3)
+        terms_first = terms.transpose(1, 2, 0, 3)  # shape (n_term, force_degree + 1, 4, n_electrode)
         return np.asarray(terms_first.reshape(len(x_degree), -1))
 
 

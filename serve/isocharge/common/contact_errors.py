@@ -1,4 +1,7 @@
-"""Statistics of the errors of estimated contacts. Model cards, reports, the Bayes limit and the demo use them."""
+"""Statistics of the errors of estimated contacts.
+
+Model cards, reports, the Bayes limit and the demo use these statistics.
+"""
 
 from dataclasses import dataclass
 

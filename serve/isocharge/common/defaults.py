@@ -21,3 +21,7 @@ DEFAULT_STRESS_LIMIT = 45.0
 
 MAX_BATCH = 4096
 """Largest number of presses in one request or in a batch of Triton. The graph of a model has no limit."""
+
+FEW_ELECTRODES = 4
+"""Largest number of electrodes for which the smaller default sizes of a training are sufficient. With more electrodes,
+working areas are mostly larger, and the charges have more dimensions."""

@@ -1,4 +1,4 @@
-"""Deflection of a round film under a round probe: a table of force and distance from the centre, and its file.
+"""Deflection of a round film under a round probe, as a table over force and distance from the centre, and its file.
 
 The film is round and elastically isotropic, so that every press is a rotated press on the x axis. A disk automorphism
 maps rings around the origin to rings around the probe,
@@ -7,8 +7,8 @@ maps rings around the origin to rings around the probe,
 
 where z = x + i y is a point, p is the distance of the probe from the centre and r is the radius of the probe, all in
 film radii. The deflection is smooth on these rings, so that a few hundred numbers describe the deflection of one press.
-The deflection of a membrane is proportional to the cube root of the force. Between two forces of the table, the ratio
-of the deflection to this cube root is therefore interpolated over the logarithm of the force. The package `simulate`
+The deflection of a membrane is proportional to the cube root of the force. Between two forces of the table, the
+deflection divided by this cube root is therefore interpolated over the logarithm of the force. The package `simulate`
 writes the file, and the live page of `serve` shows the deflection.
 """
 
@@ -101,7 +101,10 @@ def _is_close(given: object, value: float) -> bool:
 
 
 def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, rings: Array, angles: int) -> Complexes:
-    """Compute the points of a field for a probe on the x axis. The docstring of this module states the automorphism.
+    """Compute the points of a deflection field for a probe on the x axis.
+
+    Rings around the origin are mapped to rings around the probe by the disk automorphism z -> (z + c) / (1 + c z). The
+    shift c is chosen so that a circle around the origin becomes the edge of the probe.
 
     Args:
         radius_mm: Radius of the film, mm.
@@ -146,7 +149,10 @@ Increasing = Annotated[tuple[Finite, ...], Meta(min_length=1)]
 
 
 class _File(Struct):
-    """Content of the file. The numbers in `deflection` are ratios to the largest deflection, in base64."""
+    """Content of the file.
+
+    The key `deflection` contains the deflections divided by the largest deflection, encoded in base64.
+    """
 
     isocharge_deflection: Annotated[int, Meta(ge=VERSION, le=VERSION, description=f"the version {VERSION}")]
     film: dict[str, Finite]
@@ -159,7 +165,14 @@ class _File(Struct):
     deflection: bytes
 
     def __post_init__(self) -> None:
-        """Check that the keys of the file fit each other; raise WrongKey for the first key that does not."""
+        """Check that the values of the keys are consistent.
+
+        The film must have exactly the expected properties. The numbers along each axis of the table must increase.
+        There must be one deflection for each combination of force, distance, ring and angle.
+
+        Raises:
+            WrongKey: For the first key whose value is wrong.
+        """
         if set(self.film) != set(FILM_KEYS):
             raise WrongKey("film", f"the keys {', '.join(FILM_KEYS)}", list(self.film))
         for key in ("force_N", "distance_mm", "rings"):
@@ -168,7 +181,7 @@ class _File(Struct):
                 raise WrongKey(key, "increasing numbers", list(numbers))
 
         expected_count = math.prod(self.shape)
-        expected_bytes = 2 * expected_count
+        expected_bytes = 2 * expected_count  # 16-bit integers
         if expected_count > MAX_NUMBERS or len(self.deflection) != expected_bytes:
             expected = f"{expected_count} numbers of 16 bits in base64, {MAX_NUMBERS} at most"
             raise WrongKey("deflection", expected, len(self.deflection))

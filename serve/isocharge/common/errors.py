@@ -1,8 +1,8 @@
 """The exceptions of isocharge. Each class also inherits from the built-in exception with the most similar meaning.
 
 A message states what was expected, what was given, where, and what to do. `isocharge.cli.main` maps the exceptions to
-exit codes: 2 for wrong input, and 1 for everything else. `isocharge.serve.network.protocol.response` maps them to HTTP
-and gRPC statuses.
+exit codes: 2 for wrong input, and 1 for everything else. `isocharge.serve.network.protocol.response` maps the
+exceptions to HTTP and gRPC statuses.
 """
 
 from collections.abc import Iterator

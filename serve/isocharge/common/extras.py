@@ -22,7 +22,7 @@ PACKAGES = {
 
 @contextmanager
 def require(*extras: str) -> Iterator[None]:
-    """Import packages of extras inside this context, and name the install command if a package is missing.
+    """Raise an error that names the install command if an import inside this context finds no package of the extras.
 
     Args:
         extras: Names of the extras in pyproject.toml.
@@ -37,7 +37,7 @@ def require(*extras: str) -> Iterator[None]:
     try:
         yield
     except (ModuleNotFoundError, MissingExtra) as error:
-        package = (error.name or "").partition(".")[0]
+        package = (error.name or "").partition(".")[0]  # the package of the missing module
         if not any(package in PACKAGES[extra] for extra in extras):
             raise
         raise MissingExtra(

@@ -82,7 +82,7 @@ def bounded_lines(file: TextIO, max_characters: int = MAX_LINE_CHARACTERS) -> It
 
 
 def read_needed(path: Path, error: type[IsochargeError], advice: str, max_bytes: int = MAX_FILE_BYTES) -> bytes:
-    """Read the bytes of a regular file. If this is not possible, raise an error that states what to do.
+    """Read the bytes of a regular file. If the file cannot be read, raise an error that states what to do.
 
     Args:
         path: The file.
@@ -125,7 +125,7 @@ def write_whole(path: Path, data: bytes) -> None:
 class AtomicWriter:
     """Writer of a new file that appends data completely or not at all.
 
-    It has the methods of a binary file that MCAP and text writers use.
+    The writer has the methods of a binary file that MCAP and text writers use.
     """
 
     def __init__(self, path: Path) -> None:
@@ -148,8 +148,9 @@ class AtomicWriter:
         unwritten = memoryview(data)
         try:
             os.lseek(self._descriptor, self._size, os.SEEK_SET)
-            while unwritten:
-                unwritten = unwritten[os.write(self._descriptor, unwritten) :]
+            while unwritten:  # one call may write only a part of the data
+                written_bytes = os.write(self._descriptor, unwritten)
+                unwritten = unwritten[written_bytes:]
         except OSError:
             os.ftruncate(self._descriptor, self._size)
             raise
@@ -193,9 +194,10 @@ def new_file(path: Path) -> Iterator[Path]:
             temporary.rename(path)
             sync_folder(path.parent)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        # Neither a folder nor a file has this name any more, unless an error occurred.
+        shutil.rmtree(temporary, ignore_errors=True)  # if it is a folder
         with suppress(OSError):
-            temporary.unlink()
+            temporary.unlink()  # if it is a file
 
 
 @contextmanager
@@ -227,7 +229,7 @@ def _temporary_path(path: Path) -> Path:
 
 @contextmanager
 def as_output_errors(path: Path, advice: str = "choose another output") -> Iterator[None]:
-    """Convert an OSError of the block to an OutputError.
+    """Convert an OSError that the block raises to an OutputError.
 
     Args:
         path: The output, for the error message.
@@ -236,13 +238,14 @@ def as_output_errors(path: Path, advice: str = "choose another output") -> Itera
     try:
         yield
     except OSError as error:
-        if isinstance(error, IsochargeError | BrokenPipeError):  # a broken pipe is not an error of this output
+        # Errors of isocharge have their own message already, and a broken pipe is not an error of this output.
+        if isinstance(error, IsochargeError | BrokenPipeError):
             raise
         raise OutputError(f"{path} cannot be written: {error.strerror or error}; {advice}") from error
 
 
 def remove_empty(folders: Iterable[Path]) -> None:
-    """Remove the folders that are empty, and leave all other folders unchanged.
+    """Remove those of the given folders that are empty. All other folders remain unchanged.
 
     Inner folders must come before outer folders.
     """

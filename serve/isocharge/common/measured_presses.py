@@ -1,4 +1,4 @@
-"""Measured presses: charges of a film under presses. The position or the force of each press is known, or both.
+"""Measured presses: charges of a film under presses. For each press, the position, the force or both are known.
 
 A file of presses is CSV or Parquet with the columns `x_mm`, `y_mm`, `force_N` and one column for each electrode (pC),
 in any order. An empty cell stands for an unknown value. A file may have four further columns:
@@ -127,7 +127,7 @@ class MeasuredPresses:
         return len(self.lines)
 
     def __getitem__(self, rows: int | slice | Sequence[int] | Integers | Booleans) -> "MeasuredPresses":
-        """Return some of the presses, which are given by an index, by several indices, by a slice or by a mask."""
+        """Return the presses that an index, several indices, a slice or a mask selects."""
         indices = np.atleast_1d(np.arange(len(self))[rows])
         return replace(
             self,
@@ -188,7 +188,7 @@ class MeasuredPresses:
     def columns(self) -> dict[str, Array]:
         """Columns of a file of these presses by their names, each of shape (n,).
 
-        There is no column of the temperature if the temperature of no press is known.
+        A column of temperatures is omitted if it would be empty for every press.
         """
         columns = dict(zip(CONTACT, self.contact.T, strict=True))
         columns |= dict(zip(self.electrodes, self.charge_pC.T, strict=True))
@@ -276,6 +276,7 @@ def read_presses(
         if not 0.0 < std <= PRESS_RULES[name].maximum:
             raise PressError(f"{name}: expected {PRESS_RULES[name].description}, got {std:g}")
 
+    # Read the columns of the file that are electrodes or have another meaning for a press.
     expected_electrodes = "the electrodes' names" if electrodes is None else f"the electrodes {tuple(electrodes)}"
     expected_header = f"a header with {', '.join(CONTACT)} and {expected_electrodes} (charges in pC)"
     names_with_meaning = (*(electrodes or ()), *PRESS_RULES)
@@ -290,6 +291,7 @@ def read_presses(
     if not count:
         raise PressError(f"{path}: expected one press or more below the header, got none")
 
+    # Columns that the file does not have become NaN. Missing standard deviations get their default values.
     absent_column = np.full(count, np.nan)
     values = {name: columns.values.get(name, absent_column) for name in (*names, *PRESS_RULES)}
     for name, std in default_stds.items():

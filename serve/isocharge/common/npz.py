@@ -1,7 +1,7 @@
 """Reader of the arrays of an npz file that may come from an untrusted source.
 
-An npz file is a zip archive with one entry in NumPy's npy format for each array. Before anything is decompressed, the
-declared sizes, the compression method and the size of the LZMA dictionary are checked, so that a small file cannot
+An npz file is a zip archive with one entry in NumPy's npy format for each array. The declared sizes, the compression
+method and the size of the LZMA dictionary are checked before anything is decompressed. A small file therefore cannot
 request much memory. No Python object is ever unpickled.
 """
 
@@ -25,6 +25,9 @@ MAX_ENTRIES = 1000
 
 MAX_HEADER_CHARACTERS = 4096
 """Longest header of an array, characters."""
+
+PREAMBLE_BYTES = 16
+"""Upper limit for the number of bytes before the header of an array: mark, version and length of the header."""
 
 MAX_LZMA_DICTIONARY_BYTES = 16 << 20
 """Largest dictionary of an entry that is compressed with LZMA, bytes. The default of Python is 8 MiB."""
@@ -76,7 +79,7 @@ def npz_arrays(data: bytes, names: Iterable[str] | None = None) -> dict[str, np.
         missing = [name for name in selected if name not in entries]
         if missing:
             raise ValueError(f"the array {missing[0]!r} is missing")
-        total_bytes = sum(entries[name].file_size for name in selected)
+        total_bytes = sum(entries[name].file_size for name in selected)  # sizes that the archive declares
         if total_bytes > MAX_UNPACKED_BYTES:
             raise ValueError(f"the arrays unpack to more than {MAX_UNPACKED_BYTES} bytes")
         arrays = {}
@@ -162,7 +165,8 @@ def _checked_entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 def _check_lzma_dictionary(data: bytes, entry: zipfile.ZipInfo) -> None:
     """Check that an entry that is compressed with LZMA does not request a large dictionary.
 
-    The size of the dictionary is a part of the LZMA properties (APPNOTE.TXT of the zip format, 5.8.8).
+    An entry consists of its header, its name, an extra field and its content. The content of an LZMA entry begins with
+    the LZMA properties, which contain the size of the dictionary (APPNOTE.TXT of the zip format, 5.8.8).
 
     Args:
         data: Bytes of the archive.
@@ -173,7 +177,7 @@ def _check_lzma_dictionary(data: bytes, entry: zipfile.ZipInfo) -> None:
     """
     name_length, extra_length = _LOCAL_HEADER.unpack_from(data, entry.header_offset)
     content_offset = entry.header_offset + _LOCAL_HEADER.size + name_length + extra_length
-    _, _, _, dictionary_bytes = _LZMA_PROPERTIES.unpack_from(data, content_offset)
+    _version, _length, _options, dictionary_bytes = _LZMA_PROPERTIES.unpack_from(data, content_offset)
     if dictionary_bytes > MAX_LZMA_DICTIONARY_BYTES:
         raise ValueError(
             f"an LZMA dictionary of {dictionary_bytes} bytes; at most {MAX_LZMA_DICTIONARY_BYTES} are accepted"
@@ -209,7 +213,7 @@ def _parse_npy(content: bytearray, name: str) -> np.ndarray:
     Raises:
         ValueError: If the version is not supported, the array has Python objects, or its shape does not fit the bytes.
     """
-    header = io.BytesIO(content[: MAX_HEADER_CHARACTERS + 16])
+    header = io.BytesIO(content[: MAX_HEADER_CHARACTERS + PREAMBLE_BYTES])
     version = np.lib.format.read_magic(header)
     if version == (1, 0):
         shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(header, MAX_HEADER_CHARACTERS)
@@ -222,7 +226,8 @@ def _parse_npy(content: bytearray, name: str) -> np.ndarray:
     header_bytes = header.tell()
     number_bytes = len(content) - header_bytes
     size = math.prod(shape)
-    if min(shape, default=0) < 0 or size * dtype.itemsize != number_bytes:
+    has_negative_length = any(length < 0 for length in shape)
+    if has_negative_length or size * dtype.itemsize != number_bytes:
         raise ValueError(f"{name}: the shape {shape} of {dtype} does not fit {number_bytes} bytes")
 
     if size == 0:  # `frombuffer` refuses an empty buffer

@@ -4,8 +4,8 @@
 def parse_number(text: str) -> float:
     """Parse a number in ASCII notation, including infinity and NaN.
 
-    Unlike `float`, the function does not accept underscores, as in `1_0`, and digits of other scripts, because other
-    programs do not write numbers in this way.
+    Unlike `float`, the function accepts neither underscores, as in `1_0`, nor digits of other scripts. Other programs
+    do not write numbers in this way.
 
     Raises:
         ValueError: If the text is not a number.

@@ -5,7 +5,7 @@ y = h_L V + c + x S. The activation f follows each hidden layer. The skip layer 
 outputs, so that the hidden layers only need to learn the nonlinear part. Leading dimensions of the arrays are batch
 dimensions, so that the weights of several perceptrons can be evaluated in one call.
 
-The definition is generic in the type of its arrays. Training evaluates it with PyTorch tensors
+The definition is generic in the type of its arrays. Training evaluates the perceptron with PyTorch tensors
 (`isocharge.train.training.torch_evaluation`), and the ONNX and C exports write it.
 """
 
@@ -80,7 +80,7 @@ def evaluate_output_layer(perceptron: Perceptron[Any], hidden_output: Values, in
         inputs: Inputs of the perceptron, shape (..., n_input).
 
     Returns:
-        Shape (..., n_output).
+        Outputs, shape (..., n_output).
     """
     last = perceptron.last
     return np.asarray(hidden_output @ last.weight + last.bias + inputs @ perceptron.skip)

@@ -67,6 +67,7 @@ def second_thread() -> Iterator[Executor]:
         if listener:
             listener(title, done, total, note)
 
+    # The listener is a context variable, which a new thread does not inherit. The initializer sets it in the thread.
     with ThreadPoolExecutor(1, initializer=_listener.set, initargs=(report_until_stopped,)) as executor:
         try:
             yield executor
@@ -77,7 +78,7 @@ def second_thread() -> Iterator[Executor]:
 
 
 def track(items: Iterable[Item], title: str, total: int | None = None) -> Iterator[Item]:
-    """Yield the items and report the progress. An item counts as done when the next one is requested.
+    """Yield the items and report the progress. An item counts as done when the next item is requested.
 
     Args:
         items: The items of the work.

@@ -1,4 +1,4 @@
-"""Runs that can be stopped and resumed. The finished parts of a run are stored next to the folder that it writes.
+"""Runs that can be stopped and resumed. The finished parts of a run are stored next to the folder that the run writes.
 
     presses.part/
         run.json           settings of the run; a run with other settings does not use the folder
@@ -87,6 +87,7 @@ class ResumableRun:
             The content; None if the part is not finished. If the part is damaged, a warning is logged and the result
             is None.
         """
+        # The file with the checksum is written last. A part without this file is not finished.
         try:
             checksum = read_whole(self._parts / f"{name}.sha256").decode()
         except (OSError, UnicodeDecodeError):
@@ -157,13 +158,14 @@ class _StoringExecutor(Executor):
         self._submitted = 0
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Return the future of a task, whose result is loaded if it is stored, and otherwise computed and stored.
+        """Submit a task whose result is stored as a part of the run, and return its future.
 
-        If there is no other executor, the task is computed before this method returns.
+        If an earlier run has stored the result, the result is loaded. Otherwise the other executor computes the task.
+        If there is no other executor, the task is computed before this method returns. The result is then stored.
         """
-        part = f"{self._name}-{self._submitted:04d}.npy"
+        part = f"{self._name}-{self._submitted:04d}.npy"  # parts are numbered in the order of submission
         self._submitted += 1
-        stored: Future[Any] = Future()
+        stored: Future[Any] = Future()  # is done when the result is stored
         loaded = self._run.load(part, _decode_array)
         if loaded is not None:
             stored.set_result(loaded)
@@ -236,8 +238,8 @@ def refuse_finished(target: Path) -> None:
 def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
     """Begin a run, or resume a run that was stopped. The target folder is created when the block ends without an error.
 
-    After an error, the draft is kept for the next run. It is removed if no part is finished, or if the same error would
-    occur again.
+    After an error, the draft is kept for the next run. The draft is removed if no part is finished, or if the same
+    error would occur again.
 
     Args:
         target: Folder that the run writes.
@@ -258,9 +260,22 @@ def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fa
 
 @contextmanager
 def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
-    """Begin or resume a run whose block writes the target itself; see `resume_folder` for the arguments.
+    """Begin or resume a run whose block writes the target itself, for example as a single file.
 
-    The draft is removed when the block ends without an error.
+    The draft is removed when the block ends without an error. After an error, the draft is kept for the next run,
+    unless no part is finished or the same error would occur again.
+
+    Args:
+        target: File or folder that the run writes.
+        identity: All settings on which the result depends, as JSON.
+        fresh: Whether to delete an earlier draft.
+
+    Yields:
+        The draft, which stores the finished parts.
+
+    Raises:
+        OutputExists: If the target exists, or the draft belongs to a run with other settings or is in use.
+        OutputError: If a file cannot be written.
     """
     refuse_finished(target)
     draft = ResumableRun(target)
@@ -285,6 +300,8 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
 def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterator[None]:
     """Lock the draft of a run during the block, and create the draft if necessary.
 
+    The folder of a draft contains a lock file, and a file `run.json` with the settings of the run.
+
     Args:
         draft: The run.
         identity: Settings of the run. A draft with other settings is refused.
@@ -296,7 +313,7 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
             draft.remove()
     is_new = not folder.exists()
     try:
-        if is_new:
+        if is_new:  # the folder appears with both files at once, even if the process is killed in between
             with new_folder(folder) as temporary:
                 (temporary / "lock").touch()
                 write_whole(temporary / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
@@ -310,13 +327,13 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
 
 
 def output_errors(target: Path) -> AbstractContextManager[None]:
-    """Convert an OSError of the block to an OutputError, whose message states how to resume the run."""
+    """Convert an OSError that the block raises to an OutputError, whose message states how to resume the run."""
     return as_output_errors(target, f"repeat the command to resume from {draft_of(target)}, or choose another output")
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Lock a folder against other processes during the block. The system unlocks it if this process is killed.
+    """Lock a folder against other processes during the block. The system unlocks the folder if this process is killed.
 
     Args:
         path: The folder, or a lock file in the folder.

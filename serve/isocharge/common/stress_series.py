@@ -11,10 +11,10 @@ s11 + s22, the sum of the two normal stresses, is a smooth function on either si
 
     ln(s11 + s22) = sum c_ijkm T_i(p') T_j(l') T_k(u) T_m(cos(arg z)),
 
-where T are Chebyshev polynomials, p' is the distance and l' is the logarithm of the force, both scaled to [-1, 1].
-The argument u is 2 (|z| / s0)^2 - 1 under the probe. Outside of the probe, u is the logarithm of |z|, scaled to [-1, 1]
-between s0 and `max_ring`. An electrode of area A on a film with d31 = d32 collects the charge
-d31 * A * mean(s11 + s22). The package `simulate` writes the file, and the playground computes charges from it.
+where T are Chebyshev polynomials, p' is the distance and l' is the logarithm of the force, both scaled to [-1, 1]. The
+argument u is 2 (|z| / s0)^2 - 1 under the probe. Outside of the probe, u is ln|z|, scaled linearly so that s0 becomes
+-1 and `max_ring` becomes 1. An electrode of area A on a film with d31 = d32 collects the charge d31 * A * mean(s11 +
+s22). The package `simulate` writes the file, and the playground computes charges from it.
 """
 
 import base64
@@ -61,7 +61,7 @@ class StressSeries:
     outer: Array
 
     def fits(self, film: Any) -> bool:
-        """Return whether a film, as a sensor file describes it, has the properties of the film of this series."""
+        """Return whether the film that a sensor file describes has the same properties as the film of this series."""
         return is_same_film(film, self.film)
 
     def to_json(self) -> dict[str, Any]:

@@ -64,7 +64,7 @@ Text = Annotated[str, Meta(min_length=1, max_length=1000)]
 
 
 class Settings(Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of a file in which unknown keys are errors. Type checkers need `frozen=True` again in each subclass."""
+    """A table of a file in which unknown keys are errors. Each subclass must repeat `frozen=True` for type checkers."""
 
 
 class WrongKey(ValueError):
@@ -163,7 +163,7 @@ def parse_json(text: str | bytes, where: str, error: type[InputError], kind: typ
 
 
 def convert(value: object, kind: type[T], where: str, error: type[InputError]) -> T:
-    """Convert a value of tables, lists, texts and numbers to a type.
+    """Convert a value, which consists of tables, lists, texts and numbers, to a type.
 
     Args:
         value: Value from TOML or JSON.
@@ -182,7 +182,7 @@ def _prefix(where: str) -> str:
 
 
 def _first_mistake(value: object, kind: Any, cause: Exception) -> str:
-    """Return a description of the first mistake in a value; if none is found, the message of msgspec."""
+    """Return a description of the first mistake in a value, or the message of msgspec if no mistake is found."""
     try:
         return next(_mistakes(value, kind, ""), cut(str(cause)))
     except RecursionError:
@@ -201,6 +201,8 @@ def _mistakes(value: object, expected_type: Any, path: str) -> Iterator[str]:
     yield from _mistakes_in_tag(value, members, path)
     for member in members:
         yield from _mistakes_in_parts(value, member, path)
+
+    # A mistake in the whole value. If the check of a struct has raised the error, its exception is the cause.
     try:
         msgspec.convert(value, expected_type)
     except msgspec.ValidationError as error:
@@ -227,7 +229,9 @@ def _expected_value(expected_type: Any, first_member: Any) -> str:
 
 
 def _mistakes_in_tag(value: object, members: list[Any], path: str) -> Iterator[str]:
-    """Yield a mistake in the tag, the key whose value selects one of several structs.
+    """Yield the mistake if the tag of a table is missing or unknown.
+
+    The tag is the key whose value selects one of several structs. If there is only one struct, the tag may be missing.
 
     Args:
         value: Value from TOML or JSON.
@@ -235,11 +239,11 @@ def _mistakes_in_tag(value: object, members: list[Any], path: str) -> Iterator[s
         path: Names of the keys that lead to the value.
     """
     structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
-    tagged = [struct.__struct_config__ for struct in structs if struct.__struct_config__.tag is not None]
-    if not tagged or not isinstance(value, Mapping):
+    configs_with_tag = [struct.__struct_config__ for struct in structs if struct.__struct_config__.tag is not None]
+    if not configs_with_tag or not isinstance(value, Mapping):
         return
-    tags = [config.tag for config in tagged]
-    tag_key = str(tagged[0].tag_field)
+    tags = [config.tag for config in configs_with_tag]
+    tag_key = str(configs_with_tag[0].tag_field)  # all structs of a union have the same tag key
     if tag_key not in value:
         if len(tags) > 1:
             yield f"key {_join(path, tag_key)!r} is missing"
@@ -338,7 +342,11 @@ def _join(path: str, key: str) -> str:
 
 
 def _describe_type(kind: inspect.Type) -> str:
-    """Return a description of the values of a type for error messages."""
+    """Return a description of the values of a type for error messages.
+
+    A description in the annotation of the type takes precedence. Types without a case of their own, such as tables, are
+    described by their noun.
+    """
     match kind:
         case inspect.Metadata(type=inner, extra_json_schema=extra):
             return (extra or {}).get("description") or _describe_type(inner)
@@ -397,6 +405,7 @@ def _describe_number(noun: str, above: float | None, minimum: float | None, maxi
         minimum: Inclusive lower bound; None if there is none.
         maximum: Inclusive upper bound; None if there is none.
     """
+    # Bounds of the size of `MAX_FLOAT` exclude only infinity, and are not mentioned.
     if minimum is not None and abs(minimum) == MAX_FLOAT:
         minimum = None
     if maximum is not None and abs(maximum) == MAX_FLOAT:

@@ -1,4 +1,4 @@
-"""The version of the installed package, which is looked up when it is first used, because the lookup is slow."""
+"""The version of the installed package, with a slow lookup that is delayed until the version is first used."""
 
 from collections.abc import Callable
 from functools import cache

@@ -1,7 +1,7 @@
 """A queue with a thread that writes its items, so that the caller never waits for a slow consumer.
 
 The thread writes the oldest item first. If the consumer is so slow that more than `MAX_WAITING` items wait, the oldest
-items are dropped and counted. The items that the consumer gets are therefore as new as possible.
+items are dropped and counted. The consumer therefore gets the newest items.
 """
 
 import threading
@@ -82,6 +82,7 @@ class WriterQueue(Generic[T]):
             Exception: The exception that `write` has raised in the thread, unless `put` has raised it already.
         """
         with self._change:
+            # Wait as long as the thread takes items from the queue or raises an error within the timeout.
             while self._waiting and self._thread.is_alive():
                 has_changed = partial(self._has_changed, self._taken)
                 if not self._change.wait_for(has_changed, CLOSE_TIMEOUT_s):
@@ -124,7 +125,7 @@ class WriterQueue(Generic[T]):
         while True:
             with self._change:
                 self._change.wait_for(lambda: self._waiting or self._is_closed)
-            if not (self._is_ready() or self._is_closed):
+            if not (self._is_ready() or self._is_closed):  # after `close`, items are written without this check
                 continue
             with self._change:
                 if not self._waiting:

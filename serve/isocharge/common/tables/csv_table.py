@@ -76,10 +76,19 @@ class CsvTable(NumberTable):
         super().__init__(header, names, where, error, expected)
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
-        """Convert the cells of the requested columns to numbers, row by row; see `NumberTable.read`."""
+        """Convert the cells of the requested columns to numbers, row by row.
+
+        Args:
+            rules: Rule of each requested column, by its name. The rules only appear in error messages here.
+            max_rows: Largest number of rows.
+
+        Raises:
+            error: If there are too many rows, or a cell is not a finite number.
+        """
         positions = {name: self.header.index(name) for name in rules}
+        # Arrays of 64-bit integers and floats need less memory than lists. The numbers of all rows follow each other.
         line_numbers = array("q")
-        numbers = array("d")  # the requested cells of the first row, then those of the second row, and so on
+        numbers = array("d")
         for line_number, cells in self._rows:
             if len(line_numbers) == max_rows:
                 self._refuse_row_count(max_rows)
@@ -155,7 +164,10 @@ class _LinesWithoutComments:
         return self
 
     def __next__(self) -> str:
-        """Return the next line, or a blank line in place of a comment."""
+        """Return the next line, or a blank line in place of a comment.
+
+        After each line, the attribute `at_row_start` is False until the reader of the rows sets it again.
+        """
         line = next(self._lines)
         if self._at_first_line:
             line = line.removeprefix(BYTE_ORDER_MARK)
@@ -170,6 +182,8 @@ def _numbered_rows(
 ) -> Iterator[tuple[int, list[str]]]:
     """Yield the line number, from 1, and the cells of each row that is neither blank nor a comment.
 
+    If a row has several lines, its line number is the number of the last line.
+
     Args:
         lines: Lines of the text, each with its line end.
         names: Names that have a meaning. A line that begins with # and one of these names is not a comment.
@@ -183,14 +197,14 @@ def _numbered_rows(
     reader = csv.reader(source, strict=True)
     try:
         for cells in reader:
-            source.at_row_start = True
+            source.at_row_start = True  # the next line begins a row and may be a comment
             if any(cell.strip() for cell in cells):
                 yield reader.line_num, cells
     except InputError:  # from the iterator that supplies the lines
         raise
     except csv.Error as cause:
         raise error(f"{where}, line {reader.line_num}: not CSV text ({cause})") from cause
-    except UnicodeDecodeError as cause:
+    except UnicodeDecodeError as cause:  # a kind of ValueError, which is therefore caught before
         raise error(where + _decoding_advice(cause, reader.line_num)) from cause
     except ValueError as cause:  # a line that is too long to be held
         raise error(f"{where}, line {reader.line_num + 1}: not CSV text ({cause})") from cause
@@ -198,6 +212,8 @@ def _numbered_rows(
 
 def _decoding_advice(cause: UnicodeDecodeError, lines_before: int) -> str:
     """Return the end of an error message about bytes that are not UTF-8: the line, the reason and what to do.
+
+    If the file begins like a file of another known format, the message names this format instead.
 
     Args:
         cause: The error, which contains the piece of the file that was being decoded.

@@ -45,7 +45,9 @@ class ColumnMeaning:
 
 
 def header_advice(columns: Iterable[str], absent: Mapping[str, ColumnMeaning]) -> Iterator[str]:
-    """Yield advice for each column that probably is one of the missing columns under another name.
+    """Yield advice for each column that is probably one of the missing columns under another name.
+
+    If several columns of the file resemble the same missing column, only the first of them gets the advice.
 
     Args:
         columns: Columns of the file that have no other meaning.
@@ -64,7 +66,11 @@ def header_advice(columns: Iterable[str], absent: Mapping[str, ColumnMeaning]) -
 
 
 def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
-    """Return advice for a column that probably is the missing column `name`; an empty text if it probably is not.
+    """Return advice for a column that is probably the missing column `name`, or an empty text for any other column.
+
+    Three kinds of names are recognised. The name may differ only in its capital letters. It may consist of words that
+    mean the missing column. It may also consist of such words and a unit, which is either that of the missing column or
+    can be converted to it.
 
     Args:
         column: Name of the column in the file.
@@ -77,13 +83,15 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
         )
     advice_to_rename = f"rename {shown(column)} to {shown(name)}"
     if meaning.noun == "electrode":
-        meaning = replace(meaning, words=_words(name))
+        meaning = replace(meaning, words=_words(name))  # an electrode is recognised by its own name
 
+    # The column consists of words only, such as "force applied".
     words = _words(column)
     has_only_known_words = words <= meaning.words | GENERAL_WORDS
     if _is_named(words, meaning) and has_only_known_words:
         return advice_to_rename
 
+    # The column consists of a label and a unit, such as "force (N)" or "force_N".
     match = _LABEL_AND_UNIT.fullmatch(column)
     if match is None:
         return ""

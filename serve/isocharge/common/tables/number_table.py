@@ -53,6 +53,7 @@ class ColumnRule:
     def violations(self, values: Array) -> Booleans:
         """Return a mask of the values that violate the rule, shape (n,). NaN stands for an empty cell."""
         is_empty = np.isnan(values)
+        # Comparisons with NaN are false, so that an empty cell is not outside of the limits.
         is_outside = (values < self.minimum) | (values > self.maximum)
         if self.is_positive:
             is_outside |= values <= 0.0
@@ -94,7 +95,7 @@ class NumberColumns:
         rows_and_columns = np.argwhere(np.column_stack(violations))  # ordered by rows
         if not rows_and_columns.size:
             return
-        row, column_index = rows_and_columns[0]
+        row, column_index = rows_and_columns[0]  # the first violation in the first row that has one
         name = list(self.values)[column_index]
         value = _value_text(float(self.values[name][row]))
         raise error(

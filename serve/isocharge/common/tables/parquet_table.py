@@ -1,8 +1,8 @@
 """Columns of numbers as Parquet.
 
-Only the requested columns are decoded, after their types and the number of rows were checked in the metadata of the
-file. Their types may be integers, floating-point numbers and decimals of any width. Null and NaN stand for empty cells.
-All other columns may have any type.
+The types of the requested columns and the number of rows are first checked in the metadata of the file. Then only the
+requested columns are decoded. The types of the columns may be integers, floating-point numbers and decimals of any
+width. Null and NaN stand for empty cells. All other columns may have any type.
 """
 
 import io
@@ -26,6 +26,9 @@ SUFFIX = ".parquet"
 
 MARK = b"PAR1"
 """First and last four bytes of a Parquet file."""
+
+SIZE_FIELD_BYTES = 4
+"""Length of the field near the end of a Parquet file that contains the size of the metadata, bytes."""
 
 MAX_FOOTER_BYTES = 16 << 20
 """Largest size of the metadata at the end of a file."""
@@ -70,7 +73,15 @@ class ParquetTable(NumberTable):
         super().__init__(header, names, where, error, expected)
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
-        """Decode the requested columns; see `NumberTable.read`."""
+        """Decode the requested columns.
+
+        Args:
+            rules: Rule of each requested column, by its name. The rules only appear in error messages here.
+            max_rows: Largest number of rows.
+
+        Raises:
+            error: If there are too many rows, or a column has no numbers, or the file is damaged.
+        """
         row_count = self._metadata.num_rows
         if row_count > max_rows:
             self._refuse_row_count(max_rows)
@@ -115,7 +126,7 @@ class ParquetTable(NumberTable):
         groups = list(range(self._metadata.num_row_groups))
         for batch in self._parquet.reader.iter_batches(ROWS_PER_BATCH, groups, [index], use_threads=False):
             next_row = row + batch.num_rows
-            if next_row > row_count:
+            if next_row > row_count:  # more rows than the metadata declare, which the check below reports
                 break
             numbers[row:next_row] = _as_float64(batch.column(0))
             row = next_row
@@ -185,10 +196,10 @@ def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
 
     # A Parquet file ends with the size of its metadata (u32, little-endian) and the mark.
     file_bytes = file.seek(0, io.SEEK_END)
-    file.seek(max(0, file_bytes - 4 - len(MARK)))
-    metadata_bytes = int.from_bytes(file.read(4), "little")
+    file.seek(max(0, file_bytes - SIZE_FIELD_BYTES - len(MARK)))
+    metadata_bytes = int.from_bytes(file.read(SIZE_FIELD_BYTES), "little")
     last_mark = file.read(len(MARK))
-    file.seek(0)
+    file.seek(0)  # pyarrow reads the file from its beginning
 
     if first_mark != MARK or last_mark != MARK:
         raise error(f"{where}: not a Parquet file, or one that was cut off; write it again, or as CSV")
@@ -211,7 +222,7 @@ def _pyarrow_errors_converted(where: str, error: type[InputError]) -> Iterator[N
 
     try:
         yield
-    except error:
+    except error:  # an error that the block has raised with its own message
         raise
     except (ArrowException, OSError, ValueError, MemoryError, OverflowError) as cause:
         reason = cut(" ".join(str(cause).split()))
