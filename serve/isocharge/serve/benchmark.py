@@ -145,9 +145,10 @@ def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Cont
         charge_pC: Charges of presses, shape (n, electrodes), pC. Each call for one press uses the next row. Batches of
             more than n presses are left out.
     """
+    # Functions that return the charges of the next press, as an array and as a list, and begin again after the last.
     next_array = partial(next, cycle(charge_pC))
     next_list = partial(next, cycle(charge_pC.tolist()))
-    out = np.zeros(N_WITHOUT_CORRELATION, np.float32)
+    out = np.zeros(N_WITHOUT_CORRELATION, np.float32)  # receives the results of `predict_into`
     contenders = [
         Contender("predict_into, float32 array", 1, lambda: predictor.predict_into(next_array(), out)),
         Contender("predict, list of numbers", 1, lambda: predictor.predict(next_list())),

@@ -30,7 +30,7 @@ def demo_command(
             "--seconds",
             min=3.0,
             max=1e6,
-            help="Duration of the live part, s. (default: 20; with --live until Ctrl-C)",
+            help="Duration of the live part, s. (default: 10; with --live until Ctrl-C)",
         ),
     ] = None,
     sensor: Annotated[
@@ -56,7 +56,7 @@ def demo_command(
 ) -> None:
     """Show what isocharge does: simulate a film, train a model, follow a virtual sensor live, and draw the results.
 
-    Takes about two minutes. Writes dataset, model and one page of pictures (mm, N, pC) into a new folder. --live only
+    Takes less than a minute. Writes dataset, model and one page of pictures (mm, N, pC) into a new folder. --live only
     follows a virtual sensor on a page for browsers, with the released model; it trains and writes nothing.
     --playground only writes one HTML file, which needs no server and no other file.
 

@@ -42,7 +42,7 @@ SEED = 0
 RATE_HZ = 200.0
 """Frames per second of the virtual sensor, Hz."""
 
-LIVE_S = 20.0
+LIVE_S = 10.0
 """Duration of the live part, s."""
 
 PRINT_INTERVAL_S = 0.5
@@ -62,7 +62,7 @@ LATENCY_S = 0.5
 
 
 class FollowedPress(NamedTuple):
-    """Frame of the live part during a press of the virtual sensor that the model reports.
+    """Frame of the live part in which both the virtual sensor and the model have a contact.
 
     Attributes:
         number: Number of the press, from 1.
@@ -91,13 +91,14 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
     settings = load_config(config) if config else None
     folder = output or _free_name(Path("demo-output"))
     sensor = load_sensor(sensor_name or DEFAULT_SENSOR)
+    probe = Circle(1.0)
     sweep = Sweep(played_radius_mm(sensor.name), samples=SAMPLES, seed=SEED)
     durations_s: dict[str, float] = {}
     with new_folder(folder) as draft:
         with _step(
             "simulate", f"{sensor.name}, circle of 1 mm, 0.05 to 2 N, within {sweep.radius:.3g} mm", durations_s
         ):
-            (forward_map,) = solve_maps(sensor, (Circle(1.0),), sweep)
+            (forward_map,) = solve_maps(sensor, (probe,), sweep)  # one map for each probe
             dataset = read_dataset(write_sweep(draft / "presses", (forward_map,), sweep))
             say(
                 f"   {len(dataset.samples)} presses interpolated from {forward_map.solves} solves, relative error "
@@ -139,7 +140,7 @@ def _step(name: str, description: str, durations_s: dict[str, float]) -> Iterato
 
 
 def _free_name(base: Path) -> Path:
-    """Return `base`, or the first of base-2, base-3, ... that does not exist."""
+    """Return `base`, or the first of the paths base-2, base-3 and so on that does not exist."""
     numbered = (base.with_name(f"{base.name}-{number}") for number in count(2))
     return next(path for path in chain([base], numbered) if not path.exists())
 
@@ -167,9 +168,11 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
         all_records = (record for chunk in port for record in touch.feed(chunk))
         records = islice(all_records, frame_count)
         for frame_number, record in enumerate(track(records, "following", frame_count), start=1):
-            truth = sensor.truth(record.seq or 0)
+            truth = sensor.truth(record.seq or 0)  # what the virtual sensor played in this frame
             true_contact = (truth.x_mm, truth.y_mm, truth.force_N)
             contact = _contact_of(record)
+
+            # A press lasts as long as both the virtual sensor and the model have a contact.
             was_pressed = is_pressed
             is_pressed = record.contact and truth.force_N > 0.0
             if is_pressed and not was_pressed:
@@ -198,7 +201,7 @@ def _columns(is_contact: bool, contact: tuple[float, float, float]) -> str:
 
 
 def _test_presses(forward_map: ForwardMap, predictor: Predictor, sweep: Sweep) -> Array:
-    """Estimate presses on which the model was not trained.
+    """Estimate the contacts of presses on which the model was not trained.
 
     Returns:
         True and estimated (x, y, F), shape (TEST_PRESSES, 6), mm and N.
@@ -212,7 +215,7 @@ def _test_presses(forward_map: ForwardMap, predictor: Predictor, sweep: Sweep) -
 def _position_error(presses: Array) -> Array:
     """Compute the distances between true and estimated positions, mm.
 
-    Each row ends with the true and the estimated contact, (x, y, F).
+    Each row ends with the true contact (x, y, F), followed by the estimated contact.
     """
     return position_error(presses[:, -3:], presses[:, -6:-3])
 
@@ -232,13 +235,17 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], mode
         durations_s: Duration of each step, s.
         model_folder: Folder of the model in the folder of the results.
     """
-    errors = ContactErrorStatistics.of(tested[:, 3:], tested[:, :3])
+    true_contact, estimated_contact = np.split(tested, 2, axis=1)  # each of shape (m, 3)
+    errors = ContactErrorStatistics.of(estimated_contact, true_contact)
+
+    # Measure the latency of one kind of call, the prediction of a single press from a list of charges.
     model = load_model(find_model(str(model_folder)))
     predictor = Predictor(model.folder)
     charges = press_charges(predictor, model.golden.charge_pC)
     contenders = in_process_contenders(predictor, charges)
     one_press_as_list = contenders[1]
     (latency,) = take_turns([one_press_as_list], LATENCY_S)
+
     size_KiB = (model.folder / "model.onnx").stat().st_size / 1024
     rows = [
         ("position error, with noise", _position_words(tested)),
@@ -265,12 +272,15 @@ def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array
     electrode_count = len(forward_map.electrodes)
     figure = new_figure(15.0, 9.2)
     top, bottom = cast(np.ndarray, figure.subfigures(2, 1))
+
+    # Upper row: the film under one press, a section through it, and the paths of the live part.
     left, middle, right = top.subplots(1, 3)
     draw_deflection(left, equilibrium)
     draw_electrodes(left, forward_map.sensor, names=False)
     draw_section(middle, equilibrium)
     _draw_live_paths(right, forward_map, followed)
 
+    # Lower row: a map of the charge of each electrode, and the errors of the test presses, which get more width.
     width_ratios = [1.0] * electrode_count + [1.25]
     *map_axes, error_axes = bottom.subplots(1, electrode_count + 1, width_ratios=width_ratios)
     for electrode_index, (axes, name) in enumerate(zip(map_axes, forward_map.electrodes, strict=True)):
@@ -291,13 +301,13 @@ def _draw_live_paths(axes: Any, forward_map: ForwardMap, followed: Array) -> Non
         forward_map: Forward map of the film, whose layout is drawn.
         followed: Frames of the live part, columns as in `FollowedPress`, shape (n, 7), mm and N.
     """
-    press_number = followed[:, 0]
-    true_xy = followed[:, 1:3]
-    estimated_xy = followed[:, 4:6]
-    for number in np.unique(press_number):
-        frames = press_number == number
-        axes.plot(*true_xy[frames].T, color=PRESSED, lw=3.0, solid_capstyle="round")
-        axes.plot(*estimated_xy[frames].T, color=FELT, lw=0.7)
+    column = dict(zip(FollowedPress._fields, followed.T, strict=True))
+    for press_number in np.unique(column["number"]):
+        in_press = column["number"] == press_number  # the frames of this press
+        true_path = (column["true_x_mm"][in_press], column["true_y_mm"][in_press])
+        estimated_path = (column["x_mm"][in_press], column["y_mm"][in_press])
+        axes.plot(*true_path, color=PRESSED, lw=3.0, solid_capstyle="round")
+        axes.plot(*estimated_path, color=FELT, lw=0.7)
 
     # The legend contains only the two lines of the first press.
     true_line, estimated_line = axes.lines[:2]
@@ -316,8 +326,10 @@ def _draw_error_against_force(axes: Any, force: Array, error: Array) -> None:
         error: Position errors of the presses, shape (n,), mm.
     """
     axes.loglog(force, error, ".", color=PRESSED, ms=2, alpha=0.5)
+
+    # The percentiles are computed in 12 ranges of force, which have the same width on the logarithmic axis.
     bin_edges = np.geomspace(force.min(), force.max(), 13)
-    bin_centres = np.sqrt(bin_edges[:-1] * bin_edges[1:])
+    bin_centres = np.sqrt(bin_edges[:-1] * bin_edges[1:])  # geometric means of neighbouring edges
     for percentile, style, label in ((50, "-", "median"), (95, "--", "95 %")):
         errors = binned_statistic(force, error, partial(np.percentile, q=percentile), bin_edges).statistic
         axes.plot(bin_centres, errors, style, color=FELT, label=label)

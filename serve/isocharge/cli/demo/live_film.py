@@ -3,7 +3,7 @@
 from contextlib import ExitStack, closing
 
 from isocharge.cli.demo.played_area import DEFAULT_SENSOR, played_radius_mm
-from isocharge.cli.shared.live_page import PageFeed, answering, live_page
+from isocharge.cli.shared.live_page import PageFeed, RecordingHeader, answering, live_page
 from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE
@@ -42,7 +42,9 @@ def show_live_film(address: Address, seconds: float | None, sensor_name: str | N
             forward_map = ForwardMap.build(load_sensor(sensor), Circle(1.0), radius_mm, DEFAULT_PLAYED_FORCE_RANGE)
         board = stack.enter_context(virtual_sensor(forward_map, "reference", SEED, RATE_HZ))
         port = stack.enter_context(Port(board.url))
-        stack.enter_context(answering(link, live, ("every", {}, "")))
+        # A recording that the page begins has every frame, and neither a device file nor a name of the film.
+        header = RecordingHeader(policy="every", device={}, name="")
+        stack.enter_context(answering(link, live, header))
         say("Ctrl-C stops")
         feed = PageFeed(link, touch, live)
         for record in stack.enter_context(closing(live.follow(port))):

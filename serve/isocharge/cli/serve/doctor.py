@@ -129,7 +129,7 @@ def doctor_command(
     )
     if not json:
         show("\n".join(report_lines(examination)))
-    if metadata and unnoticed and not json:
+    if metadata and unnoticed and examination.good and not json:
         show(f"{metadata.label}: {unnoticed.summary}")
     found_channels = None
     if check_wiring and examination.good and not examination.touch:
@@ -180,7 +180,8 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
 def port_lines() -> Iterator[str]:
     """Yield a line for each serial port of this machine.
 
-    The line describes the port and the frames received within one second.
+    The line names the port, and describes the frames that the port received within one second. If there were no intact
+    frames, the line contains the first missing setting. If the port cannot be read, the line contains the error.
     """
     for port in sorted(list_ports.comports()):
         try:
@@ -188,9 +189,12 @@ def port_lines() -> Iterator[str]:
         except IsochargeError as error:
             yield f"{port.device} ({port.description}): {error}"
             continue
-        received = examination.missing[0] if examination.missing else "nothing is missing"
         if examination.good:
             received = f"{examination.format}, {examination.rate_Hz:.0f} frames/s at {examination.baud} baud"
+        elif examination.missing:
+            received = examination.missing[0]
+        else:
+            received = "nothing is missing"
         yield f"{port.device} ({port.description}): {received}"
 
 
@@ -223,7 +227,12 @@ def _setting(key: str, text: str) -> Any:
 
 
 def _request(text: str | None, rate_Hz: float) -> Request | None:
-    """Convert the text of `--request` to bytes. The text may contain escape sequences.
+    r"""Convert the text of `--request` to a request of bytes that is sent to the board for each frame.
+
+    Args:
+        text: Value of the option, None if it is not given. Escape sequences such as `\n` and `\x01` stand for one
+            byte each.
+        rate_Hz: Number of requests per second, Hz.
 
     Raises:
         InputError: If the text is empty, or an escape sequence is wrong.
@@ -231,7 +240,10 @@ def _request(text: str | None, rate_Hz: float) -> Request | None:
     if text is None:
         return None
     try:
-        data = text.encode("latin-1", "backslashreplace").decode("unicode_escape").encode("latin-1")
+        # `unicode_escape` decodes bytes of Latin-1. Characters outside of Latin-1 become escape sequences before, and
+        # the last step then refuses them, because they do not fit into one byte.
+        escaped = text.encode("latin-1", "backslashreplace")
+        data = escaped.decode("unicode_escape").encode("latin-1")
     except (UnicodeDecodeError, UnicodeEncodeError) as error:
         raise InputError(rf"--request: expected a text like '?\n' or '\x01\x04', got {text!r}") from error
     if not data:
@@ -289,6 +301,10 @@ def report_lines(examination: Examination) -> Iterator[str]:
         yield examination.held
     yield "missing to get a touch:" if examination.missing else "missing to get a touch: nothing"
     for sentence in examination.missing:
+        yield f"- {sentence}"
+    if examination.missing_for_held_presses:
+        yield "missing for held presses:"
+    for sentence in examination.missing_for_held_presses:
         yield f"- {sentence}"
 
 

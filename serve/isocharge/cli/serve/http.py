@@ -75,7 +75,9 @@ def http_command(
     """
     token = given_token(token)
     address = Address(host, port, uds)
-    check_exposure(address if grpc_port is None else Address(host), has_token=token is not None)
+    # The gRPC server listens on the host even if the HTTP server listens on a Unix socket.
+    most_exposed_address = address if grpc_port is None else Address(host)
+    check_exposure(most_exposed_address, has_token=token is not None)
     tls = given_tls(tls_cert, tls_key)
     secret = None if token is None else Token(token)
     browser_check = BrowserCheck(host, allow_host or (), any_host=secret is not None or uds is not None)
@@ -96,7 +98,10 @@ def http_command(
 
 @contextmanager
 def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
-    """Yield the counters of the servers. If the log is JSON, a thread writes it to stderr while the context is open.
+    """Yield the traffic counters of the servers, which write the log of requests if `--log json` is given.
+
+    A separate thread writes the log to stderr while the context is open, so that a slow reader of stderr does not delay
+    the answers. Warnings of all packages are written to the same log.
 
     Args:
         log: Value of `--log`.
@@ -110,7 +115,7 @@ def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
         logging.basicConfig(level=logging.WARNING, handlers=[request_log], force=True)
         logging.captureWarnings(True)
         traffic = Traffic(request_log)
-        traffic.lost_lines = lambda: lines.lost
+        traffic.lost_lines = lambda: lines.lost  # number of lines that the queue had to discard, for the metrics
         yield traffic
 
 

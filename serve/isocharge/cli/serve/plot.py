@@ -78,6 +78,8 @@ def plot_command(
     recording = Recording(file)
     with shown_progress():
         traces = traces_of(recording.records(PlottedRecord), str(file))
+
+    # Read the description of the film. The picture is drawn without what cannot be read.
     sensor = None
     working_area = None
     try:
@@ -86,6 +88,7 @@ def plot_command(
         working_area = np.array(metadata.working_area_mm)
         sensor = sensor_from_dict(metadata.sensor, metadata.label)
     except InputError as error:
+        # If the working area is known, only the description of the electrodes was wrong.
         omitted = "the film, whose model is not available" if working_area is None else "electrodes"
         say(f"drawn without {omitted}: {error}")
     title = f"{file.name}, {recording.model}"
@@ -105,7 +108,9 @@ PlottedRecord = defstruct(
 
 
 def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
-    """Return the columns of records.
+    """Convert records to one array for each column.
+
+    The electrodes are those of the first record.
 
     Args:
         records: The n records.
@@ -124,15 +129,20 @@ def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
     electrodes = tuple(first.charge_raw_pC or ())
 
     def row(record: Any) -> tuple[Any, ...]:
-        """Return the values of a record in the order of `names`."""
+        """Return the values of a record: its numbers, the charge of each electrode, and whether each flag is set.
+
+        Missing values are None.
+        """
         numbers = [getattr(record, name) for name in NUMBERS]
-        charges = record.charge_pC or {}
-        charge_pC = [charges.get(name) for name in electrodes]
+        charge_of_electrode = record.charge_pC or {}
+        charge_pC = [charge_of_electrode.get(name) for name in electrodes]
         flags = [word in record.flags for word in MEANINGS]
         return (*numbers, *charge_pC, *flags)
 
     names = [*NUMBERS, *(f"charge_pC.{name}" for name in electrodes), *MEANINGS]
-    rows = np.fromiter(map(row, chain([first], records)), np.dtype((float, len(names))))
+    all_records = chain([first], records)
+    row_type = np.dtype((float, len(names)))  # None in a row becomes NaN
+    rows = np.fromiter(map(row, all_records), row_type)  # shape (n, n_column)
     columns = dict(zip(names, rows.T, strict=True))
     return {name: column for name, column in columns.items() if name not in MEANINGS or column.any()}
 
@@ -154,11 +164,16 @@ class _Groups(NamedTuple):
 
     @classmethod
     def of(cls, time_s: Array, unit_s: float) -> "_Groups":
-        """Group records.
+        """Divide consecutive records into at most `MAX_GROUPS` groups of equal size, and find the gaps between them.
+
+        A gap is a pause before a group that is much longer than the usual time between the starts of two groups.
 
         Args:
             time_s: Times since the first record, shape (n,), s.
             unit_s: Length of the unit of the time axis, s.
+
+        Returns:
+            The groups, with times in the unit of the time axis.
         """
         group_size = math.ceil(len(time_s) / MAX_GROUPS)
         start = np.arange(0, len(time_s), group_size)  # first record of each group
@@ -197,13 +212,16 @@ def recording_picture(
     start_s = traces["timestamp"][0]
     time_s = traces["timestamp"] - start_s
     duration_s = time_s[-1]
+    # The longest unit of time that suits the duration of the recording
     unit_s, unit = next((unit_s, unit) for min_duration_s, unit_s, unit in TIME_UNITS if duration_s >= min_duration_s)
     groups = _Groups.of(time_s, unit_s)
     flag_words = [word for word in MEANINGS if word in traces]
 
+    # Right half: position, force, charges and flags over time, one above the other
     figure = new_figure(15.0, 8.6)
     film_figure, time_figure = cast(np.ndarray, figure.subfigures(1, 2, width_ratios=(1.0, 1.35)))
-    heights = (1.0, 0.8, 1.0, 0.09 * max(1, len(flag_words)) + 0.05)
+    flag_height = 0.09 * max(1, len(flag_words)) + 0.05  # grows with the number of rows of flags
+    heights = (1.0, 0.8, 1.0, flag_height)
     position_axes, force_axes, charge_axes, flag_axes = time_figure.subplots(4, 1, sharex=True, height_ratios=heights)
     _draw_with_std(position_axes, groups, traces, "x_mm", COLOURS[0])
     _draw_with_std(position_axes, groups, traces, "y_mm", COLOURS[1])
@@ -216,6 +234,7 @@ def recording_picture(
     flag_axes.set_xlabel(f"time since {datetime.fromtimestamp(start_s, UTC):%Y-%m-%d %H:%M:%S} UTC, {unit}")
     figure.suptitle(f"{title}: {len(time_s)} records in {duration_s / unit_s:.4g} {unit}")
 
+    # Left half: the path of the contacts on the film
     film_axes = film_figure.subplots()
     if working_area is not None:
         film_axes.add_patch(Polygon(working_area, fill=False, ls=":", ec=INK, lw=1.2))
@@ -254,15 +273,17 @@ def _draw_flags(axes: Any, groups: _Groups, traces: dict[str, Array], words: lis
     """
     min_length = 2e-3 * max(float(groups.end_time[-1]), 1e-9)
     lengths = np.maximum(groups.end_time - groups.start_time, min_length)
-    for height, word in enumerate(words):
+    for row_height, word in enumerate(words):
+        # The flag of a group is set if the flag is set in one of its records.
         is_set = np.maximum.reduceat(traces[word], groups.start) > 0.0
-        bars = np.column_stack([groups.start_time[is_set], lengths[is_set]])
-        axes.broken_barh(bars, (height - 0.35, 0.7), color=INK)
+        starts_and_lengths = np.column_stack([groups.start_time[is_set], lengths[is_set]])
+        bottom_and_height = (row_height - 0.35, 0.7)
+        axes.broken_barh(starts_and_lengths, bottom_and_height, color=INK)
     axes.set(yticks=range(len(words)), yticklabels=words)
 
 
 def _label_axes(axes: Any, label: str) -> None:
-    """Add a label, a grid and, if a line of the axes has a label, a legend.
+    """Add a label and a grid, and also a legend if a line of the axes has a label.
 
     Args:
         axes: Axes of matplotlib.
@@ -287,9 +308,11 @@ def _draw_path(axes: Any, traces: dict[str, Array], time: Array, time_label: str
         time_label: Label of the scale of colours.
     """
     position_mm = np.column_stack([traces["x_mm"], traces["y_mm"]])
-    contacts = _every_nth(np.flatnonzero(~np.isnan(position_mm[:, 0])), MAX_POINTS)
+    has_position = ~np.isnan(position_mm[:, 0])
+    contacts = _every_nth(np.flatnonzero(has_position), MAX_POINTS)  # numbers of the records that are drawn as dots
     if len(contacts):
-        axes.plot(*_every_nth(position_mm, MAX_POINTS).T, color=INK, lw=0.5, alpha=0.5)  # NaN separates the presses
+        line_x, line_y = _every_nth(position_mm, MAX_POINTS).T
+        axes.plot(line_x, line_y, color=INK, lw=0.5, alpha=0.5)  # NaN separates the presses
         _draw_contacts(axes, traces, position_mm, contacts, time, time_label)
     else:
         axes.text(0.5, 0.5, "nothing touched the film", transform=axes.transAxes, ha="center", color=INK)
@@ -319,6 +342,7 @@ def _draw_contacts(
     dots = axes.scatter(*position_mm[contacts].T, c=time[contacts], s=size, lw=0.0, alpha=0.8, zorder=4)
     axes.figure.colorbar(dots, ax=axes, shrink=0.6, label=time_label, location="bottom", pad=0.02)
 
+    # An ellipse extends two standard deviations to each side, and is therefore four standard deviations wide.
     with_ellipse = _every_nth(contacts, MAX_ELLIPSES)
     width_mm = 4.0 * traces["x_std_mm"][with_ellipse]
     height_mm = 4.0 * traces["y_std_mm"][with_ellipse]
@@ -326,7 +350,7 @@ def _draw_contacts(
         EllipseCollection(
             width_mm,
             height_mm,
-            np.zeros(len(with_ellipse)),
+            angles=np.zeros(len(with_ellipse)),
             units="xy",
             offsets=position_mm[with_ellipse],
             offset_transform=axes.transData,
@@ -338,6 +362,7 @@ def _draw_contacts(
         )
     )
 
+    # Crosses mark the contacts with at least one of the flags.
     is_doubtful = np.zeros(len(contacts), dtype=bool)
     for word in DOUBTFUL_FLAGS:
         if word in traces:

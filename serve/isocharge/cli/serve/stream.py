@@ -23,6 +23,7 @@ from isocharge.cli.serve.records import (
 from isocharge.cli.shared.live_page import (
     LiveOption,
     PageFeed,
+    RecordingHeader,
     TlsCertOption,
     TlsKeyOption,
     TokenOption,
@@ -146,7 +147,8 @@ def stream_command(
     The first 100 frames (0.5 s at 200 Hz) are the tare, the charges at rest: leave the film alone meanwhile. The signal
     SIGUSR1 starts a new tare; SIGUSR2 goes back to the film as it was calibrated; SIGHUP takes the latest version of
     MODEL, without losing a frame. Ctrl-C stops. If the reader of stdout is too slow for a sensor, the oldest lines are
-    dropped and counted in the summary; a recording (--record) is complete.
+    dropped and counted in the summary; a recording (--record) is complete. Exit code 1 if no frames are recognised
+    within --seconds.
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
@@ -177,11 +179,11 @@ def stream_command(
         stack.enter_context(on_signal(signal.SIGUSR2, recorded.request_film_reset))
         renew = partial(recorded.request_model, partial(_load, model, models))
         stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(renew)))
-        stack.enter_context(stop_after(seconds))
+        timer = stack.enter_context(stop_after(seconds))
         outputs = stack.enter_context(outputs_of(output, path, is_live=source.is_live))
         writers: list[RecordWriter] = [outputs.write]
         if page is not None:
-            header = None if recorder else (policy.value, board.table, name)
+            header = None if recorder else RecordingHeader(policy.value, board.table, name)
             stack.enter_context(answering(page, recorded, header))
             feed = PageFeed(page, path, recorded)
             writers.append(feed.write)
@@ -196,11 +198,13 @@ def stream_command(
             if source.is_live:
                 outputs.close()
             say(summary(path, latencies))
-    if path.totals().frames == 0:
+    has_no_frames = path.totals().frames == 0
+    if has_no_frames:
         say(f"no frames were recognised; {no_frames_hint(port, device)}")
     say_missing_records(outputs)
     is_recording_incomplete = recorder is not None and recorder.failed
-    if is_recording_incomplete or outputs.has_incomplete_file:
+    is_without_result = has_no_frames and timer.has_expired
+    if is_recording_incomplete or outputs.has_incomplete_file or is_without_result:
         raise typer.Exit(1)
 
 

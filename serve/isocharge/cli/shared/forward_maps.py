@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 from isocharge.cli.shared.options import parse_radius_mm, worker_count
 from isocharge.cli.shared.terminal import say, shown_progress
-from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
+from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.resumable_run import draft_of
 from isocharge.simulate import (
@@ -104,7 +104,11 @@ def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit:
 
 
 N_SIMULATED_PRESSES = 24_000
-"""Number of presses that `simulated_presses` returns."""
+"""Number of presses that `simulated_presses` returns for a sensor with at most `FEW_ELECTRODES` electrodes."""
+
+MANY_SIMULATED_PRESSES = 96_000
+"""Number of presses for a sensor with more electrodes, whose working area is larger. Networks that are
+trained on fewer presses have larger errors near the rim of this area."""
 
 
 def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, force: tuple[float, float]) -> Dataset:
@@ -119,5 +123,6 @@ def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, fo
         force: Smallest and largest force, N.
     """
     with TemporaryDirectory() as folder:
-        sweep = Sweep(radius, force, samples=N_SIMULATED_PRESSES)
+        n_press = N_SIMULATED_PRESSES if len(sensor.electrodes) <= FEW_ELECTRODES else MANY_SIMULATED_PRESSES
+        sweep = Sweep(radius, force, samples=n_press)
         return read_dataset(run_sweep(Path(folder) / "presses", sensor, probes, sweep))

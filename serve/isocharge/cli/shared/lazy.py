@@ -1,6 +1,6 @@
 """Groups of commands whose modules are imported only when a command is called.
 
-Therefore the help of a group is printed without importing its commands.
+The help of a group is therefore printed without importing its commands.
 """
 
 from collections.abc import Mapping
@@ -45,7 +45,7 @@ def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer
 
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
-            for name, command in commands.items():
+            for name, command in commands.items():  # placeholders, which only have the summaries
                 self.add_command(TyperCommand(name, help=command.summary, short_help=command.summary))
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -74,8 +74,9 @@ def load_command(command: LazyCommand) -> TyperCommand:
     module, _, function = command.function_path.partition(":")
     with require(command.extra) if command.extra else nullcontext():
         command_function = getattr(import_module(module), function)
+    # Typer makes a command only from an app. An app with a single function becomes one command without subcommands.
     single_command_app = typer.Typer(add_completion=False, rich_markup_mode=None)
     single_command_app.command(cls=OptionalValueCommand)(command_function)
     typer_command = typer.main.get_command(single_command_app)
-    typer_command.name = None
+    typer_command.name = None  # the group that contains the command names it
     return typer_command  # type: ignore[return-value]

@@ -6,10 +6,10 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from msgspec import structs
@@ -46,6 +46,21 @@ MAX_PORT = 65535
 
 STATE_INTERVAL_S = 0.25
 """Time between two messages with the counters, s."""
+
+
+class RecordingHeader(NamedTuple):
+    """Content of the header of a recording that the page begins; see `Recorder`.
+
+    Attributes:
+        policy: Which frames have a record; a `Policy`.
+        device: Content of the device file.
+        name: Name of the film in the records; None or empty for the name of the sensor of the model.
+    """
+
+    policy: str
+    device: Mapping[str, Any]
+    name: str | None
+
 
 LiveOption = Annotated[
     str | None,
@@ -112,7 +127,7 @@ def given_token(token: str | None) -> str | None:
     """Return the token that the option or the environment contains.
 
     If the environment contains an empty token, the function returns an empty text. Typer alone would treat an empty
-    token as a missing one.
+    token as a missing token.
     """
     return os.environ.get("ISOCHARGE_TOKEN") if token is None else token
 
@@ -130,11 +145,13 @@ def page_address(live: str, token: str | None) -> Address:
     host, colon, port = live.rpartition(":")
     if not colon:
         host = LOOPBACK
+    # The length is checked before the conversion, because `int` refuses very long texts.
     is_short_number = port.isascii() and port.isdecimal() and len(port) <= len(str(MAX_PORT))
     is_port = is_short_number and int(port) <= MAX_PORT
     if not (host and is_port):
         raise InputError(f"--live: expected PORT or HOST:PORT, as 8001 or {DEFAULT_LIVE_ADDRESS}, got {shown(live)}")
-    address = Address(host.removeprefix("[").removesuffix("]"), int(port))
+    bare_host = host.removeprefix("[").removesuffix("]")  # IPv6 addresses are written in brackets
+    address = Address(bare_host, int(port))
     check_exposure(address, has_token=given_token(token) is not None)
     return address
 
@@ -172,9 +189,11 @@ def live_page(
         from isocharge.serve.viewer.process import Page, page_process
 
     description = describe_film(name, metadata, find_field(model, metadata))
-    reader, end = make_link()
-    page = Page(end, description, address, given_token(token), is_recording, tls)
-    with closing(reader), page_process(page) as url, closing(reader):  # the page's process ends when its reader closes
+    reader, page_end = make_link()
+    page = Page(page_end, description, address, given_token(token), is_recording, tls)
+    # The process of the page ends when the reader's end is closed. This end is therefore closed before the code waits
+    # for the process, and also if the process cannot be started. Closing twice is harmless.
+    with closing(reader), page_process(page) as url, closing(reader):
         if is_recording:
             reader.enable_waiting()
         say(f"{'replay' if is_recording else 'live'} page: {url}")
@@ -182,16 +201,16 @@ def live_page(
 
 
 class PageFeed:
-    """Sender of the records of a stream to its live page. The counters of the stream are sent a few times per second.
-
-    Args:
-        link: The reader's end of the link to the page.
-        touch: The stream.
-        live: The stream with its recording; None for a replay.
-    """
+    """Sends the records of a stream to its live page, and the counters of the stream a few times per second."""
 
     def __init__(self, link: ReaderEnd, touch: TouchStream, live: RecordedStream | None = None) -> None:
-        """Initialise without records. The class docstring describes the arguments."""
+        """Initialise without records.
+
+        Args:
+            link: The reader's end of the link to the page.
+            touch: The stream.
+            live: The stream with its recording; None for a replay.
+        """
         self._link = link
         self._touch = touch
         self._live = live
@@ -200,7 +219,10 @@ class PageFeed:
         self._timestamps_s: deque[float] = deque(maxlen=RATE_RECORDS)
 
     def write(self, record: PredictionRecord) -> None:
-        """Send a record without waiting for the page."""
+        """Send a record without waiting for the page, and from time to time also the state of the stream.
+
+        If the process of the page has ended, a message is printed once, and the stream continues.
+        """
         was_open = self._link.is_open
         self._link.send_sample(self._pack(record))
         self._timestamps_s.append(math.nan if record.timestamp is None else record.timestamp)
@@ -233,14 +255,15 @@ class PageFeed:
 
 
 @contextmanager
-def answering(link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str | None] | None) -> Iterator[None]:
-    """Carry out the requests of the page during the block, and show warnings of the live path on the page.
+def answering(link: ReaderEnd, live: RecordedStream, header: RecordingHeader | None) -> Iterator[None]:
+    """Carry out the requests of the page during the block, and show warnings of the package `serve` on the page.
+
+    A thread waits for the requests and carries them out.
 
     Args:
         link: The reader's end of the link to the page.
         live: The stream.
-        header: Policy, device table and name of the film, for recordings that the page begins. None refuses such
-            requests.
+        header: Header of the recordings that the page begins. None refuses requests for recordings.
     """
 
     def answer_requests() -> None:
@@ -262,17 +285,14 @@ def answering(link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str
         logger.removeHandler(handler)
 
 
-def _carry_out(
-    request: LiveRequest, link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str | None] | None
-) -> None:
-    """Carry out one request of the page.
+def _carry_out(request: LiveRequest, link: ReaderEnd, live: RecordedStream, header: RecordingHeader | None) -> None:
+    """Carry out one request of the page: write a marker, begin or end a recording, tare, or reset the film.
 
     Args:
         request: The request.
         link: The reader's end of the link to the page.
         live: The stream.
-        header: Policy, device table and name of the film, for recordings that the page begins; None if the command
-            itself records the stream.
+        header: Header of the recordings that the page begins; None if the command itself records the stream.
 
     Raises:
         InputError: If the page requests a recording while the command records the stream.

@@ -114,7 +114,7 @@ def refuse(mistakes: Mapping[str, object]) -> None:
 def worker_count(workers: int | None) -> int:
     """Return the value of `--workers`.
 
-    Without the option, return the number of processor cores, but not more than 64.
+    Without the option, return the number of processor cores, at most 64.
     """
     from isocharge.simulate.execution.workers import cores
 

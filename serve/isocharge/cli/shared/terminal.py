@@ -2,7 +2,7 @@
 
 All text that a command prints passes through this module, which escapes the characters that a terminal executes or
 hides. Messages are printed on stderr. Progress bars are only shown if stderr is a terminal. If a standard stream is
-closed, full or slow, the command does not fail, and its text does not reach another file.
+closed, full or slow, the command does not fail, and its text is not written into another file.
 """
 
 import io
@@ -24,9 +24,21 @@ from isocharge.common.errors import OutputError
 from isocharge.common.printable_text import printable, printable_lines
 from isocharge.common.progress import Listener, listening
 
+STDIN_DESCRIPTOR = 0
+"""File descriptor of the standard input of a process."""
+
+STDOUT_DESCRIPTOR = 1
+"""File descriptor of the standard output of a process."""
+
+STDERR_DESCRIPTOR = 2
+"""File descriptor of the standard error of a process."""
+
+STANDARD_DESCRIPTORS = (STDIN_DESCRIPTOR, STDOUT_DESCRIPTOR, STDERR_DESCRIPTOR)
+"""File descriptors of the three standard streams, in increasing order."""
+
 
 class ClosedOutput(io.TextIOBase):
-    """Replacement of a stdout that was closed when the command started."""
+    """Stream that replaces stdout if stdout was closed when the command started."""
 
     def write(self, _: str, /) -> int:
         """Refuse to write.
@@ -43,28 +55,31 @@ def open_closed_streams() -> None:
     Without this replacement, the next file that is opened would get the file descriptor of stdout, and printed text
     would be written into that file.
     """
-    for descriptor in (0, 1, 2):
+    # Open the null device on each file descriptor that is closed.
+    for descriptor in STANDARD_DESCRIPTORS:
         try:
             os.fstat(descriptor)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # gets the lowest free file descriptor, which is `descriptor`
+
+    # Python sets the stream object to None if its file descriptor was closed when the interpreter started.
     if sys.stdin is None:
-        sys.stdin = open(0, closefd=False)  # noqa: SIM115
+        sys.stdin = open(STDIN_DESCRIPTOR, closefd=False)  # noqa: SIM115
     if sys.stdout is None:
         sys.stdout = ClosedOutput()
     if sys.stderr is None:
-        sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
+        sys.stderr = open(STDERR_DESCRIPTOR, "w", closefd=False)  # noqa: SIM115
 
 
-def discard_output(number: int) -> None:
+def discard_output(descriptor: int) -> None:
     """Redirect a standard stream to the null device. Otherwise Python would fail when it flushes the stream at exit.
 
     Args:
-        number: File descriptor of the stream.
+        descriptor: File descriptor of the stream.
     """
     with suppress(OSError):
         null_device = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null_device, number)
+        os.dup2(null_device, descriptor)
         os.close(null_device)
 
 
@@ -88,7 +103,7 @@ def announce(line: str) -> None:
     try:
         print(printable(line), flush=True)
     except OSError:
-        discard_output(1)
+        discard_output(STDOUT_DESCRIPTOR)
 
 
 def stdout_writer() -> Callable[[str], None]:
@@ -106,9 +121,9 @@ def stdout_writer() -> Callable[[str], None]:
 def write_stderr(line: str) -> None:
     """Write a line to stderr at once. The command continues if stderr is full or closed."""
     try:
-        _write_all(2, f"{printable(line)}\n".encode())
+        _write_all(STDERR_DESCRIPTOR, f"{printable(line)}\n".encode())
     except OSError:
-        discard_output(2)
+        discard_output(STDERR_DESCRIPTOR)
 
 
 def stdout_is_ready() -> bool:
@@ -137,40 +152,75 @@ def _write_all(descriptor: int, data: bytes) -> None:
 
 @contextmanager
 def until_stopped() -> Iterator[None]:
-    """Leave the block without an error after Ctrl-C, after SIGTERM, or if the reader of stdout closes it."""
+    """Run the block until it ends, or until the command is asked to stop, which is not an error.
+
+    Three events stop the block: Ctrl-C, the signal SIGTERM, and a reader of stdout that closes its end of the pipe.
+    """
+    # Without a handler, SIGTERM would end the process at once. This handler raises KeyboardInterrupt, as Ctrl-C does,
+    # so that the block can close its files and ports.
     previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     except KeyboardInterrupt:
         pass
-    except BrokenPipeError:
-        discard_output(1)
+    except BrokenPipeError:  # no program reads stdout any more
+        discard_output(STDOUT_DESCRIPTOR)
     finally:
         signal.signal(signal.SIGTERM, previous_handler)
 
 
+MIN_TIMER_S = 1e-3
+"""Shortest time of the timer of `stop_after`, s. A time of 0 would switch the timer off."""
+
+
+class StopTimer:
+    """Timer of `stop_after`.
+
+    Attributes:
+        has_expired: Whether the timer, and not Ctrl-C, has interrupted the block.
+    """
+
+    def __init__(self) -> None:
+        self.has_expired = False
+
+    def interrupt(self, *_: object) -> None:
+        """Interrupt the block. This is the handler of the signal SIGALRM.
+
+        Raises:
+            KeyboardInterrupt: Always.
+        """
+        self.has_expired = True
+        raise KeyboardInterrupt
+
+
 @contextmanager
-def stop_after(seconds: float | None) -> Iterator[None]:
+def stop_after(seconds: float | None) -> Iterator[StopTimer]:
     """Interrupt the block after the given time in the same way as Ctrl-C, even while the command waits for a port.
+
+    A timer of the system sends the signal SIGALRM, whose handler raises KeyboardInterrupt.
 
     Args:
         seconds: Time, s; None for no limit.
+
+    Yields:
+        The timer.
     """
+    timer = StopTimer()
     if seconds is None:
-        yield
+        yield timer
         return
-    previous_handler = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
+    previous_handler = signal.signal(signal.SIGALRM, timer.interrupt)
+    signal.setitimer(signal.ITIMER_REAL, max(seconds, MIN_TIMER_S))
     try:
-        yield
+        yield timer
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)  # 0 stops the timer
         signal.signal(signal.SIGALRM, previous_handler)
 
 
 @contextmanager
 def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[None]:
-    """Call `act` whenever a signal arrives during the block."""
+    """Call the function `act` whenever a signal arrives during the block."""
     previous_handler = signal.signal(number, lambda *_: act())
     try:
         yield
@@ -179,14 +229,16 @@ def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[Non
 
 
 def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
-    """Return a handler of the signal SIGHUP. The system also sends this signal if the terminal of the command is
-    closed.
+    """Return a handler of SIGHUP that calls `act`, or stops the command if its terminal has been closed.
+
+    The user sends SIGHUP to request the action. The system sends the same signal when the terminal is closed. The
+    handler distinguishes the two cases by the standard streams that were terminals when the command started.
 
     Args:
-        act: Function that the handler calls if the terminal is open. Otherwise the handler stops the command like
-            Ctrl-C.
+        act: Function that the handler calls while the terminal is open. If the terminal has been closed, the handler
+            raises KeyboardInterrupt instead, as Ctrl-C does.
     """
-    terminals = [descriptor for descriptor in (0, 1, 2) if os.isatty(descriptor)]
+    terminals = [descriptor for descriptor in STANDARD_DESCRIPTORS if os.isatty(descriptor)]
 
     def act_or_stop() -> None:
         """Call `act`, or stop the command if its terminal has been closed."""
@@ -210,7 +262,7 @@ def say(message: str) -> None:
     try:
         typer.echo(printable_lines(message), err=True)
     except OSError:
-        discard_output(2)
+        discard_output(STDERR_DESCRIPTOR)
 
 
 def this_command() -> str:
@@ -220,10 +272,13 @@ def this_command() -> str:
 
 @contextmanager
 def warnings_to_stderr() -> Iterator[None]:
-    """Print the warnings of all packages. Warnings of simulation and training begin with `caution:`."""
-    handler = logging.StreamHandler()
-    logger = logging.getLogger("isocharge")
+    """Print the warnings of all packages of isocharge on stderr while the context is open.
+
+    Warnings of simulation and training begin with `caution:`.
+    """
+    handler = logging.StreamHandler()  # writes to stderr
     handler.setFormatter(_WarningFormatter())
+    logger = logging.getLogger("isocharge")
     logger.addHandler(handler)
     try:
         yield
@@ -242,16 +297,16 @@ class _WarningFormatter(logging.Formatter):
 @contextmanager
 def shown_progress() -> Iterator[None]:
     """Show the progress of all work inside the block: bars on a terminal, otherwise a line every few seconds."""
-    if not sys.stderr.isatty():
+    if sys.stderr.isatty():
+        with _progress_bars() as show_bar, listening(show_bar):
+            yield
+    else:
         with listening(_ProgressLines()):
             yield
-        return
-    with _progress_bars() as bar, listening(bar):
-        yield
 
 
 class _ProgressLines:
-    """Progress as plain lines, at most one every `PROGRESS_LINE_INTERVAL_S`."""
+    """Shows progress as plain lines of text, at most one line in each `PROGRESS_LINE_INTERVAL_S`."""
 
     def __init__(self) -> None:
         self._next_line_s = time.monotonic() + PROGRESS_LINE_INTERVAL_S
@@ -264,7 +319,10 @@ class _ProgressLines:
 
 @contextmanager
 def _progress_bars() -> Iterator[Listener]:
-    """Show a bar for each title, with the remaining time."""
+    """Open a display of progress bars on stderr, and yield the function that updates the bars.
+
+    Each title has its own bar, which shows the elapsed and the remaining time.
+    """
     # The import takes 40 ms, which help and short commands need not wait for.
     from rich.console import Console
     from rich.progress import (
@@ -286,18 +344,27 @@ def _progress_bars() -> Iterator[Listener]:
         TextColumn("{task.fields[note]}", markup=False),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        rows: dict[str, TaskID] = {}
+        bar_of_title: dict[str, TaskID] = {}
 
-        def show(title: str, done: int, total: int, note: str) -> None:
-            """Show the progress of one piece of work in its own bar, which is identified by the title."""
+        def update_bar(title: str, done: int, total: int, note: str) -> None:
+            """Show that `done` of `total` steps are complete in the bar with this title; create the bar if necessary.
+
+            If fewer steps are complete than before, the work has started again, and the bar starts again, too.
+
+            Args:
+                title: Title of the work, which identifies its bar.
+                done: Number of complete steps.
+                total: Number of all steps.
+                note: Text that is shown after the bar.
+            """
             shown_title = printable(title)
             shown_note = printable(note)
-            if shown_title not in rows:
-                rows[shown_title] = bars.add_task(shown_title, total=total, note=shown_note)
-            row = rows[shown_title]
-            has_restarted = done < bars.tasks[row].completed
+            if shown_title not in bar_of_title:
+                bar_of_title[shown_title] = bars.add_task(shown_title, total=total, note=shown_note)
+            bar = bar_of_title[shown_title]
+            has_restarted = done < bars.tasks[bar].completed
             if has_restarted:
-                bars.reset(row)  # the time starts again, too
-            bars.update(row, completed=done, total=total, note=shown_note)
+                bars.reset(bar)  # the elapsed time starts again, too
+            bars.update(bar, completed=done, total=total, note=shown_note)
 
-        yield show
+        yield update_bar

@@ -1,7 +1,9 @@
 """Health of one channel of a board while the film is at rest: offset, noise, drift and hum."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,9 +48,11 @@ class ChannelHealth:
 
 
 def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz: float) -> ChannelHealth:
-    """Measure the health of a channel. A constant, a slope and the hum are fitted to its values.
+    """Measure the offset, the noise, the drift and the hum of a channel.
 
-    The function ignores NaN and values whose magnitude is larger than `LARGEST_PC`.
+    A constant, a slope and the hum at each mains frequency are fitted to the values by least squares. The noise is the
+    standard deviation of the residuals. The function ignores NaN and values whose magnitude is larger than
+    `LARGEST_PC`.
 
     Args:
         name: Name of the channel.
@@ -63,31 +67,55 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
     usable_pC = charge_pC[is_usable]
     usable_times_s = times_s[is_usable]
 
-    fitted_Hz: list[float] = []
+    hum_frequencies_Hz: list[float] = []
     if usable_times_s[-1] > SHORTEST_S:
-        fitted_Hz = [hum_Hz for hum_Hz in MAINS_HZ if rate_Hz > SAMPLES_PER_PERIOD * hum_Hz]
+        hum_frequencies_Hz = [hum_Hz for hum_Hz in MAINS_HZ if rate_Hz > SAMPLES_PER_PERIOD * hum_Hz]
+    fit = _fit_drift_and_hum(usable_pC, usable_times_s, hum_frequencies_Hz)
+    return ChannelHealth(
+        name,
+        offset_pC=float(usable_pC.mean()),
+        noise_pC=float(fit.residual_pC.std()),
+        drift_pC_per_s=fit.slope_pC_per_s,
+        hum_pC=(fit.hum_amplitudes_pC.get(50.0), fit.hum_amplitudes_pC.get(60.0)),
+        span_pC=float(np.ptp(usable_pC)),
+        unusable=unusable,
+    )
 
+
+class _DriftAndHum(NamedTuple):
+    """Straight line and sinusoidal hum that were fitted to the values of a channel.
+
+    Attributes:
+        slope_pC_per_s: Slope of the line.
+        hum_amplitudes_pC: Amplitude of the hum at each frequency, Hz.
+        residual_pC: Values minus the fit, shape (n,).
+    """
+
+    slope_pC_per_s: float
+    hum_amplitudes_pC: dict[float, float]
+    residual_pC: Array
+
+
+def _fit_drift_and_hum(charge_pC: Array, times_s: Array, hum_frequencies_Hz: Sequence[float]) -> _DriftAndHum:
+    """Fit a straight line and a hum at each frequency to the values of a channel, by linear least squares.
+
+    Args:
+        charge_pC: Values, shape (n,), pC.
+        times_s: Times of the values, shape (n,), s.
+        hum_frequencies_Hz: Frequencies of the hum, Hz; empty if only the line is fitted.
+    """
     # The columns are a constant, a slope, and a cosine and a sine for each frequency of the hum.
-    columns = [np.ones_like(usable_times_s), usable_times_s]
-    for hum_Hz in fitted_Hz:
-        phase = 2.0 * np.pi * hum_Hz * usable_times_s
+    columns = [np.ones_like(times_s), times_s]
+    for hum_Hz in hum_frequencies_Hz:
+        phase = 2.0 * np.pi * hum_Hz * times_s
         columns += [np.cos(phase), np.sin(phase)]
     design_matrix = np.column_stack(columns)
-    coefficients = np.linalg.lstsq(design_matrix, usable_pC, rcond=None)[0]
-    residual_pC = usable_pC - design_matrix @ coefficients
+    coefficients = np.linalg.lstsq(design_matrix, charge_pC, rcond=None)[0]
 
     _constant, slope_pC_per_s, *hum_coefficients = coefficients.tolist()
     cosines_pC = hum_coefficients[0::2]
     sines_pC = hum_coefficients[1::2]
     amplitudes_pC = {}
-    for hum_Hz, cosine_pC, sine_pC in zip(fitted_Hz, cosines_pC, sines_pC, strict=True):
+    for hum_Hz, cosine_pC, sine_pC in zip(hum_frequencies_Hz, cosines_pC, sines_pC, strict=True):
         amplitudes_pC[hum_Hz] = math.hypot(cosine_pC, sine_pC)
-    return ChannelHealth(
-        name,
-        offset_pC=float(usable_pC.mean()),
-        noise_pC=float(residual_pC.std()),
-        drift_pC_per_s=slope_pC_per_s,
-        hum_pC=(amplitudes_pC.get(50.0), amplitudes_pC.get(60.0)),
-        span_pC=float(np.ptp(usable_pC)),
-        unusable=unusable,
-    )
+    return _DriftAndHum(slope_pC_per_s, amplitudes_pC, charge_pC - design_matrix @ coefficients)

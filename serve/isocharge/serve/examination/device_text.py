@@ -24,8 +24,8 @@ LINES_TO_FILL_IN = {
 def device_text(examination: Examination) -> str:
     """Return the device file of a board as TOML text.
 
-    The section `[gain]` comes last. If keys of this section are not known, they are written as comments, which the user
-    completes.
+    The section `[gain]` comes last. If the channels are not in pC, the section ends with comments for the conversion to
+    pC, which the user completes.
     """
     other_sections = {key: value for key, value in examination.device.items() if key != "gain"}
     text = to_toml(other_sections, (*HEAD, *_description(examination)))

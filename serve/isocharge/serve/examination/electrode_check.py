@@ -79,13 +79,16 @@ class ElectrodeCheck:
 def _order_sentence(expected: Mapping[str, str], found: Mapping[str, str]) -> str:
     """Return a sentence that states whether the channels are swapped, turned, or in another order.
 
+    The channels are turned if each channel is connected the same number of places too far around the film.
+
     Args:
         expected: Channel of each electrode as it was assumed, by the names of the electrodes.
         found: Channel of each electrode as the presses show it, by the names of the electrodes.
     """
+    # For each electrode that was pressed, the electrode to which the answering channel was assumed to belong
     electrodes = list(expected)
-    assumed_electrode = {channel: electrode for electrode, channel in expected.items()}
-    assumed_electrodes = [assumed_electrode[found[electrode]] for electrode in electrodes]
+    electrode_of_channel = {channel: electrode for electrode, channel in expected.items()}
+    assumed_electrodes = [electrode_of_channel[found[electrode]] for electrode in electrodes]
     pairs = zip(electrodes, assumed_electrodes, strict=True)
     wrong_electrodes = [electrode for electrode, assumed in pairs if electrode != assumed]
     if not wrong_electrodes:
@@ -131,6 +134,7 @@ def check_electrodes(
         measured_changes.append(_wait_for_press(blocks, electrode, timeout_s))
     changes = np.array(measured_changes)  # shape (electrodes, channels)
 
+    # A channel is inverted if its value falls under the press near its own electrode.
     found = {}
     inverted = []
     for row, column in enumerate(assign_channels(changes, electrodes)):
@@ -188,8 +192,9 @@ def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str
         table: Content of the device file with the assumed channels.
         check: Result of the presses.
     """
-    assumed_electrode = {channel: electrode for electrode, channel in check.expected.items()}
-    source_electrode = {electrode: assumed_electrode[channel] for electrode, channel in check.found.items()}
+    # Each electrode receives the settings of the electrode to which its channel was assumed to belong.
+    electrode_of_channel = {channel: electrode for electrode, channel in check.expected.items()}
+    source_electrode = {electrode: electrode_of_channel[channel] for electrode, channel in check.found.items()}
     corrected = {name: _reassigned_settings(section, source_electrode) for name, section in table.items()}
     corrected["channels"] = dict(check.found)
     return corrected
@@ -231,7 +236,7 @@ class _Blocks:
         self._channels = channels
 
     def next_block(self, deadline_s: float) -> tuple[Array, Array] | None:
-        """Wait for the next block.
+        """Collect frames for `BLOCK_S`, or longer until a frame has arrived, and return their medians and noise.
 
         Args:
             deadline_s: Time on the monotonic clock until which frames are waited for, s.
@@ -282,7 +287,7 @@ def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
     largest_change = np.zeros_like(rest_level)
     is_pressed = False
     while (block := blocks.next_block(deadline_s)) is not None:
-        level, _ = block
+        level, _ = block  # medians of the channels, and their noise
         change = level - rest_level
         if np.any(np.abs(change) > CHANGE_SIGMAS * noise):
             is_pressed = True
@@ -301,7 +306,9 @@ def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
 
 
 def _wait_for_rest(blocks: _Blocks, electrode: str, deadline_s: float, timeout_s: float) -> tuple[Array, Array]:
-    """Wait until the channels are quiet in `REST_BLOCKS` blocks.
+    """Wait until the channels are quiet in `REST_BLOCKS` consecutive blocks.
+
+    The channels are quiet if the level of each channel varies by at most half of the change that begins a press.
 
     Args:
         blocks: Source of the blocks.
@@ -320,7 +327,8 @@ def _wait_for_rest(blocks: _Blocks, electrode: str, deadline_s: float, timeout_s
         recent_blocks.append(block)
         levels = np.array([level for level, _ in recent_blocks])  # shape (blocks, channels)
         noise = np.median([block_noise for _, block_noise in recent_blocks], axis=0)
-        is_quiet = bool(np.all(np.ptp(levels, axis=0) <= 0.5 * CHANGE_SIGMAS * noise))
+        variation = np.ptp(levels, axis=0)  # largest minus smallest level of each channel
+        is_quiet = bool(np.all(variation <= 0.5 * CHANGE_SIGMAS * noise))
         if len(recent_blocks) == REST_BLOCKS and is_quiet:
             return levels.mean(axis=0), noise
     if recent_blocks:

@@ -8,6 +8,7 @@ rest level before the press. If the rest level drifts, it is extrapolated along 
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,6 +43,13 @@ LEARNING_TAU_s = 1e5
 """Time constant for `[leak]` that corrects no leak, s. The stage still estimates the drift at rest and removes it."""
 
 
+SMALLEST_SIZE = 1e-30
+"""Lower limit for the size of a step, in any unit, which avoids a division by zero if the channels never change."""
+
+END_BLOCKS = 5
+"""Number of blocks at the beginning and at the end of a press whose means are compared."""
+
+
 @dataclass(frozen=True)
 class HeldPress:
     """Result of a held press.
@@ -60,6 +68,9 @@ class HeldPress:
 def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     """Find a press that is held for at least `MIN_HELD_S`, and describe how its charge changes.
 
+    The values are averaged over blocks of time. The press begins with the first large step between the blocks. The film
+    must be at rest before the press, and the step must be much larger than the usual change between blocks.
+
     Args:
         values: Values of the channels, shape (n, channels), in any unit.
         times_s: Times since the first frame, shape (n,), s.
@@ -70,33 +81,59 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     levels = _block_means(values, times_s)
     if levels is None or len(levels) * BLOCK_S < MIN_REST_S + SETTLE_S + MIN_HELD_S:
         return None
+    step = _find_step(levels)
 
-    # The step of the press is the first change within two blocks that is at least half as large as the largest change.
-    steps = levels[2:] - levels[:-2]  # shape (blocks - 2, channels)
-    step_sizes = np.linalg.norm(steps, axis=1)
-    rest_blocks = int(np.argmax(step_sizes > 0.5 * step_sizes.max()))  # number of blocks before the press
-    step_size = float(step_sizes[rest_blocks])
-    step_direction = steps[rest_blocks] / max(step_size, 1e-30)
-    component = levels @ step_direction  # shape (blocks,)
-
-    # A step is the difference between two blocks with one block between them. The press begins in the middle block.
-    begin = rest_blocks + 1
-    settled = begin + round(SETTLE_S / BLOCK_S)
-    end = _end_of_press(component, settled, step_size)
-    is_large = step_size >= STEP_RATIO * np.median(step_sizes)
-    has_rest = rest_blocks * BLOCK_S >= MIN_REST_S
+    begin = step.rest_blocks + 1  # block in which the press begins
+    settled = begin + round(SETTLE_S / BLOCK_S)  # first block in which the force is constant
+    end = _end_of_press(step.component, settled, step.size)
+    has_rest = step.rest_blocks * BLOCK_S >= MIN_REST_S
     is_long = (end - settled) * BLOCK_S >= MIN_HELD_S
-    if not (is_large and has_rest and is_long):
+    if not (step.is_large and has_rest and is_long):
         return None
 
-    block_times_s = BLOCK_S * (np.arange(len(component)) + 0.5)
-    rest, drift_per_s = _extrapolate_rest(component, block_times_s, rest_blocks, step_size)
-    press_size = component - rest
+    block_times_s = BLOCK_S * (np.arange(len(step.component)) + 0.5)  # middle of each block
+    rest, drift_per_s = _extrapolate_rest(step.component, block_times_s, step.rest_blocks, step.size)
+    press_size = step.component - rest
     held_s = block_times_s[settled:end] - BLOCK_S * begin
     description, sections = _describe(held_s, press_size[settled:end])
     if drift_per_s != 0.0:
-        description, sections = _with_drift(description, sections, percent_per_s=100.0 * drift_per_s / step_size)
+        description, sections = _with_drift(description, sections, percent_per_s=100.0 * drift_per_s / step.size)
     return HeldPress(BLOCK_S * begin, sections, description)
+
+
+class _Step(NamedTuple):
+    """Step of the channels at the beginning of a press.
+
+    Attributes:
+        rest_blocks: Number of blocks before the press.
+        size: Euclidean norm of the change of the channels, in the unit of the channels.
+        is_large: Whether the step is much larger than the usual change of the channels.
+        component: Mean of each block along the direction of the change, shape (blocks,), in the unit of the channels.
+    """
+
+    rest_blocks: int
+    size: float
+    is_large: bool
+    component: Array
+
+
+def _find_step(levels: Array) -> _Step:
+    """Find the first change within two blocks that is at least half as large as the largest change.
+
+    A change is the difference between two blocks with one block between them, because the force of a press rises during
+    a part of one block. The press begins in this middle block.
+
+    Args:
+        levels: Mean of each channel in each block, shape (blocks, channels), any unit.
+    """
+    changes = levels[2:] - levels[:-2]  # shape (blocks - 2, channels)
+    change_sizes = np.linalg.norm(changes, axis=1)
+    is_step = change_sizes > 0.5 * change_sizes.max()
+    rest_blocks = int(np.argmax(is_step))  # position of the first True
+    size = float(change_sizes[rest_blocks])
+    direction = changes[rest_blocks] / max(size, SMALLEST_SIZE)
+    is_large = bool(size >= STEP_RATIO * np.median(change_sizes))
+    return _Step(rest_blocks, size, is_large, component=levels @ direction)
 
 
 def _extrapolate_rest(
@@ -138,26 +175,28 @@ def _block_means(values: Array, times_s: Array) -> Array | None:
     """
     if not np.isfinite(values).all():
         return None
-    block_numbers = (times_s / BLOCK_S).astype(int)
-    counts = np.bincount(block_numbers)[:-1]
+    block_numbers = (times_s / BLOCK_S).astype(int)  # number of the block of each value
+    counts = np.bincount(block_numbers)[:-1]  # number of values in each block
     if not counts.all():
         return None
-    sums = np.stack([np.bincount(block_numbers, column)[:-1] for column in values.T], axis=1)
+    channel_sums = [np.bincount(block_numbers, weights=column)[:-1] for column in values.T]
+    sums = np.stack(channel_sums, axis=1)  # shape (blocks, channels)
     return np.asarray(sums / counts[:, None])
 
 
 def _end_of_press(component: Array, settled: int, step_size: float) -> int:
-    """Return the number of the first block after the press.
+    """Return the number of the block at which the press ends.
 
-    If the press is held to the end, return the number of blocks.
+    The press ends where the values first fall by a large part of the step within two blocks. If there is no such fall,
+    the press is held to the end, and the result is the number of blocks.
 
     Args:
         component: Mean of each block along the change of the press, shape (blocks,).
         settled: First block in which the force is constant.
         step_size: Change of the component when the press begins.
     """
-    changes = component[settled + 2 :] - component[settled:-2]
-    releases = np.flatnonzero(changes < -RELEASE_SHARE * step_size)
+    changes = component[settled + 2 :] - component[settled:-2]  # from each block to the second block after it
+    releases = np.flatnonzero(changes < -RELEASE_SHARE * step_size)  # counted from the block `settled`
     if releases.size == 0:
         return len(component)
     return settled + int(releases[0])
@@ -173,15 +212,20 @@ def _with_drift(
         sections: Sections for a device file.
         percent_per_s: Drift of the rest in percent of the press per second.
     """
-    remedy = f"[leak] tau_s = {LEARNING_TAU_s:g} in a device file lets the drift be learned at rest and taken off"
-    if "leak" in sections:
+    has_leak = "leak" in sections  # the press leaks as well, so that [leak] cannot be chosen for the drift
+    if has_leak:
         remedy = "leave the board alone until the rest stands still, and measure again"
+    else:
+        remedy = f"[leak] tau_s = {LEARNING_TAU_s:g} in a device file lets the drift be learned at rest and taken off"
     sentence = f"the rest drifts, by {percent_per_s:.2g} % of the press in a second; {description}; {remedy}"
-    return sentence, {"leak": {"tau_s": LEARNING_TAU_s}} | sections
+    default_sections = {"leak": {"tau_s": LEARNING_TAU_s}}
+    return sentence, default_sections | sections
 
 
 def _describe(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, float]]]:
-    """Describe how the charge of a press changes. A drift of the rest level is not included.
+    """Describe how the charge of a press changes: whether it is constant, leaks, creeps, or follows no clear law.
+
+    A drift of the rest level is not included.
 
     Args:
         held_s: Times since the beginning of the press, shape (n,), s.
@@ -190,8 +234,8 @@ def _describe(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, floa
     Returns:
         A sentence, and sections for a device file.
     """
-    first_size = size[:5].mean()
-    last_size = size[-5:].mean()
+    first_size = size[:END_BLOCKS].mean()
+    last_size = size[-END_BLOCKS:].mean()
     lost_share = 1.0 - float(last_size / first_size)
     if abs(lost_share) < STEADY_SHARE:
         return f"a held press keeps its charge for {held_s[-1]:.0f} s", {}

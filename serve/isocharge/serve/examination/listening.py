@@ -105,10 +105,12 @@ def listen(
     Raises:
         PortError: If the port cannot be opened.
     """
+    # Listen for a short time to find out whether the line returns the requests.
     if request is not None and not request.echo:
         received = _listen_at_baud(url, bauds[0], ECHO_S, request, wait)
         request = replace(request, echo=received.echo_share >= ECHO_SHARE)
 
+    # Try the baud rates. A port without a baud rate, such as a network port, is not tried.
     chosen_baud = bauds[0]
     if has_speed(url) and len(bauds) > 1:
         for baud in bauds:

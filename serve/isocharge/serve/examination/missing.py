@@ -55,7 +55,7 @@ class BoardFindings:
 
 
 def missing_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield one sentence for each missing setting or property that the board needs before contacts can be computed."""
+    """Yield one sentence for each setting or property that is missing before contacts can be computed."""
     capture = findings.capture
     if not capture.bytes_seen:
         yield "not one byte came: check power and cable, and whether the board sends unasked (if not: --request)"
@@ -77,7 +77,6 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
             yield f"life on channel {printable(channel.name)}: every value is {channel.offset_pC:g}"
         if findings.unit == "pC":
             yield from _charge_sentences(channel, findings.device.tare or TareRule())
-    yield from _leak_sentences(findings)
 
 
 def _transmission_sentences(capture: Capture) -> Iterator[str]:
@@ -132,8 +131,16 @@ def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
             yield f"[hum] frequency_Hz = {frequency_Hz:g} (device file): channel {name} hums by {hum_pC:.2g} pC"
 
 
-def _leak_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield the settings or properties that are missing for a correction of the leak of the amplifiers."""
+def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
+    """Yield a sentence for each setting or property that is missing before held presses keep their force.
+
+    These are the settings with which the leak of the amplifiers is corrected. Touches are computed without them.
+
+    If the user has held a press during the check, its result determines the settings. Otherwise a sentence asks for the
+    time constants of the amplifiers, unless the device file has them.
+    """
+    if not findings.capture.frames:
+        return
     device = findings.device
     held = findings.held
     if findings.capture.frames[0].t_us is None and device.leak is not None:

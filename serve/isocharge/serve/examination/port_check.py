@@ -1,5 +1,8 @@
-"""The port check, which reports the format and the rate of the frames, the health of the channels, a device file, and
-missing settings."""
+"""The port check, which examines the bytes that a board sends.
+
+The result contains the format and the rate of the frames, the health of the channels, a device file, and the missing
+settings.
+"""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -14,7 +17,7 @@ from isocharge.common.printable_text import printable
 from isocharge.serve.examination.channel_health import ChannelHealth, measure_channel_health
 from isocharge.serve.examination.held_press import HeldPress, find_held_press
 from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
-from isocharge.serve.examination.missing import BoardFindings, missing_sentences
+from isocharge.serve.examination.missing import BoardFindings, held_press_sentences, missing_sentences
 from isocharge.serve.examination.proposal import Proposal, propose, unit_of
 from isocharge.serve.examination.touch_search import find_touch
 from isocharge.serve.frames.frame import Frame
@@ -52,6 +55,8 @@ class Examination:
         held: Description of a press that was held during the check, a sentence; empty if there was none.
         touch: Description of a touch while the film should be at rest, a sentence; empty if there was none.
         missing: One sentence for each setting or property that is missing before contacts can be computed.
+        missing_for_held_presses: One sentence for each setting or property that is missing before held presses keep
+            their force. Touches are computed without them.
         works: Whether a film at rest is tared with this device file. False after a touch.
         device: Content of the given device file, or of a proposed device file. It is empty without frames, and has no
             offsets after a touch.
@@ -74,6 +79,7 @@ class Examination:
     held: str
     touch: str
     missing: tuple[str, ...]
+    missing_for_held_presses: tuple[str, ...]
     works: bool
     device: Mapping[str, Any]
 
@@ -149,15 +155,20 @@ def examine_received(
         electrodes: Electrodes of the model that will be used; empty for any model.
         gain: Keys of the section `[gain]`, if there is no device file.
 
+    Returns:
+        The result of the check: the frames, the channels, the missing settings, and the content of a device file.
+
     Raises:
         DeviceError: If the gain is wrong, or for other electrodes.
     """
+    # Without a device file, the format of the frames and the settings are proposed from the bytes.
     proposal = Proposal(dict(device.table), electrodes)
     is_proposed = device is ANY_BOARD
     if is_proposed:
         proposal = propose(received, electrodes, gain or {})
         device = _proposed_device(proposal, is_gain_stated=bool(gain))
 
+    # Read the frames, and examine the channels in the time before a held press.
     capture = read_frames(received, device)
     unit = "pC" if device.gain is not None else unit_of(capture)
     electrode_at = electrode_positions(capture, device)
@@ -167,11 +178,14 @@ def examine_received(
     channels = tuple(_channels(capture, device, electrode_at, rest_end_s))
     touch = _touch_sentence(capture, device, electrode_at, held, unit)
 
+    # Complete the device file, and test whether the film can be tared with its settings.
     table = _completed_table(proposal.table, held, without_offsets=is_proposed and bool(touch))
     board = BoardFindings(capture, channels, unused, device, proposal.electrodes, unit, held, touch)
     electrode_names = proposal.electrodes or tuple(electrode_at.values())
     is_at_rest = bool(electrode_at) and not touch
     works = is_at_rest and _can_be_tared(received, table, electrode_names)
+
+    # The first frame shows whether the frames have a number and a time.
     first_frame = capture.frames[0] if capture.frames else Frame(None, None, ())
     is_numbered = first_frame.seq is not None
     counts = capture.parser.counts
@@ -193,6 +207,7 @@ def examine_received(
         held="" if held is None else held.description,
         touch=touch,
         missing=tuple(missing_sentences(board)),
+        missing_for_held_presses=tuple(held_press_sentences(board)),
         works=works,
         device=table,
     )
@@ -211,10 +226,10 @@ def _completed_table(table: Mapping[str, Any], held: HeldPress | None, *, withou
         for name, section in held.sections.items():
             completed.setdefault(name, section)
     if without_offsets and "gain" in completed:
-        gain = {key: value for key, value in completed["gain"].items() if key != "offset"}
+        gain_without_offset = {key: value for key, value in completed["gain"].items() if key != "offset"}
         del completed["gain"]
-        if gain:
-            completed["gain"] = gain
+        if gain_without_offset:  # an empty section is not valid
+            completed["gain"] = gain_without_offset
     return completed
 
 
@@ -249,8 +264,9 @@ def _touch_sentence(
 def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
     """Return whether a tare of the film succeeds with the settings of a device file.
 
-    If the device file has no tare, or there are too few frames for two tares, the result is also true. The result is
-    false if there are no frames, or if reading the frames raises an error.
+    If the device file has no tare, or there are too few frames to judge, the result is also true. Twice as many frames
+    as a tare needs are enough to judge. The result is false if there are no frames, or if reading the frames raises an
+    error.
 
     Args:
         received: Bytes that the board sent while the film was at rest.
@@ -268,6 +284,8 @@ def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: 
                     return True
     except IsochargeError:
         return False
+
+    # No frame was tared. This proves that a tare fails only if there were enough frames.
     return device.tare is not None and 0 < frame_count < 2 * device.tare.frames
 
 

@@ -42,6 +42,12 @@ LARGEST_V = 12.0
 LARGEST_NOISE_V = 0.02
 """Largest noise of a board that sends volts, V. Charges of a film in pC have more noise."""
 
+SMALLEST_LIMIT = 1e-9
+"""Rest level that counts as 0 even if a channel has no noise, in any unit."""
+
+SMALLEST_NOISE = 1e-12
+"""Lower limit for the noise of a channel, in any unit, whose logarithm is computed."""
+
 ELECTRODES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Names of the electrodes if there is no model."""
 
@@ -53,10 +59,11 @@ def rest_of(values: Array) -> float:
 
 
 def noise_of(values: Array) -> float:
-    """Estimate the standard deviation of a channel from the sizes of its steps, on which presses have little influence.
+    """Estimate the noise of a channel from the differences between consecutive values.
 
-    The median step of normally distributed noise is 0.6745 * sqrt(2) standard deviations. If the median step of coarse
-    counts is 0, the mean step is used, which is 2 / sqrt(pi) standard deviations.
+    Presses have little effect on these differences. If the noise is normally distributed, the median difference is
+    0.6745 * sqrt(2) standard deviations. If the median difference of coarse counts is 0, the mean difference is used,
+    which is 2 / sqrt(pi) standard deviations.
 
     Args:
         values: Values of the channel, shape (n,), any unit. Values that are not finite are left out.
@@ -89,6 +96,10 @@ class Proposal(NamedTuple):
 def propose(received: ReceivedData, electrodes: tuple[str, ...], gain: Mapping[str, Any]) -> Proposal:
     """Propose the device file for a board.
 
+    The bytes determine the format of the frames, the channels of the electrodes, and the offsets of the channels. The
+    section `[gain]` is proposed if the user states the gain, if the channels have large offsets, or if their unit is
+    not pC.
+
     Args:
         received: Bytes that the board sent.
         electrodes: Electrodes of the model; empty for any model.
@@ -107,6 +118,7 @@ def propose(received: ReceivedData, electrodes: tuple[str, ...], gain: Mapping[s
     if positions:
         table["channels"] = {electrode: capture.names[position] for electrode, position in positions.items()}
 
+    # Measure the offsets in the frames before a held press.
     held = find_held_press(values, times_s)
     rest_values = values if held is None else values[times_s < held.begin_s]
     rest_columns = {electrode: rest_values[:, position] for electrode, position in positions.items()}
@@ -114,7 +126,7 @@ def propose(received: ReceivedData, electrodes: tuple[str, ...], gain: Mapping[s
     if gain or has_large_offset or unit_of(capture) != "pC":
         known_gain = dict(gain)
         if not known_gain and unit_of(capture) == "pC":
-            known_gain = {"pC_per_unit": 1.0}
+            known_gain = {"pC_per_unit": 1.0}  # only the offsets are needed
         table["gain"] = _offsets(rest_columns, known_gain) | known_gain
     return Proposal(table, electrodes or tuple(positions))
 
@@ -189,7 +201,8 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
         channel_electrodes = tuple(electrode_of(names[position]) for position in candidates)
         are_usual_names = set(channel_electrodes) <= set(ELECTRODES)
         electrodes = channel_electrodes if are_usual_names else tuple(ELECTRODES[: len(candidates)])
-    if len(candidates) < len(electrodes) == len(names):
+    has_channel_for_each = len(names) == len(electrodes)
+    if len(candidates) < len(electrodes) and has_channel_for_each:
         candidates = list(range(len(names)))  # a channel that never changes keeps its place and is reported
     if len(candidates) < len(electrodes):
         return {}
@@ -214,26 +227,29 @@ def _varying_channels(values: Array) -> list[int]:
 def _most_alike(values: Array, candidates: list[int], count: int) -> list[int]:
     """Choose the adjacent channels whose noise is most similar, and return their positions.
 
-    The ratio of the largest to the smallest noise is compared in whole decades. The first of several equal choices is
-    used.
+    For each group of adjacent channels, the ratio of the largest to the smallest noise is rounded to a power of ten, so
+    that small differences do not matter. The first group with the smallest rounded ratio is chosen.
 
     Args:
         values: Values of all channels, shape (n, channels).
         candidates: Positions of the channels to choose from.
         count: Number of channels to choose.
     """
-    noise_decades = np.log10([max(noise_of(values[:, position]), 1e-12) for position in candidates])
-    first_choices = range(len(candidates) - count + 1)
-    ranges = [round(float(np.ptp(noise_decades[first : first + count]))) for first in first_choices]
-    best = int(np.argmin(ranges))
-    return candidates[best : best + count]
+    noise = [noise_of(values[:, position]) for position in candidates]
+    log_noise = np.log10(np.maximum(noise, SMALLEST_NOISE))
+    differences = []  # difference of the logarithms in each group, as a whole number
+    for first in range(len(candidates) - count + 1):
+        log_noise_of_group = log_noise[first : first + count]
+        differences.append(round(float(np.ptp(log_noise_of_group))))
+    best_first = int(np.argmin(differences))
+    return candidates[best_first : best_first + count]
 
 
 def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the key `offset` of the section `[gain]`.
+    """Return the key `offset` of the section `[gain]`: the values of the channels without charge.
 
-    The result has one value if all electrodes have the same offset, and is empty if all electrodes rest at 0. Half of
-    the range of a converter is preferred to the measured rest level, unless the difference would prevent a tare.
+    The key has one value if all electrodes have the same offset. The result is empty if all electrodes rest at 0. Half
+    of the range of a converter is preferred to the measured rest level, unless the difference would prevent a tare.
 
     Args:
         columns: Values of the channel of each electrode at rest, each of shape (n,), in the unit of the board.
@@ -241,6 +257,8 @@ def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str,
     """
     rests = {electrode: rest_of(column) for electrode, column in columns.items()}
     offsets = {electrode: _offset(column) for electrode, column in columns.items()}
+
+    # `limits` are the largest rest levels, in the unit of the board, that count as 0.
     if gain:  # a tare accepts a small offset, so half of its limit is allowed
         limit = 0.5 * TareRule().offset_limit_pC / _largest_pC(gain)
         limits = dict.fromkeys(columns, limit)
@@ -248,7 +266,9 @@ def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str,
         if any(difference > limit for difference in differences):
             offsets = {electrode: _rounded(rest) for electrode, rest in rests.items()}
     else:  # only the noise shows whether a channel rests at 0
-        limits = {electrode: max(REST_SIGMAS * noise_of(column), 1e-9) for electrode, column in columns.items()}
+        limits = {
+            electrode: max(REST_SIGMAS * noise_of(column), SMALLEST_LIMIT) for electrode, column in columns.items()
+        }
 
     all_rest_at_zero = all(abs(rest) <= limits[electrode] for electrode, rest in rests.items())
     if all_rest_at_zero:
@@ -260,9 +280,13 @@ def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str,
 
 
 def _largest_pC(gain: Mapping[str, Any]) -> float:
-    """Compute the largest magnitude of the charge of one unit over all electrodes, pC.
+    """Compute a charge, pC, that one unit of the board does not exceed in magnitude at any electrode.
 
-    The charge is `pC_per_unit`, or the product of `V_per_unit` and `feedback_pF`.
+    The charge is `pC_per_unit`, or the product of `V_per_unit` and `feedback_pF`. The largest values of the two
+    settings may belong to different electrodes.
+
+    Args:
+        gain: The keys of the section `[gain]` that state the charge. Each is a number, or has one for each electrode.
     """
     product_pC = 1.0
     for setting in gain.values():
@@ -272,7 +296,7 @@ def _largest_pC(gain: Mapping[str, Any]) -> float:
 
 
 def _offset(column: Array) -> float | int:
-    """Return the value of a channel without charge.
+    """Return the value that a channel has if there is no charge.
 
     If the rest level is near half of the range of a converter, half of the range is returned. Otherwise the rest level
     is returned.

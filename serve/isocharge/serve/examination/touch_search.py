@@ -54,6 +54,9 @@ class TouchFound(NamedTuple):
 def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | None:
     """Search for a touch.
 
+    A channel is touched if its value changes fast by more than noise can explain. If the values are in pC, a large slow
+    change is a touch, too.
+
     Args:
         values: Values of the channels, shape (n, channels).
         times_s: Times since the first frame, shape (n,), s.
@@ -66,12 +69,15 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
     blocks = block_medians(values, times_s)
     if len(blocks) < MIN_BLOCKS:
         return None
-    smoothed = np.median([blocks[:-2], blocks[1:-1], blocks[2:]], axis=0)  # shape (blocks - 2, channels)
+    # The median of three consecutive blocks, shape (blocks - 2, channels)
+    smoothed = np.median([blocks[:-2], blocks[1:-1], blocks[2:]], axis=0)
     touches: list[TouchFound] = []
     for position, channel_levels in enumerate(smoothed.T):
         if not np.isfinite(channel_levels).all():
             continue
         min_change = _smallest_touch(values[:, position], unit_is_pC)
+
+        # The change of the channel within each window of half a second, and during the whole time
         windows = sliding_window_view(channel_levels, min(STEEP_BLOCKS, len(channel_levels)))
         window_changes = np.ptp(windows, axis=1)  # shape (windows,)
         total_change = float(np.ptp(channel_levels))
@@ -108,8 +114,9 @@ def block_medians(values: Array, times_s: Array) -> Array:
         Medians of the finite values, shape (blocks, channels). Blocks without frames are left out, and so is the last
         block, which may be incomplete. NaN if a block of a channel has no finite value.
     """
-    block_numbers = np.floor(times_s / BLOCK_S).astype(int)
-    first_rows = np.flatnonzero(np.diff(block_numbers, prepend=-1))
+    block_numbers = np.floor(times_s / BLOCK_S).astype(int)  # number of the block of each frame
+    begins_block = np.diff(block_numbers, prepend=-1) != 0
+    first_rows = np.flatnonzero(begins_block)  # first frame of each block
     blocks = np.split(values, first_rows[1:])
     whole_blocks = blocks[:-1]
     if not whole_blocks:

@@ -5,9 +5,9 @@ sensor. The section Coordinates of README.md defines the origin and the axes x a
 right-handed frames, so z points towards the probe, against the direction of the push.
 
 The wrench is the load of the probe on the film. A press of F at (x, y) has the force (0, 0, -F) and the torque (-y F, x
-F, 0) about the origin. The pose is the point of contact in the plane of the unloaded film. It has no rotation, and its
-covariance contains the standard deviations of the model. If contacts are tracked, the wrench and the pose describe the
-tracked contact, as on the live page. The record also contains the contact of the single frame.
+F, 0) about the origin. The pose is the point of contact in the plane of the unloaded film. The pose has no rotation,
+and its covariance contains the standard deviations of the model. If contacts are tracked, the wrench and the pose
+describe the tracked contact, as on the live page. The record also contains the contact of the single frame.
 
 A ROS message consists of a header and numbers of double precision. The messages are encoded here, because
 `mcap-ros2-support` provides its encoder only as a part of its own writer, which cannot write JSON and takes 15 times as

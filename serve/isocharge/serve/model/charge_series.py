@@ -6,11 +6,11 @@ cannot distinguish them. The tracker then compares the measured charges with thi
     ln Q_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree,
 
 where T_i are Chebyshev polynomials, r is the largest distance of a contact from the centre, and l is the logarithm of
-the force, scaled to [-1, 1]. The file is in the same folder as `model.onnx` and contains three arrays:
+the force, scaled to [-1, 1]. The file is in the same folder as `model.onnx` and contains three arrays.
 
-    series      c, shape (degree + 1, degree + 1, force_degree + 1, n_electrode)
-    radius_mm   r
-    force_N     smallest and largest force
+- `series`: the coefficients c, shape (degree + 1, degree + 1, force_degree + 1, n_electrode).
+- `radius_mm`: the largest distance r.
+- `force_N`: the smallest and the largest force.
 """
 
 import io
@@ -53,7 +53,7 @@ N_CHECKED_FORCES = 5
 
 @dataclass(frozen=True)
 class ChargeSeries:
-    """Charges of all contacts within a distance from the centre of the film.
+    """Charges of all contacts up to a given distance from the centre of the film.
 
     Attributes:
         series: Series of ln Q, where Q is the charge in pC.
@@ -89,16 +89,19 @@ class ChargeSeries:
         centre = np.array([0.0, 0.0, 0.5 * (min_log_force + max_log_force)])
         scale = np.array([self.radius_mm, self.radius_mm, 0.5 * (max_log_force - min_log_force)])
         unit_contact = (contact - centre) / scale
-        # ln Q and its derivatives with respect to the three coordinates, shape (n, 4, n_electrode).
+
+        # ln Q, followed by its derivatives with respect to the three coordinates, shape (n, 4, n_electrode)
         values = self.series.values(unit_contact)
         log_charge = values[:, 0]
-        log_slopes = values[:, 1:]
-        log_force_slope = values[:, 3]
+        log_slopes = values[:, 1:]  # shape (n, 3, n_electrode)
+        log_force_slope = log_slopes[:, -1]
 
         unit_force = unit_contact[:, 2:]
         distance_from_range = unit_force - np.clip(unit_force, -1.0, 1.0)  # 0 within the range of forces
         charge_pC = np.exp(log_charge + distance_from_range * log_force_slope)
-        jacobian = charge_pC[:, :, None] * log_slopes.swapaxes(1, 2) / scale  # because dQ = Q d(ln Q)
+
+        # dQ = Q d(ln Q). The division by the scale converts the derivatives to the units of the contact.
+        jacobian = charge_pC[:, :, None] * log_slopes.swapaxes(1, 2) / scale
         return charge_pC, jacobian
 
     def to_bytes(self) -> bytes:

@@ -36,7 +36,7 @@ def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
     if checksums is None:
         log.warning("%s: golden.json holds no checksum of this file; whether it fits model.onnx is not verified", path)
         return data
-    expected_sha256 = checksums.get(name, "no such file")
+    expected_sha256 = checksums.get(name, "no such file")  # the text is no checksum, so that the comparison fails
     actual_sha256 = sha256_of(data)
     if actual_sha256 != expected_sha256:
         raise ModelError(

@@ -68,7 +68,10 @@ class FilmDirections:
 
     @classmethod
     def none(cls, n_electrode: int) -> "FilmDirections":
-        """Return an empty set of directions. It is used for a model that was calibrated by an earlier version."""
+        """Return an empty set of directions.
+
+        The empty set is used for a model that was calibrated by an earlier version.
+        """
         no_coefficients = np.zeros((1, 1, 1, 0, n_electrode))
         return cls(no_coefficients, radius_mm=1.0, force_N=(1.0, 2.0), by_pretension=np.zeros(0))
 
@@ -101,6 +104,8 @@ class FilmDirections:
         min_log_force, max_log_force = np.log(self.force_N)
         log_force = np.log(np.clip(contact[:, 2], *self.force_N))
         unit_force = (2.0 * log_force - min_log_force - max_log_force) / (max_log_force - min_log_force)
+
+        # Positions in multiples of the radius; positions beyond the radius are moved onto the circle.
         distance_mm = np.hypot(contact[:, 0], contact[:, 1])
         unit_position = contact[:, :2] / np.maximum(distance_mm, self.radius_mm)[:, None]
         unit_contact = np.column_stack([unit_position, unit_force])
@@ -160,8 +165,9 @@ def _film_directions(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Film
             f"series: expected equal degrees in x and y, degrees up to {MAX_DEGREE} and up to {MAX_DIRECTIONS} "
             f"directions, got the shape {coefficients.shape}"
         )
-    # A Chebyshev polynomial is at most 1, so the sum of the coefficients is the largest possible value of a series.
-    largest_log_change = float(np.abs(coefficients).sum(axis=(0, 1, 2)).max(initial=0.0))
+    # A Chebyshev polynomial is at most 1, so a series is at most the sum of the magnitudes of its coefficients.
+    max_log_changes = np.abs(coefficients).sum(axis=(0, 1, 2))  # shape (n_direction, n_electrode)
+    largest_log_change = float(max_log_changes.max(initial=0.0))
     if largest_log_change > MAX_LOG_CHANGE:
         raise ValueError(f"series: expected changes of ln Q up to {MAX_LOG_CHANGE:g}, got up to {largest_log_change:g}")
     by_pretension = finite_array(arrays, "by_pretension", (n_direction,))

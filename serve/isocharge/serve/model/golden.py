@@ -141,6 +141,7 @@ def read_golden(path: Path) -> Golden:
         file = read_json(path, "golden vectors", ModelError, _File)
     except ModelError as error:
         raise ModelError(f"{error}; the file is damaged: copy or export the model again") from error
+    # The correlations are an output of newer models only.
     present_outputs = [name for name in OUTPUTS if getattr(file.outputs, name) is not None]
     return Golden(
         sha256=file.sha256,

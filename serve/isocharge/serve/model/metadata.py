@@ -159,7 +159,11 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
     unnoticed: UnnoticedPresses | None = None
 
     def __post_init__(self) -> None:
-        """Check that the keys are consistent with each other; raise WrongKey for the first key that is not."""
+        """Check that the values of the keys are valid and consistent with each other.
+
+        Raises:
+            WrongKey: For the first key that is missing or not valid.
+        """
         if "name" not in self.sensor:
             raise WrongKey("sensor.name")
         sensor_name = self.sensor["name"]
@@ -211,6 +215,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         """
         place = f"{where}: metadata"
         try:
+            # The version is read first, because other versions may have other keys.
             names = [name for name in cls.__struct_fields__ if name in props]
             values = {name: parse_json(props[name], f"{place}: {name}", ModelError, object) for name in names}
             version = convert(values, _Version, place, ModelError).format_version

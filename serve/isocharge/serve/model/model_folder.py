@@ -323,6 +323,8 @@ def write_model(
     target = check_target(folder, metadata.version, metadata.electrodes)
     if folder.resolve().name != metadata.name:
         raise ModelError(f"{folder}: expected a folder named {metadata.name!r}, as the metadata names the model")
+
+    # Compute the golden vectors with the new model.
     where = f"the new model {metadata.label}"
     session = open_session(onnx_model, where)
     check_interface(session, len(metadata.electrodes), where)
@@ -330,6 +332,8 @@ def write_model(
     golden_of_model = make_golden(session, onnx_model, charges, contact_floors(metadata))
     companion_sha256 = {name: sha256_of(content) for name, content in companion_files.items()}
     golden = replace(golden_of_model, companion_sha256=companion_sha256)
+
+    # Write the version under a temporary name, which is changed only if a reader would accept the version.
     with new_folder(target) as draft:
         write_whole(draft / "model.onnx", onnx_model)
         write_whole(draft / "golden.json", golden.to_json().encode())
@@ -344,17 +348,20 @@ def write_model(
 def _write_triton_config(path: Path, metadata: ModelMetadata, *, has_correlation: bool) -> None:
     """Write `config.pbtxt` so that Triton can serve all versions of the model.
 
+    The file may list only outputs that every version computes. If an existing file does not list the output of the
+    correlations, an older version does not compute them, and the new file does not list this output either.
+
     Args:
         path: The file, which may exist already.
         metadata: Metadata of the new version.
-        has_correlation: Whether the new version computes correlations. The output of the correlations is not listed if
-            an existing file does not list it, because an older version then does not compute correlations.
+        has_correlation: Whether the new version computes correlations.
     """
     n_electrode = len(metadata.electrodes)
     config_without_correlation = triton_config(metadata.name, n_electrode, correlation=False)
     older_lacks_correlation = path.exists() and path.read_text(encoding="utf-8") == config_without_correlation
-    correlation = has_correlation and not older_lacks_correlation
-    write_whole(path, triton_config(metadata.name, n_electrode, correlation=correlation).encode())
+    lists_correlation = has_correlation and not older_lacks_correlation
+    config = triton_config(metadata.name, n_electrode, correlation=lists_correlation)
+    write_whole(path, config.encode())
 
 
 def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Path:
@@ -413,7 +420,7 @@ def _check_triton_config(path: Path, name: str, electrodes: tuple[str, ...]) -> 
 def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
     """Check a new version in the same way as when it is read.
 
-    Its metadata are also compared with the expected metadata.
+    The metadata of the version are also compared with the expected metadata.
 
     Args:
         draft: Folder with the files of the new version.

@@ -95,7 +95,11 @@ class Pretensions:
     activation: str = TANH.name
 
     def to_bytes(self) -> bytes:
-        """Return the content of the file `pretensions.npz`."""
+        """Return the content of the file `pretensions.npz`.
+
+        The file contains the pretensions, the typical charges and the weights as arrays. A JSON object with the name
+        `about` contains all other numbers.
+        """
         numbers = {name: getattr(self, name) for name in _NUMBERS}
         constant_names = list(self.weights)
         about = json.dumps({"format_version": FORMAT, "constants": constant_names, **numbers}, allow_nan=False)
@@ -273,7 +277,7 @@ def _check_misfits(pretensions: Pretensions) -> None:
     """Raise ValueError if the network computes misfits that are not finite at pretensions within its range."""
     checked_MPa = np.linspace(*pretensions.range_MPa, CHECKED_PRETENSIONS)
     with np.errstate(over="ignore", invalid="ignore"):
-        charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)
+        charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)  # a weak, a typical and a strong press
         misfits = pretensions.at(checked_MPa).vectors(charges_pC, checked_MPa)
     if not np.isfinite(misfits).all():
         raise ValueError("the weights give misfits that are not finite")
@@ -302,7 +306,8 @@ def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: in
     """Check the shapes of the weights, and return their names in the order of the layers.
 
     The names of the hidden layers are pairs: the weight and the bias of each layer. The last three names are those of
-    the skip layer, which connects the inputs with the outputs, and of the bias and the weight of the output layer.
+    the skip layer, of the bias of the output layer, and of the weight of the output layer. The skip layer connects the
+    inputs with the outputs.
 
     Args:
         arrays: Arrays of the file by name.

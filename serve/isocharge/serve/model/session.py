@@ -78,8 +78,10 @@ def open_session(
 
 
 def _decode_texts(session: ort.InferenceSession) -> None:
-    """Read the metadata and the names of a session, so that onnxruntime raises an exception if they are not valid
-    UTF-8."""
+    """Read the metadata and the names of a session.
+
+    Reading them makes onnxruntime raise an exception if they are not valid UTF-8.
+    """
     _ = session.get_modelmeta().custom_metadata_map
     _ = [tensor.name for tensor in (*session.get_inputs(), *session.get_outputs())]
 
@@ -90,6 +92,7 @@ def _single_thread_options() -> ort.SessionOptions:
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
+    # A spinning thread would keep a core busy while it waits for work.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     return options
@@ -221,6 +224,8 @@ class BoundPress:
         # The session holds only the addresses of the arrays. The views in `write` and `read` keep the arrays alive.
         binding = _bind(session, charges, outputs, self.columns)
         self.run: Callable[[], None] = partial(session.run_with_iobinding, binding)
+
+        # Functions that pack float32 numbers into the memory of the charges, and unpack them from that of the outputs.
         self.write = partial(struct.Struct(f"={electrodes}f").pack_into, charges.data.cast("B"), 0)
         self.read = partial(struct.Struct(f"={outputs.size}f").unpack, outputs.data.cast("B"))
         # The type is Any because the type hints of memoryview cover only bytes.
@@ -229,7 +234,7 @@ class BoundPress:
         self._output_view_without_correlation: Any = outputs[:N_WITHOUT_CORRELATION].data
 
     def run_into(self, charge_pC: Singles, out: Singles) -> None:
-        """Compute one press from an array into another array.
+        """Compute one press, with the charges in one array and the results written into another array.
 
         The arrays are copied through memoryviews, which check the number type and the shape without extra time.
 
@@ -255,6 +260,9 @@ def _columns(widths: Mapping[str, int]) -> dict[str, slice]:
 
     Args:
         widths: Number of values of each output by its name. The correlations, if there are any, are put last.
+
+    Returns:
+        Slice of the values of each output, by the name of the output.
     """
     names = [name for name in widths if name != CORRELATION]
     if CORRELATION in widths:

@@ -87,7 +87,7 @@ class Address:
             return f"unix:{self.uds}"
         scheme = "https" if secure else "http"
         host = f"[{self.host}]" if ":" in self.host else self.host
-        port = listening.getsockname()[1]
+        _, port, *_ = listening.getsockname()  # the actual port, also if the system has chosen it
         return f"{scheme}://{host}:{port}"
 
 
@@ -170,6 +170,7 @@ class Tls:
         try:
             for path in paths:
                 read_whole(path)  # refuses a pipe, for which load_cert_chain would wait without end
+            # An empty password, because OpenSSL would otherwise ask for the password of an encrypted key.
             context.load_cert_chain(self.certificate, self.key, password=lambda: "")
         except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
             names = " and ".join(map(str, paths))

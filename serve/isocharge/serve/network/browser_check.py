@@ -81,6 +81,10 @@ class BrowserCheck:
     ) -> str | None:
         """Return the reason why a request is refused; None if the request is accepted.
 
+        The requested host must be one that this server has. If the browser states the origin of the page that sends the
+        request, the page must belong to this server. Otherwise the header `Sec-Fetch-Site` must not name another site,
+        unless the user follows a link to a page of this server.
+
         Args:
             method: Method in capitals.
             host: Value of the header `Host`; empty if the request has none.
@@ -138,6 +142,7 @@ class BrowserCheck:
             return True
         page_name = _name_in(f"//{page_host}")
         requested_name = _name_in(f"//{requested_host}")
+        # Equal names with different ports are two servers of the same machine.
         return page_name in self._allowed_names and page_name != requested_name
 
     def _served_names(self) -> str:

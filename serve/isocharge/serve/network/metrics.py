@@ -34,16 +34,16 @@ _Counters = dict[tuple[str, str], Statistics]
 
 
 class Metrics(Collector):
-    """Metrics of one server, computed for each scrape.
-
-    Args:
-        store: The models of the server.
-        traffic: Counters of requests and connections.
-        server_version: Version of isocharge.
-    """
+    """Metrics of one server, computed for each scrape."""
 
     def __init__(self, store: ModelStore, traffic: Traffic, server_version: str) -> None:
-        """Register the metrics of the server and of its process. The class describes the arguments."""
+        """Register the metrics of the server and of its process.
+
+        Args:
+            store: The models of the server.
+            traffic: Counters of requests and connections.
+            server_version: Version of isocharge.
+        """
         self._store = store
         self._traffic = traffic
         self._version = server_version

@@ -115,7 +115,9 @@ class ModelStore:
         return loaded
 
     def _not_found_message(self, name: str, version: str) -> str:
-        """Return the message for a model that is not loaded. It lists the loaded versions and the reasons for refusals.
+        """Return the message for a model that is not loaded.
+
+        The message lists the loaded versions and the reasons for refusals.
 
         Args:
             name: Name of the model.
@@ -132,7 +134,7 @@ class ModelStore:
         return "; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *reasons])
 
     def label(self, name: str, version: str = "") -> str | None:
-        """Return the label `name/version` of a version; None if it is not loaded.
+        """Return the label `name/version` of a version; None if this version is not loaded.
 
         Args:
             name: Name of the model.
@@ -280,13 +282,21 @@ class ModelStore:
             versions: New versions of the model, in ascending order.
             refused: Reasons why versions were refused, by name and version.
         """
-        loaded = {key: version for key, version in self._loaded.items() if key[0] != name}
+        loaded = {
+            (other_name, version): other_version
+            for (other_name, version), other_version in self._loaded.items()
+            if other_name != name
+        }
         for new_version in versions:
             loaded[name, new_version.version] = new_version
         if versions:
             loaded[name, ""] = versions[-1]  # the highest version
 
-        other_refused = {key: reason for key, reason in self._refused.items() if key[0] != name}
+        other_refused = {
+            (other_name, version): reason
+            for (other_name, version), reason in self._refused.items()
+            if other_name != name
+        }
         self._refused = other_refused | refused
         self._loaded = loaded
 
@@ -310,6 +320,7 @@ def open_model_store(models: Path | None = None) -> ModelStore:
             raise ModelError(f"{models}: expected models, <name>/<version>/model.onnx, found none; correct --models")
 
     def find_folders() -> Mapping[str, Path]:
+        """Return the present folder of each model by its name."""
         folder_of_model: dict[str, Path] = {}
         for root in roots:
             for name in model_names(root):

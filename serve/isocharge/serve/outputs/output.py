@@ -1,9 +1,10 @@
 """The interface of an output, and the description of a kind of output.
 
 Another package adds a kind of output through an entry point of the group "isocharge.outputs", which refers to an
-`OutputKind`:
+`OutputKind`.
 
-    # pyproject.toml
+Example of such an entry point in pyproject.toml:
+
     [project.entry-points."isocharge.outputs"]
     sqlite = "my_package:SQLITE"
 """

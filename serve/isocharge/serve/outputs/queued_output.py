@@ -45,9 +45,12 @@ class QueuedOutput:
         self._queue.put(record)
 
     def close(self) -> None:
-        """Write the waiting records for as long as the consumer accepts them, and close the other output."""
+        """Write the waiting records for as long as the consumer accepts them, and close the other output.
+
+        If the other output has failed, it is discarded instead.
+        """
         self._queue.close()
-        if self._queue.is_stuck:
+        if self._queue.is_stuck:  # the thread still writes to the other output, which therefore cannot be closed
             return
         try:
             if self.has_failed:

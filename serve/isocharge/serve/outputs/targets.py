@@ -113,7 +113,9 @@ class Outputs:
         if len(set(targets)) < len(targets):
             raise InputError(f"outputs {shown(list(targets))}: expected targets that differ; remove one of them")
         # Standard output is written last. If its reader has closed it, the other outputs have received the record.
-        self._kinds = sorted(kinds, key=lambda target_and_kind: target_and_kind[1].is_standard_output)
+        file_kinds = [(target, kind) for target, kind in kinds if not kind.is_standard_output]
+        standard_kinds = [(target, kind) for target, kind in kinds if kind.is_standard_output]
+        self._kinds = file_kinds + standard_kinds
         self._context = context
         self._outputs: dict[str, Output] = {}
         self.not_written: dict[str, int | None] = {}
@@ -179,7 +181,7 @@ class Outputs:
             except (OSError, IsochargeError) as error:
                 errors.append(error)
             if isinstance(output, QueuedOutput) and output.has_failed:
-                self.not_written[target] = None
+                self.not_written[target] = None  # the number is unknown, because the output has stopped
             elif isinstance(output, QueuedOutput) and output.lost:
                 self.not_written[target] = output.lost
         if errors:

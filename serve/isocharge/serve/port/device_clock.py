@@ -64,19 +64,23 @@ class DeviceClock:
 
     def reset(self) -> None:
         """Treat the next reading as the first reading of a new connection."""
-        self._raw_us: int | None = None
-        self._device_us = 0
-        self._last_arrival_s: float | None = None
-        self._chunk_arrival_s: float | None = None
+        self._raw_us: int | None = None  # clock of the latest reading as it was sent
+        self._device_us = 0  # clock of the latest reading without wraps
+        self._last_arrival_s: float | None = None  # arrival of the latest reading without a clock
+        self._chunk_arrival_s: float | None = None  # arrival of the latest chunk
+
         # In the fit, the time `_fitted_us` of the device is the host time `_fitted_host_s`.
         self._fitted_us: int | None = None
         self._fitted_host_s = 0.0
-        self._fit_age_s = 0.0
+        self._fit_age_s = 0.0  # time since the beginning of the fit
         self._is_first_fit = True
-        self._latest_host_s = -math.inf
+        self._latest_host_s = -math.inf  # host time of the latest reading, which must not decrease
 
     def read(self, t_us: int | None, modulus: int, arrived_s: float) -> ReadingTime:
         """Return the time of the next reading.
+
+        If the device sends a clock, the time is the clock converted to host time by the fit. Otherwise the time is the
+        arrival of the chunk.
 
         Args:
             t_us: Clock as the device sent it, us; None if the device sends no clock.
@@ -90,12 +94,12 @@ class DeviceClock:
             self._last_arrival_s = arrived_s
             return ReadingTime(arrived_s, None, step_s)
 
-        step_us = self._unwrap(t_us, modulus)
+        step_us = self._unwrap(t_us, modulus)  # time since the previous reading
         if self._is_ahead_of(arrived_s):
             self.restarts += 1
             self._fitted_us = None  # the fit starts again from this reading
             step_us = 0
-        if self._fitted_us is None:
+        if self._fitted_us is None:  # until the next chunk arrives, the arrival is the time of this reading
             self._fitted_us = self._device_us
             self._fitted_host_s = max(arrived_s, self._latest_host_s)
             self._is_first_fit = True

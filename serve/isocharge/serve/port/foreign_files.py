@@ -3,6 +3,7 @@
 The lines of such files contain numbers, which the parsers of text would read as the charges of a board.
 """
 
+import codecs
 import shlex
 
 from isocharge.common.errors import InputError
@@ -49,7 +50,8 @@ def _kind_and_command(name: str, head: bytes) -> tuple[str, str] | None:
         Kind and advice, as parts of a sentence; None if the bytes may come from a board.
     """
     file = shlex.quote(name)
-    first_line = head.removeprefix(b"\xef\xbb\xbf").lstrip().partition(b"\n")[0]
+    text_start = head.removeprefix(codecs.BOM_UTF8).lstrip()
+    first_line, _, _ = text_start.partition(b"\n")
     if first_line.startswith(RECORDING_START):
         return "a recording", f"play it with: isocharge serve replay {file}"
     if first_line.startswith(b"{") and all(key in first_line for key in RECORD_KEYS):

@@ -42,6 +42,9 @@ KIND = "isocharge_recording"
 LONGEST_ENTRY = 1 << 20
 """Length of the longest line, characters. A chunk of 64 KiB in base64 has a tenth of this length."""
 
+PROGRESS_LINES = 1000
+"""Number of lines between two reports of the progress of reading."""
+
 Latency = Annotated[float, Meta(ge=-1e12, le=1e12, description="a latency of some days at most, us")]
 Moment = Annotated[float, Meta(ge=-1e11, le=1e11, description="a time before the year 5138, unix seconds")]
 Nanoseconds = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
@@ -276,7 +279,7 @@ class Recording:
                         yield parse_json(line, "", RecordingError, kind)
                     line_number += 1
                     read_characters += len(line)
-                    if line_number % 1000 == 0:
+                    if line_number % PROGRESS_LINES == 0:
                         report("reading", min(read_characters, file_bytes), file_bytes)
         except (OSError, ValueError) as error:
             raise RecordingError(f"{self._path}, line {line_number}: damaged ({cut(str(error))})") from error
@@ -297,7 +300,7 @@ class _Header(Struct):
 
 
 class _Entry(Struct):
-    """A line of a recording after the first line. It is a record, or an object with one of the other keys."""
+    """A line of a recording after the first line. The line is a record, or an object with one of the other keys."""
 
     timestamp: float | None = None
     latency_us: Latency | None = None
@@ -330,11 +333,11 @@ class _Entry(Struct):
             return Back()
         if self.use is not None:
             return NewModel(self.use)
-        return Event(None)
+        return Event(None)  # a request for a new tare
 
 
 class RecordedClock:
-    """The clock of a replay. For each record, it returns the time at which the original record was created."""
+    """The clock of a replay. For each record, the clock returns the time at which the original record was created."""
 
     def __init__(self) -> None:
         """Begin at the time 0."""

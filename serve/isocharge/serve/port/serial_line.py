@@ -47,19 +47,19 @@ class Request:
 
 
 class Requester:
-    """Computes when a request is due, and removes the echo of requests from received bytes.
-
-    Args:
-        request: The request.
-        now_s: Clock, s.
-    """
+    """Computes when a request is due, and removes the echo of requests from received bytes."""
 
     def __init__(self, request: Request, now_s: Callable[[], float] = time.monotonic) -> None:
-        """Begin with a request that is due. The class describes the arguments."""
+        """Begin with a request that is due.
+
+        Args:
+            request: The request.
+            now_s: Clock, s.
+        """
         self._request = request
         self._now_s = now_s
-        self._requests = 0
-        self._echoes = 0
+        self._requests = 0  # number of requests so far
+        self._echoes = 0  # number of complete echoes so far
         self.reset()
 
     @property
@@ -97,19 +97,21 @@ class Requester:
     def remove_echo(self, received: bytes) -> bytes:
         """Return the received bytes without the echo of the request.
 
-        The echo may arrive in several parts. If the line has no echo according to the request, complete echoes are
-        counted, but the bytes are returned unchanged.
+        The echo consists of the bytes of the request, and may arrive in several parts. If the line has no echo
+        according to the request, complete echoes are counted, but the bytes are returned unchanged.
         """
         if not received:
             return b""
         self._received_s = self._now_s()
+
+        # The received bytes may be shorter than the expected echo, or may continue after it.
         echo_length = min(len(received), len(self._expected_echo))
         is_echo = received[:echo_length] == self._expected_echo[:echo_length]
         if echo_length == 0 or not is_echo:
             self._expected_echo = b""
             return received
 
-        self._expected_echo = self._expected_echo[echo_length:]
+        self._expected_echo = self._expected_echo[echo_length:]  # the part that has not arrived yet
         if not self._expected_echo:
             self._echoes += 1
         if not self._request.echo:
@@ -143,18 +145,18 @@ OPEN_ERRORS: tuple[type[Exception], ...] = (ValueError, *READ_ERRORS)
 
 
 class SerialLine:
-    """An open line that pyserial provides.
-
-    Args:
-        url: Device path, or a URL that pyserial accepts.
-        baud: Bits per second.
-
-    Raises:
-        OSError, ValueError: If the line cannot be opened.
-    """
+    """An open line that pyserial provides."""
 
     def __init__(self, url: str, baud: int) -> None:
-        """Open the line. The system is set to deliver bytes without a delay. The class describes the arguments."""
+        """Open the line. The system is set to deliver bytes without a delay.
+
+        Args:
+            url: Device path, or a URL that pyserial accepts.
+            baud: Bits per second.
+
+        Raises:
+            OSError, ValueError: If the line cannot be opened.
+        """
         # pyserial is imported only here, so that programs that only predict need not wait for the import.
         serial = importlib.import_module("serial")
         if url.startswith("tcp://"):
@@ -228,33 +230,33 @@ _CONTROL_CHARACTER = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
 class UdpSocket:
-    """An open socket that receives datagrams.
-
-    Args:
-        url: udp://HOST:PORT. Without a host, the socket receives on every address of the machine.
-
-    Raises:
-        OSError: If the address cannot be bound.
-        ValueError: If the URL holds no address.
-    """
+    """An open socket that receives datagrams."""
 
     def __init__(self, url: str) -> None:
-        """Open the socket and bind it to the address. The class describes the argument."""
+        """Open the socket and bind it to the address.
+
+        Args:
+            url: udp://HOST:PORT. Without a host, the socket receives on every address of the machine.
+
+        Raises:
+            OSError: If the address cannot be bound.
+            ValueError: If the URL holds no address.
+        """
         parts = urlsplit(url)
         if parts.port is None or parts.path or parts.query:
             raise ValueError(f"expected {UDP_SCHEME}HOST:PORT, got {url!r}")
         addresses = socket.getaddrinfo(
             parts.hostname or "", parts.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
         )
-        family, kind, protocol, _, address = addresses[0]
+        family, kind, protocol, _, address = addresses[0]  # the address that the system prefers
         self._socket = socket.socket(family, kind, protocol)
         try:
             self._socket.bind(address)
         except OSError:
             self._socket.close()
             raise
-        self._board_ends_lines = False
-        self._peer: tuple[str, int] | None = None
+        self._board_ends_lines = False  # whether a datagram of the board has ended with a line feed
+        self._peer: tuple[str, int] | None = None  # sender of the latest datagram, to which answers are sent
 
     def reset_input_buffer(self) -> None:
         """Drop the datagrams that have arrived."""
@@ -292,7 +294,10 @@ class UdpSocket:
         return bool(readable)
 
     def _end_line(self, data: bytes) -> bytes:
-        """Add a line feed to a datagram of text, unless the board ends its datagrams with line feeds."""
+        """Add a line feed to a datagram of text, unless the board ends its datagrams with line feeds.
+
+        A datagram is text if it is valid UTF-8 without control characters. Other datagrams are returned unchanged.
+        """
         if data.endswith(b"\n"):
             self._board_ends_lines = True
         has_control_characters = _CONTROL_CHARACTER.search(data) is not None

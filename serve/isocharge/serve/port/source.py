@@ -348,7 +348,10 @@ def open_source(
 
     Args:
         url: A device path or URL, the path of a file or a named pipe, or - for the standard input.
-        baud, silence_s, reconnect, request: See `Port`.
+        baud: Baud rate of a serial port, bit/s.
+        silence_s: Time without a byte after which a port is considered lost, s.
+        reconnect: Whether to open a lost port repeatedly until it is back, instead of raising an error.
+        request: Request that the board needs for each frame; None for a board that sends frames by itself.
         wait: Time to wait until the port can be opened or the file exists, s.
 
     Raises:
@@ -357,6 +360,8 @@ def open_source(
     """
     if url == STDIN:
         return contextlib.nullcontext(FileSource(sys.stdin.fileno(), STDIN))
+
+    # Wait until the path exists, because only then it is known whether it is a file or a port.
     deadline_s = time.monotonic() + wait
     is_path = "://" not in url
     while is_path and not Path(url).exists() and time.monotonic() < deadline_s:

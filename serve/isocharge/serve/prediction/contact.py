@@ -96,7 +96,7 @@ class Contact(NamedTuple):
         for name, std in stds.items():
             decimals = MAX_DECIMALS
             if math.isfinite(std) and std > 0.0:
-                decimals_of_two_digits = 1 - math.floor(math.log10(std))
+                decimals_of_two_digits = 1 - math.floor(math.log10(std))  # 3 for a standard deviation of 0.012
                 decimals = min(max(decimals_of_two_digits, 0), MAX_DECIMALS)
             value = getattr(self, name)
             yield name, f"{value:.{decimals}f}", f"{std:.{decimals}f}"
@@ -129,19 +129,24 @@ class Sensitivity:
         self._reference: Contact | None = None
         self._unit_shift = (0.0, 0.0, 0.0)
 
-    def shift(self, contact: Contact, size: float, other: Callable[[], Contact]) -> tuple[float, float, float]:
+    def shift(
+        self, contact: Contact, size: float, predict_after_unit: Callable[[], Contact]
+    ) -> tuple[float, float, float]:
         """Compute by how much a change of the parameter moves a contact.
+
+        The movement is proportional to the change. The movement for a change by `unit` is stored, and is used again for
+        the next contacts, as long as these are close to the contact for which it was computed.
 
         Args:
             contact: The contact at the present value of the parameter.
             size: Change of the parameter, in the same unit as `unit`.
-            other: Function that predicts the contact with the parameter increased by `unit`.
+            predict_after_unit: Function that predicts the contact with the parameter increased by `unit`.
 
         Returns:
             Changes of x and y, mm, and of the force, N.
         """
         if not is_close(contact, self._reference):
-            contact_after_unit = other()
+            contact_after_unit = predict_after_unit()
             self._reference = contact
             self._unit_shift = (
                 contact_after_unit.x_mm - contact.x_mm,
@@ -171,7 +176,7 @@ def is_close(contact: Contact, reference: Contact | None) -> bool:
 class Contacts(NamedTuple):
     """Contacts of n presses. The fields are those of `Contact`, each as a float32 array of shape (n,).
 
-    `np.asarray` converts them to one array of shape (n, 10) with one press in each row.
+    `np.asarray` converts these fields to one array of shape (n, 10) with one press in each row.
     """
 
     x_mm: Singles
@@ -254,8 +259,7 @@ class Validity:
 
     @cached_property
     def implausible_limits(self) -> tuple[float, float]:
-        """Limits beyond which an output cannot be a measurement: the squared distance from the centre, mm^2, and the
-        force, N."""
+        """Squared distance from the centre, mm^2, and force, N, beyond which an output cannot be a measurement."""
         radius_mm = np.linalg.norm(self.corners_mm - self.centre_mm, axis=1).max()
         _, max_force_N = self.force_range_N
         return float(IMPLAUSIBLE_FACTOR * radius_mm) ** 2, IMPLAUSIBLE_FACTOR * max_force_N
@@ -326,7 +330,7 @@ class Validity:
             is_outside=self._is_outside(contact),
             is_beyond=self.is_beyond(contact),
             has_misfit=contact.misfit > self.misfit_limit,
-            yields=contact.force_N > self.yield_force_N,
+            is_above_yield=contact.force_N > self.yield_force_N,
         )
 
     def _is_outside(self, contact: Contact) -> bool:
@@ -358,9 +362,9 @@ class Validity:
         is_outside_forces = (contacts.force_N < min_force_N) | (contacts.force_N > max_force_N)
         is_outside = is_outside_area | is_outside_forces
         has_misfit = contacts.misfit > self.misfit_limit
-        yields = contacts.force_N > self.yield_force_N
+        is_above_yield = contacts.force_N > self.yield_force_N
         # Every contact that is beyond the limits is also outside, so that `is_beyond` need not be tested here.
-        if not (is_outside | has_misfit | yields).any():
+        if not (is_outside | has_misfit | is_above_yield).any():  # no contact has a flag
             return [()] * len(is_outside)
 
         centre_x_mm, centre_y_mm = self.centre_mm
@@ -368,18 +372,18 @@ class Validity:
         with np.errstate(over="ignore"):  # a distance that overflows is infinite and exceeds the limit
             distance_squared_mm2 = (contacts.x_mm - centre_x_mm) ** 2 + (contacts.y_mm - centre_y_mm) ** 2
         is_beyond = (distance_squared_mm2 > limit_mm2) | (contacts.force_N > limit_N)
-        columns = (is_outside.tolist(), is_beyond.tolist(), has_misfit.tolist(), yields.tolist())
+        columns = (is_outside.tolist(), is_beyond.tolist(), has_misfit.tolist(), is_above_yield.tolist())
         return [_flag_words(*conditions) for conditions in zip(*columns, strict=True)]
 
 
-def _flag_words(is_outside: bool, is_beyond: bool, has_misfit: bool, yields: bool) -> tuple[str, ...]:
+def _flag_words(is_outside: bool, is_beyond: bool, has_misfit: bool, is_above_yield: bool) -> tuple[str, ...]:
     """Return the flags of all conditions that are true.
 
     Args:
         is_outside: Whether the contact is outside the working area or the range of forces.
         is_beyond: Whether the contact is so far outside that it cannot be a measurement.
         has_misfit: Whether the misfit is above the limit of the model.
-        yields: Whether the force is above the force at which the film yields.
+        is_above_yield: Whether the force is above the force at which the film yields.
     """
     flags = []
     if is_outside:
@@ -388,7 +392,7 @@ def _flag_words(is_outside: bool, is_beyond: bool, has_misfit: bool, yields: boo
         flags.append(BEYOND)
     if has_misfit:
         flags.append(MISFIT)
-    if yields:
+    if is_above_yield:
         flags.append(STRESS)
     return tuple(flags)
 

@@ -130,7 +130,7 @@ class Predictor:
         return self.validity.flags(contact)
 
     def predict_into(self, charge_pC: Singles, out: Singles) -> None:
-        """Compute the contact of one press from an array into another array. The charges are not checked.
+        """Compute the contact of one press, and write it into an existing array. The charges are not checked.
 
         Args:
             charge_pC: Touch charges, shape (electrodes,), float32, pC, in the order of `metadata.electrodes`. If a

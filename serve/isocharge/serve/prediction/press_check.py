@@ -3,8 +3,8 @@
 The result contains the errors of the model, the part that noise and rig explain, and a verdict.
 
 If the noise of the charges and the uncertainty of the rig do not explain the errors, the model does not describe the
-film. Either the film was never calibrated, or it has aged or crept since then. A drift of the film first appears as a
-common scale of the forces and as a common shift of the positions.
+film. Either the film was never calibrated, or it has aged or crept since its calibration. A drift of the film first
+appears as a common scale of the forces and as a common shift of the positions.
 """
 
 import math
@@ -131,6 +131,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     Raises:
         PressError: If the charges of one of the model's electrodes are missing.
     """
+    # Exclude the bad presses, and test whether noise and rig explain the errors of the others.
     metadata = predictor.metadata
     errors = press_errors(predictor, presses)
     is_bad = _bad_presses(errors)
@@ -144,6 +145,8 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     fits = None  # too few presses
     if count >= MIN_PRESSES:
         fits = agreement.acceptable and not misfit_text
+
+    # Explain the result to the user.
     notes: list[str] = []
     if fits is False:
         notes += _remedies(metadata, position, force)
@@ -168,8 +171,9 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
 def _bad_presses(errors: PressErrors) -> Booleans:
     """Return which presses are bad, shape (n,).
 
-    The bad presses are those whose exclusion makes all other presses agree with the model. No press is bad if all
-    presses agree with the model, or if too many presses would have to be excluded.
+    The bad presses are the presses with improbable errors, if all other presses agree with the model. No press is bad
+    if all presses agree with the model, if too many presses would have to be excluded, or if the other presses do not
+    agree with the model either.
     """
     is_compared = errors.is_compared
     no_bad_press = np.zeros_like(is_compared)
@@ -220,7 +224,12 @@ def _position_summary(errors: PressErrors, rows: Booleans) -> ErrorSummary | Non
 
 
 def _force_summary(errors: PressErrors, rows: Booleans) -> ErrorSummary | None:
-    """Summarise the force errors of some presses, %; None if no force is known."""
+    """Summarise the force errors of some presses, %; None if no force is known.
+
+    Args:
+        errors: Errors of all presses. The errors of the force are relative to the measured force.
+        rows: Which presses are summarised, shape (n,).
+    """
     error_percent = 100.0 * np.abs(errors.error[:, FORCE])
     known = rows & ~np.isnan(error_percent)
     noise_variance = (100.0 * errors.noise_std[known, FORCE]) ** 2
@@ -252,7 +261,7 @@ def _probability_of_fewer(misfit_count: int, count: int) -> float:
     """Return the probability that fewer than `misfit_count` of `count` good presses have a misfit above the limit.
 
     The number of such presses follows a binomial distribution with the probability `MISFIT_FRACTION`. The terms of the
-    distribution are computed by logarithms, because the binomial coefficients overflow.
+    distribution are computed from their logarithms, because the binomial coefficients would overflow.
     """
     log_odds = math.log(MISFIT_FRACTION / (1.0 - MISFIT_FRACTION))
     log_probability_of_none = count * math.log1p(-MISFIT_FRACTION)
@@ -289,7 +298,10 @@ def _verdict(
 
 
 def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: ErrorSummary | None) -> Iterator[str]:
-    """If the model does not fit, yield notes about possible remedies.
+    """Yield notes about possible remedies for a model that does not fit.
+
+    The first note states how uncertain the rig would have to be to explain the errors. The next note recommends a
+    calibration or, for a calibrated model, a model that learns from the measured presses.
 
     Args:
         metadata: Metadata of the model, which state whether it was calibrated.
@@ -297,9 +309,9 @@ def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: Err
         force: Errors of the forces; None if no force is known.
     """
     options = []
-    if position is not None:
+    if position is not None:  # the option is the standard deviation of x and of y, not of the distance
         options.append(f"--position-std {_explaining_rig_std(position) / math.sqrt(2.0):.2g}")
-    if force is not None:
+    if force is not None:  # the option is relative to the force, not in percent
         options.append(f"--force-std {0.01 * _explaining_rig_std(force):.2g}")
     yield f"the errors would be the rig's if that were as uncertain as {' '.join(options)}"
 
@@ -338,6 +350,10 @@ def _explain_exclusion(reason: str, metadata: ModelMetadata) -> str:
     """Return the reason for an exclusion as a part of a sentence.
 
     If a press is outside the domain of the model, the text contains the limits of the domain.
+
+    Args:
+        reason: Reason why presses were excluded.
+        metadata: Metadata of the model, which contain its domain.
     """
     if reason != NOT_TRAINED:
         return reason

@@ -172,7 +172,7 @@ def _flags(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], 
     """
     contacts = Contacts(*predicted.astype(np.float32).T)
     batch_flags = Validity.of(metadata).batch_flags(contacts)
-    is_complete = np.asarray(~np.isnan(predicted).all(axis=1))
+    is_complete = np.asarray(~np.isnan(predicted).all(axis=1))  # a press without all charges has no contact
     has_misfit = np.asarray(predicted[:, MISFIT_COLUMN] > misfit_limit(metadata))
     all_flags = []
     for press, validity_flags in enumerate(batch_flags):
@@ -189,6 +189,10 @@ def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tup
     """Return the reason why each press is excluded; empty if the press is compared.
 
     Whether a press lies in the domain of the model is determined from the measured position and force.
+
+    Args:
+        metadata: Metadata of the model, which contain its domain.
+        presses: The measured presses, with the electrodes of the model.
     """
     x_mm, y_mm, force_N = presses.contact.T
     min_force_N, max_force_N = metadata.force_range_N
@@ -242,7 +246,7 @@ class ErrorSummary:
 
     @classmethod
     def of(cls, size: Array, noise_variance: Array, rig_variance: Array) -> "ErrorSummary | None":
-        """Summarise errors.
+        """Summarise errors, and compare their mean square with the variances that noise and rig cause.
 
         Args:
             size: Absolute errors, shape (n,).
@@ -294,6 +298,9 @@ class CommonError:
         Args:
             error: Errors, shape (n,); NaN where unknown.
             variance: Expected variances of the errors, shape (n,); NaN where unknown.
+
+        Returns:
+            The mean, its standard error, and its significance with regard to a constant error of the rig.
         """
         is_known = ~np.isnan(error)
         count = int(np.count_nonzero(is_known))
@@ -381,11 +388,7 @@ def _p_value(chi_squared: float, degrees: int) -> float:
 def chi_squared_survival(statistic: float, degrees: int) -> float:
     """Compute the probability that a chi-squared variable exceeds a value.
 
-    The probability is a finite sum (Abramowitz and Stegun 1964, 26.4.4 and 26.4.5): with x = statistic / 2,
-
-        sum of x^s exp(-x) / Gamma(s + 1) over s = degrees / 2 - 1, degrees / 2 - 2, ... down to 0 or 1/2,
-
-    plus erfc(sqrt(x)) if the number of degrees is odd.
+    The probability is computed as a finite sum (Abramowitz and Stegun 1964, 26.4.4 and 26.4.5).
 
     Args:
         statistic: Sum of squares, not negative. The probability is 0 for an infinite sum.
@@ -396,6 +399,9 @@ def chi_squared_survival(statistic: float, degrees: int) -> float:
         return 1.0
     if math.isinf(x):
         return 0.0
+
+    # The sum of x^s exp(-x) / Gamma(s + 1) over s = degrees / 2 - 1, degrees / 2 - 2, ... down to 0 or 1/2,
+    # plus erfc(sqrt(x)) if the number of degrees is odd. The term with the smallest s is computed first.
     is_odd = degrees % 2 == 1
     smallest_s = 0.5 if is_odd else 0.0
     smallest_log_term = -x

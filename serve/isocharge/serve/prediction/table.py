@@ -111,12 +111,14 @@ def write_contacts(
         charge_pC: The charges of the presses, shape (n, electrodes), pC. If given together with `validity`, a row
             whose charges do not exceed the noise has a force of 0, and its other cells are empty.
     """
+    # Rows without a touch have the same cells.
     is_touch = np.ones(len(contacts.x_mm), dtype=bool)
     if validity is not None and charge_pC is not None:
         is_touch = validity.is_touch(charge_pC)
     names = Contacts._fields[:N_WITHOUT_CORRELATION]
     no_contact = tuple("0.000000" if name == "force_N" else "" for name in names)
 
+    # The rows are converted in blocks, so that the texts of a large table need not be in memory at once.
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(names if validity is None else (*names, "flags"))
     rows = np.column_stack(contacts)

@@ -2,7 +2,8 @@
 
 Every division of the bytes into fields has a score in bits. The score is the sum of two numbers: the bits that are
 needed to encode the values of a frame after the previous frame, and the `Weights` of the fields. The division with the
-lowest score is chosen. The weights give simple divisions, such as adjacent channels of one type, a lower score.
+lowest score is chosen. With these weights, simple divisions have lower scores than complicated ones. An example of a
+simple division is one whose channels are adjacent and have the same type.
 `tests/benchmarks/fit_recognition.py` fits the weights on random boards.
 """
 
@@ -14,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.serve.frames.frame_layout import ByteOrder
+from isocharge.serve.frames.frame_field import ByteOrder
 from isocharge.serve.recognition.framing import Bytes, usual_bytes
 
 COUNTING_SHARE = 0.9
@@ -119,7 +120,9 @@ class Part(NamedTuple):
 def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) -> list[list[Part]]:
     """Return the possible parts that begin at each byte of a frame.
 
-    For each byte, the first entry is a part of one byte without a meaning.
+    For each byte, the first entry is a part of one byte without a meaning. The other entries are numbers of the types
+    `TYPES` that may begin at this byte. A number may continue in the next frame, because the first byte of the frames
+    is not known yet.
 
     Args:
         rows: Bytes of the frames, each followed by the next frame, shape (n, 2 * length). The frames may begin at any
@@ -130,14 +133,14 @@ def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) ->
     """
     usual, is_constant = usual_bytes(rows)
     is_zero = is_constant & (usual == 0)
-    length = rows.shape[1] // 2
+    length = rows.shape[1] // 2  # a row has the bytes of two frames
     lowest_byte_first = slice(None) if order == "little" else slice(None, None, -1)
     parts_at: list[list[Part]] = []
     for position in range(length):
         pad_score = weights.constant if is_constant[position] else weights.noise
         parts = [Part("pad", "pad", 1, pad_score)]
         for kind in TYPES:  # such as "u16": the number is the size in bits
-            size = int(kind[1:]) // 8
+            size = int(kind[1:]) // 8  # in bytes
             span = slice(position, position + size)
             if span.stop <= 2 * length:
                 number_bytes = rows[:, span][:, lowest_byte_first]
@@ -219,6 +222,9 @@ def split_frame(
     @cache
     def best_division(position: int, row: str) -> tuple[float, tuple[Part, ...]]:
         """Find the best division of the bytes from a position to the end, and return its score and its parts.
+
+        The best division has the lowest score. The score is infinite if no division ends exactly at the last byte. A
+        row of channels does not begin with a part that is constant.
 
         Args:
             position: Position of the first byte.

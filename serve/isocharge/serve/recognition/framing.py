@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isocharge.serve.frames.checksums import CHECKSUMS, Crc
-from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC, ByteOrder
+from isocharge.serve.frames.frame_field import ByteOrder
+from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC
 from isocharge.serve.frames.stuffing import STUFFINGS, Stuffing
 
 Bytes = NDArray[np.uint8]
@@ -132,6 +133,7 @@ def _stuffed(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Windows]:
         return
 
     # If the lengths are as regular without decoding, there is no stuffing, and frames begin with this byte by chance.
+    # COBS is an exception, because it makes all frames of one length longer by the same number of bytes.
     _, count_without_decoding = _most_common_length(pieces)
     if name == "cobs" or count > count_without_decoding:
         frames = [piece for piece in decoded_pieces if len(piece) == length]
@@ -157,7 +159,9 @@ def _synchronised(stream: Bytes) -> Iterator[Windows]:
     """
     single_bytes = stream.astype(np.int64)
     byte_pairs = 256 * single_bytes[:-1] + single_bytes[1:]
-    best_coverage: dict[int, float] = {}  # by the length of the frame
+
+    # For each length of a frame, the largest share of the stream that is covered, and where its frames begin.
+    best_coverage: dict[int, float] = {}
     best_starts: dict[int, NDArray[np.int64]] = {}
     for codes, penalty in ((byte_pairs, 0.0), (single_bytes, SINGLE_BYTE_PENALTY)):
         for length, starts in _repeats(codes):
@@ -190,7 +194,7 @@ def _repeats(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]
     positions = all_positions[has_equal_code & has_frame_length]
     distances = all_distances[has_equal_code & has_frame_length]
 
-    # Count the pairs of code and distance. Each pair is encoded as one number.
+    # Count the pairs of code and distance. Each pair is encoded as one number, code * distance_count + distance.
     distance_count = MAX_FRAME_BYTES + 1
     keys = codes[positions] * distance_count + distances
     for key, count in zip(*np.unique(keys, return_counts=True), strict=True):
@@ -244,6 +248,9 @@ class Check(NamedTuple):
 def find_checks(rows: Bytes) -> Iterator[Check]:
     """Yield the checksums that fit the frames, from the widest to the narrowest.
 
+    The checksum is at the end of a frame. It covers the other bytes of the frame, but may leave out constant bytes at
+    the beginning, such as a sync pattern. For each size and byte order, at most one checksum is yielded.
+
     Args:
         rows: Bytes of the frames, shape (n, length).
     """
@@ -256,9 +263,11 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     _, is_constant = usual_bytes(checked_rows)
     length = len(is_constant)
     frames = [row.tobytes() for row in checked_rows]
+    # Number of constant bytes at the beginning: the position of the first False
     leading_constant_count = int(np.argmin([*is_constant[:MAX_FIRST_COVERED_BYTE], False]))
     for size in UNNAMED_CRCS:
-        if size + 2 > length or is_constant[-size:].all():
+        is_too_wide = size + 2 > length  # at least two bytes must remain
+        if is_too_wide or is_constant[-size:].all():
             continue
         last_begin = min(leading_constant_count, length - size - 1)
         for order in ORDERS[:size]:  # a single byte has no byte order

@@ -9,7 +9,8 @@ import numpy as np
 from isocharge.common.arrays import Booleans
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import SEQ, Frame, Parser
-from isocharge.serve.frames.frame_layout import PADDING, SYNC, ByteOrder
+from isocharge.serve.frames.frame_field import PADDING, ByteOrder
+from isocharge.serve.frames.frame_layout import SYNC
 from isocharge.serve.frames.text import Layout, TextParser
 from isocharge.serve.frames.text_lines import Notation
 from isocharge.serve.recognition.fields import Part, Weights, clock_of, parts_of, split_frame, steady_step
@@ -70,15 +71,15 @@ def _sync_lengths(may_be_sync: Booleans, start: int) -> Sequence[int]:
         start: Position of the first byte of the frame.
     """
     may_be_sync_from_start = np.roll(may_be_sync, -start)[:MAX_SYNC_BYTES]
-    longest_sync = int(np.argmin([*may_be_sync_from_start, False]))
+    longest_sync = int(np.argmin([*may_be_sync_from_start, False]))  # the position of the first False
     return range(1, longest_sync + 1)
 
 
 def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterator[tuple[float, dict[str, Any]]]:
     """Yield the possible descriptions of the frames with their scores.
 
-    For each start, checksum and byte order, one description is yielded. Descriptions without a checksum are tried only
-    if no checksum fits. The score is in bits for each byte of the
+    For each first byte of the frames, each checksum and each byte order, at most one description is yielded.
+    Descriptions without a checksum are tried only if no checksum fits. The score is in bits for each byte of the
     stream, including the bytes outside of all frames, so that frames of different lengths can be compared.
 
     Args:
@@ -90,11 +91,14 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
     rows = windows.rows()[:MAX_EXAMINED_FRAMES]
     if len(rows) < MIN_FRAMES - 1:
         return
+
+    # A frame with a sync pattern may begin at any constant byte of a window. Other windows begin with the frame.
     has_sync = windows.framing == SYNC
     usual, is_constant = usual_bytes(rows[:, :length])
     may_be_sync = is_constant & (usual != 0)  # zeros are mostly the high bytes of numbers
     starts = np.flatnonzero(may_be_sync)[:MAX_FRAME_STARTS].tolist() if has_sync else [0]
     checks = [(start, check) for start in starts for check in find_checks(rows[:, start : start + length])]
+
     covered_share = min(1.0, len(windows.starts) * length / len(windows.stream))
     rate_Hz = len(windows.stream) / length / seconds
     for order in ORDERS:
@@ -102,10 +106,11 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
         starts_without_check = [(start, Check(0, order, {})) for start in starts]
         for start, check in checks or starts_without_check:
             frame_parts = parts_at[start:] + parts_at[:start]  # from the first byte of the frame
-            checked_parts = frame_parts[: length - check.size]
+            parts_before_check = frame_parts[: length - check.size]
             sync_lengths = _sync_lengths(may_be_sync, start) if has_sync else [0]
-            score, sync_length, parts = split_frame(checked_parts, sync_lengths, weights)
-            if any(part.role == "channel" for part in parts):
+            score, sync_length, parts = split_frame(parts_before_check, sync_lengths, weights)
+            has_channel = any(part.role == "channel" for part in parts)
+            if has_channel:
                 sync = np.roll(usual, -start)[:sync_length].tobytes()
                 bits_per_byte = covered_share * score / length + (1.0 - covered_share) * weights.noise
                 yield bits_per_byte, _frames_section(windows, sync, check, order, parts)
@@ -253,7 +258,7 @@ def _meanings(frames: Sequence[Frame], rate_Hz: float) -> dict[int, str]:
     has_clock = frames[-1].t_us is not None
     steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, columns)
     for position, column_steps in enumerate(steps.T):
-        clock_name, clock_scale = clock_of(column_steps, rate_Hz) or ("", 0.0)
+        clock_name, clock_scale = clock_of(column_steps, rate_Hz) or ("", 0.0)  # no clock has an empty name
         if not has_counter and steady_step(column_steps) == 1.0:
             meanings[position] = SEQ
             has_counter = True

@@ -77,7 +77,7 @@ def _line(cells: Iterable[str]) -> str:
 
 
 def _cell(value: Any) -> str:
-    """Return the text of one cell."""
+    """Return the text of one cell: empty for None, words separated by blanks, and numbers with six decimals."""
     if value is None:
         return ""
     if isinstance(value, tuple):

@@ -2,15 +2,13 @@
 
 `Chain` contains the settings of all stages. `SignalChain` has the requested stages in the following order.
 
-- `Gain` converts the unit of the device to pC, with the offset, the sign and the gain of each channel.
-- `Limit` marks frames with a charge at the limit of the converter.
-- `HumStage` estimates and subtracts mains hum.
-- `TareStage` measures the mean and the noise of quiet frames, and subtracts the mean from all later frames.
-- `LeakStage` corrects the leak of the amplifiers, and estimates their inflow. If the settings have a memory, it
-  is replaced by `MemoryStage`, which also corrects creep, the thermoelastic step and the warmth of the film.
-- `TouchStage` detects touches with hysteresis.
-- `PressFlags` flags saturated presses, and charges below zero.
-- `Warming` estimates the common charge of a warming film with the model, and subtracts it.
+- `Gain` converts the unit of the device to pC, with the offset, the sign and the gain of each channel. - `Limit` marks
+  frames with a charge at the limit of the converter. - `HumStage` estimates and subtracts mains hum. - `TareStage`
+  measures the mean and the noise of quiet frames, and subtracts the mean from all later frames. - `LeakStage` corrects
+  the leak of the amplifiers, and estimates their inflow. If the settings have a memory, `MemoryStage` takes the place
+  of this stage, and also corrects creep, the thermoelastic step and the warmth of the film. - `TouchStage` detects
+  touches with hysteresis. - `PressFlags` flags saturated presses, and charges below zero. - `Warming` estimates the
+  common charge of a warming film with the model, and subtracts it.
 
 A frame with a value that cannot be a charge is not processed by the stages. The time of such a frame is added to the
 time of the next frame.
@@ -116,7 +114,9 @@ class SignalChain:
     """
 
     def __init__(self, settings: Chain, n_electrode: int, misfit: Misfit | None = None) -> None:
-        """Build the stages.
+        """Build the stages in the order in which they process a frame.
+
+        Stages without settings are left out, except gain, tare and touch, which are always present.
 
         Args:
             settings: Settings of all stages.
@@ -136,6 +136,7 @@ class SignalChain:
             stages.append(HumStage(settings.hum, n_electrode))
         self._tare_stage = TareStage(settings.tare, n_electrode)
         stages.append(self._tare_stage)
+
         # The offset stage is the last stage that stores the charge at rest. Warming is subtracted there.
         offset_stage: OffsetStage = self._tare_stage
         warmth_s = None
@@ -146,6 +147,7 @@ class SignalChain:
         elif settings.tau_s is not None:
             offset_stage = LeakStage(settings.leak, settings.tau_s)
             stages.append(offset_stage)
+
         earlier_stages = stages.copy()  # a copy, because further stages are appended below
         self._touch_stage = TouchStage(settings.touch, earlier_stages)
         stages += [self._touch_stage, PressFlags()]
@@ -177,7 +179,7 @@ class SignalChain:
                 raw_pC = self._gain.convert(values)
             return Reading(raw_pC, None, None, contact=False, flags=(*flags, INVALID))
 
-        step_s = dt_s + self._invalid_s
+        step_s = dt_s + self._invalid_s  # time since the previous valid frame
         self._invalid_s = 0.0
         frame = ChainFrame(values, t_s, step_s, limited, self._touch_stage.is_contact, list(flags))
         for stage in self.stages:

@@ -64,6 +64,10 @@ def update_contact(
 ) -> Touch:
     """Return the state of the touch detection after the next frame.
 
+    A touch begins when the total charge exceeds the base by the touch threshold. A touch ends when the total charge
+    falls below the release threshold. This threshold is a share of the peak of the press, but at least half of the
+    touch threshold.
+
     Args:
         rule: The thresholds.
         touch: State after the previous frame.
@@ -83,6 +87,7 @@ def update_contact(
             return Touch(last_pC=total_pC, base_pC=total_pC)
         return Touch(contact=True, peak_pC=peak_pC, last_pC=total_pC)
 
+    # Nothing has touched in the previous frame.
     base_pC = decay * touch.base_pC
     if total_pC > base_pC + touch_threshold_pC:
         return Touch(contact=True, peak_pC=min(total_pC, touch.last_pC), last_pC=total_pC)

@@ -58,6 +58,11 @@ class Hum(NamedTuple):
 def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) -> tuple[Hum, Array]:
     """Subtract the hum from a frame, and update the estimate.
 
+    The hum of a channel is the real part of a product of two complex numbers. The first is the phasor of the channel,
+    which has the amplitude and the phase of the hum. The second is a unit phasor that turns with the mains frequency.
+    The phasor of the channel is estimated from the differences between consecutive frames, which contain little of the
+    touch charge.
+
     Args:
         rule: Settings of the estimate of hum.
         hum: State after the previous frame.
@@ -68,7 +73,7 @@ def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) 
     Returns:
         The state after this frame, and the charges without hum, shape (electrodes,), pC.
     """
-    turn = cmath.exp(2j * math.pi * rule.frequency_Hz * t_s)  # the hum is the real part of phasor * turn
+    turn = cmath.exp(2j * math.pi * rule.frequency_Hz * t_s)  # the unit phasor at this frame
     turn_step = turn - hum.turn
     squared_step = turn_step.real * turn_step.real + turn_step.imag * turn_step.imag
     phasor_pC = hum.phasor_pC

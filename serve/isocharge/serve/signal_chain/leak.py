@@ -12,8 +12,8 @@ estimated only out of contact, where the innovation consists of b dt and noise.
 Three rules keep the frames of a touch from changing the inflow. Each innovation is clipped. A touch uses the inflow
 that was estimated `look_back_s` before. After a release, the estimate pauses for `hold_off_s`.
 
-Out of contact, the charge decays to zero. A charge that remains out of contact is an error, or comes from a slow
-warming of the film.
+While nothing touches the film, the computed touch charge is reduced exponentially to zero. A charge that is not zero
+then is an error, or comes from a slow warming of the film.
 """
 
 import math
@@ -26,7 +26,7 @@ from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
 
 
 class LeakRule(Rule, frozen=True, kw_only=True):
-    """Settings for estimating the inflow. They are a part of the section `[leak]` of a device file.
+    """Settings for estimating the inflow. These settings are a part of the section `[leak]` of a device file.
 
     Attributes:
         learn: Whether the inflow b is estimated.
@@ -82,6 +82,9 @@ def undo_leak(
 ) -> Leak:
     """Compute the touch charge of the next frame, and return the state after this frame.
 
+    The output of an amplifier decays with its time constant. The innovation is the difference between the output and
+    the decayed previous output. It consists of the inflow, noise and new touch charge.
+
     Args:
         rule: Settings of the estimate of the inflow.
         tau_s: Time constant of each amplifier, shape (electrodes,), s.
@@ -135,7 +138,8 @@ def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array,
     """Return the state with a corrected inflow.
 
     The inflow follows the mean of the surplus over `settle_s`. Large surpluses are clipped, because they are caused by
-    touches.
+    touches. The latest inflow may contain the beginning of a touch. Every `look_back_s`, the inflow is therefore stored
+    as the candidate, and the previous candidate becomes the trusted inflow.
 
     Args:
         rule: Settings of the estimate of the inflow.
@@ -145,8 +149,9 @@ def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array,
         dt_s: Time since the previous frame, s.
 
     Returns:
-        The state. Every `look_back_s` the candidate becomes the trusted inflow.
+        The state with the new inflow, candidate and trusted inflow.
     """
+    # The surplus of noise alone is the difference of two frames, whose standard deviation is sqrt(2) times larger.
     limit_pC = np.maximum(rule.clip_pC, rule.clip_sigmas * math.sqrt(2.0) * noise_pC)
     clipped_pC = np.minimum(np.maximum(surplus_pC, -limit_pC), limit_pC)
     learned_s = leak.learned_s + dt_s

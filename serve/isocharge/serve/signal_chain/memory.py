@@ -329,7 +329,10 @@ def _remaining_charge(memory: Memory, creep_pC: Array, step_pC: Array) -> Remain
     size_pC = math.sqrt(float(predicted_pC @ predicted_pC))
     if size_pC < MIN_CREEP_PC:
         return None
-    remaining_pC = memory.rows_pC[WARMTH_ROW] - memory.expected_pC[0]
+    expected_warmth_pC, _expected_slope = memory.expected_pC
+    remaining_pC = memory.rows_pC[WARMTH_ROW] - expected_warmth_pC
+
+    # The warmth may have changed during the touch, when it could not be observed.
     warmth_pC2 = WARMTH_CHANGE_PC**2 * len(predicted_pC) * memory.unseen_s
     return RemainingCharge(
         creep_pC=float(creep_pC @ predicted_pC) / size_pC,
@@ -353,6 +356,7 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
         The state with the updated film. If creep cannot explain the remaining charge, the film is not updated until
         the next release.
     """
+    # Charges that creep and step should have left, shape (electrodes,), and the charge that actually remains
     film = memory.film
     unit_creep_pC, unit_step_pC = SCALE_RESPONSE.dot(memory.rows_pC)
     creep_pC = film.creep * unit_creep_pC
@@ -370,6 +374,7 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
     if not is_explained:
         return memory._replace(learn_s=0.0)
 
+    # The Kalman update. The scale factors were 1 before the measurement.
     total_pC2 = prior_pC2 + measured.variance_pC2 * LEARN_S / max(dt_s, MIN_STEP_S)
     creep_scale = 1.0 + creep_covariance / total_pC2 * measured.charge_pC
     step_scale = 1.0 + step_covariance / total_pC2 * measured.charge_pC
@@ -378,6 +383,8 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
         variances.step - step_covariance**2 / total_pC2,
         variances.covariance - creep_covariance * step_covariance / total_pC2,
     )
+
+    # The charge that creep and step now explain is removed from the warmth.
     rows_pC = memory.rows_pC.copy()
     rows_pC[WARMTH_ROW] -= (creep_scale - 1.0) * creep_pC + (step_scale - 1.0) * step_pC
     learned = Film.of(film.creep * creep_scale, film.thermoelastic * step_scale, updated)
@@ -399,6 +406,8 @@ def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
     rows_pC = memory.rows_pC.copy()
     warmth_propagation = state_propagation(rule.warmth_s, age_s)[WARMTH_ROWS, WARMTH_ROWS]
     rows_pC[WARMTH_ROWS] = warmth_propagation.dot(memory.trusted_pC)
+
+    # The touch charge explains the part of the film's charge that the other rows do not explain.
     rows_pC[CHARGE_ROW] = 0.0
     charge_pC = (memory.film_pC - film.response.dot(rows_pC)) / film.step_response
     rows_pC[CHARGE_ROW] = charge_pC
@@ -414,6 +423,10 @@ def add_warmth(
     memory: Memory, change_pC: Array | float, rate_pC_per_s: Array | float, *, is_learned: bool = True
 ) -> Memory:
     """Return the state after a part of the touch charge has been assigned to the warmth.
+
+    The charge of the film directly after the change is the same. If the scale factors must not be updated after this
+    touch, the time for which the warmth could not be observed is set to infinity. The measurement after the release
+    then has an infinite variance and no influence.
 
     Args:
         memory: The state.
@@ -438,8 +451,9 @@ def add_warmth(
 def charge_scale_std(memory: Memory) -> float:
     """Return the relative standard deviation that all touch charges have in common, dimensionless.
 
-    It is computed from the variances of two scale factors, those of creep and of the thermoelastic step. Without a
-    touch, it is 0.
+    Errors of the scale factors of creep and of the thermoelastic step change the touch charge in proportion to the
+    charges of creep and step. The variance of the touch charge follows from the variances of the two scale factors.
+    Without a touch, the result is 0.
     """
     film = memory.film
     total_rows_pC = memory.rows_pC.sum(axis=1)  # summed over the electrodes, shape (rows,)

@@ -43,7 +43,7 @@ The first line is for `creep = 1`, and the second line for `thermoelastic = 1`.
 
 @lru_cache(maxsize=8)
 def _relaxation(warmth_s: float) -> tuple[Array, Array]:
-    """Return two matrices. The propagation of the state over any time is computed from them.
+    """Return two matrices, from which the propagation of the state over any time is computed.
 
     Args:
         warmth_s: Time constant with which the film follows the temperature of the air, s.

@@ -45,6 +45,15 @@ class Gain(Stage):
         charges = values if self._zero is None else values - self._zero
         return charges if self._gain_pC is None else charges * self._gain_pC
 
+    def revert(self, charge_pC: Array) -> Array:
+        """Convert charges, shape (electrodes,), pC, to values of the device. This is the inverse of `convert`.
+
+        The values are infinite if the charge per unit is nearly 0.
+        """
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            values = charge_pC if self._gain_pC is None else charge_pC / self._gain_pC
+        return values if self._zero is None else values + self._zero
+
     def step(self, frame: ChainFrame) -> None:
         """Set the raw charges of a frame."""
         frame.raw_pC = self.convert(frame.values)
@@ -93,9 +102,9 @@ class TareStage(OffsetStage):
         """
         self._rule = rule
         self._tare: Tare | None = None
-        self._waiting_pC = np.empty((0, n_electrode))
-        self._searched_frames = 0
-        self._gives_up = True
+        self._waiting_pC = np.empty((0, n_electrode))  # charges of the latest frames, from which the tare is measured
+        self._searched_frames = 0  # number of frames since the beginning of the search
+        self._gives_up = True  # whether the search ends with an error after too many frames
 
     @property
     def tare(self) -> Tare | None:
@@ -103,7 +112,7 @@ class TareStage(OffsetStage):
         return self._tare
 
     def step(self, frame: ChainFrame) -> None:
-        """Subtract the tare. While there is no tare, search for one.
+        """Subtract the tare. While there is no tare, search for a tare.
 
         Raises:
             TareError: If the film is touched during the whole search for a tare.
@@ -146,7 +155,7 @@ class TareStage(OffsetStage):
             self._tare = Tare(charge_pC=zero_pC, noise_pC=zero_pC, frames=0)
             return
         latest_pC = np.vstack([self._waiting_pC, charge_pC])
-        self._waiting_pC = latest_pC[-self._rule.frames :]
+        self._waiting_pC = latest_pC[-self._rule.frames :]  # at most as many frames as a tare needs
         if self._gives_up:
             self._searched_frames += 1
         self._tare = look_for_tare(self._rule, self._waiting_pC, self._searched_frames)
@@ -270,7 +279,10 @@ class TouchStage(Stage):
         return self._touch.contact
 
     def step(self, frame: ChainFrame) -> None:
-        """Determine whether something touches in this frame, and notify the earlier stages if a touch begins."""
+        """Determine whether something touches in this frame, and notify the earlier stages if a touch begins.
+
+        The earlier stages may then change the charges of the frame, because the touch began before it was detected.
+        """
         previous_touch = self._touch
         self._touch = self._next_touch(previous_touch, frame)
         frame.touch = self._touch
@@ -312,7 +324,10 @@ class PressFlags(Stage):
         self._is_saturated = False
 
     def step(self, frame: ChainFrame) -> None:
-        """Add the flags to a frame."""
+        """Add the flags `saturated` and `negative` to a frame.
+
+        A press that was saturated in one frame keeps the flag `saturated` until the press ends.
+        """
         was_saturated_in_press = self._is_saturated and frame.touch.contact
         self._is_saturated = frame.is_at_limit or was_saturated_in_press
         frame.is_saturated = self._is_saturated

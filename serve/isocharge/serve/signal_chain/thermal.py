@@ -10,7 +10,7 @@ of the estimate. A Kalman filter describes p as a random walk that begins at 0 w
 film predicts the warmth, the slope of p is the random walk.
 
 At positions where a press increases all charges equally, warming cannot be distinguished from force, and the curvature
-vanishes. With three electrodes, this is the case at every position. With four electrodes, it is the case near the
+vanishes. With three electrodes, this is the case at every position. With four electrodes, this is the case near the
 centre of a biaxial film. If warming cannot be distinguished from force, p is not changed, and the record has the flag
 `blind`.
 """
@@ -34,7 +34,7 @@ Misfit = Callable[[Array], Reals]
 
 
 class ThermalRule(Rule, frozen=True, kw_only=True):
-    """Settings for estimating the warming. They are a part of the section `[common_mode]` of a device file.
+    """Settings for estimating the warming. These settings are a part of the section `[common_mode]` of a device file.
 
     Attributes:
         every_s: Time between two estimates, s.
@@ -114,8 +114,11 @@ def track_thermal_drift(
     if estimate_pC2 > rule.blind_pC**2:
         return state._replace(waited_s=0.0, blind=True, rate_pC_per_s=0.0)
 
+    # The estimate is the minimum of the parabola, limited to the range of the trial values.
     minimum_pC = -slope / (2.0 * curvature)
     change_pC = min(max(minimum_pC, float(TRIED_PC[0])), float(TRIED_PC[-1]))
+
+    # Kalman update of p and of its rate of change
     charge_gain = predicted_pC2 / (predicted_pC2 + estimate_pC2)
     rate_gain = covariance / (predicted_pC2 + estimate_pC2)
     return ThermalDrift(
@@ -132,6 +135,9 @@ def _predicted_variances(
 ) -> tuple[float, float, float]:
     """Predict the uncertainty of the common charge p and of its rate of change.
 
+    The rate decays with the time constant `warmth_s` and has a white process noise. If this time constant is not known,
+    p is a random walk without a rate.
+
     Args:
         rule: Settings of the estimate of warming.
         state: State at the last estimate.
@@ -143,7 +149,8 @@ def _predicted_variances(
     """
     if warmth_s is None:
         return state.variance_pC2 + rule.wander_pC**2 * waited_s, 0.0, 0.0
-    # The process noise of the rate is such that p changes by `wander_pC` in one second.
+    # The process noise of the rate adds the variance rate_noise * waited_s^2 / 3 to p. With the factor of 3, p changes
+    # by `wander_pC` in one second.
     rate_noise = 3.0 * rule.wander_pC**2 * waited_s
     decay = math.exp(-waited_s / warmth_s)
     rate_effect_s = warmth_s * (1.0 - decay)  # change of p for a rate of 1

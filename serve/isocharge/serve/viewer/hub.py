@@ -36,6 +36,9 @@ LIVE_SAMPLES = 1 << 14
 MAX_PIECES = 600
 """Largest number of pieces in the overview of a recording."""
 
+FIRST_PIECE_S = 0.01
+"""Duration of a piece in the overview of a short recording, s. It is doubled until `MAX_PIECES` pieces suffice."""
+
 
 class Tape:
     """Ring buffer of the latest samples of a stream.
@@ -91,16 +94,19 @@ class RecordedTape(Tape):
     """All samples of a recording, stored in a temporary file.
 
     A time that is smaller than the previous time is replaced by the previous time.
-
-    Args:
-        dtype: NumPy type of a sample.
     """
 
     def __init__(self, dtype: "np.dtype[Any]") -> None:
-        """Create the temporary file. The class describes the argument."""
+        """Create the temporary file, and the overview of the forces.
+
+        The overview divides the recording into pieces of equal time, and contains the largest force of each piece.
+
+        Args:
+            dtype: NumPy type of a sample.
+        """
         super().__init__(dtype)
         self._file = tempfile.TemporaryFile()  # noqa: SIM115
-        self._piece_s = 0.01
+        self._piece_s = FIRST_PIECE_S
         self._max_force_N: list[float] = []
         self._map(LIVE_SAMPLES)
 
@@ -118,7 +124,8 @@ class RecordedTape(Tape):
         ordered = samples.copy()
         _, latest_s = self.span()
         known_s = np.nan_to_num(samples["timestamp"], nan=0.0)
-        ordered["timestamp"] = np.maximum(np.maximum.accumulate(known_s), latest_s)
+        largest_so_far_s = np.maximum.accumulate(known_s)
+        ordered["timestamp"] = np.maximum(largest_so_far_s, latest_s)
         while self.total + len(ordered) > len(self._ring):
             self._map(2 * len(self._ring))
         super().append(ordered)
@@ -154,7 +161,8 @@ class RecordedTape(Tape):
 
         # Neighbouring samples of one piece form a run.
         force_N = np.nan_to_num(samples["force_N"], nan=0.0)
-        run_starts = np.flatnonzero(np.diff(piece_of_sample, prepend=-1))
+        begins_run = np.diff(piece_of_sample, prepend=-1) != 0
+        run_starts = np.flatnonzero(begins_run)
         run_pieces = piece_of_sample[run_starts].tolist()
         run_max_N = np.maximum.reduceat(force_N, run_starts).tolist()
         for piece, max_force_N in zip(run_pieces, run_max_N, strict=True):
@@ -254,14 +262,9 @@ PROGRESS_INTERVAL_S = 0.5
 class Hub:
     """The stream and its viewers. All methods must be called in the same event loop.
 
-    Args:
-        link: Link to the process that reads the stream.
-        description: Description of the film, as `describe_film` returns it.
-        is_recording: Whether the stream is a recording.
-
     Attributes:
-        is_replay: Whether the stream is a recording.
-        requests: Type of the requests that the page may send.
+        is_recording: Whether the stream is a recording.
+        request_type: Type of the requests that the page may send.
         tape: The samples.
         description: Description of the film for the page.
         state: Values for the page that change rarely, such as counters and markers.
@@ -271,7 +274,16 @@ class Hub:
     """
 
     def __init__(self, link: PageEnd, description: dict[str, Any], *, is_recording: bool) -> None:
-        """Begin without samples and without viewers. The class describes the arguments."""
+        """Begin without samples and without viewers.
+
+        A recording is stored completely, and its viewers may select a position. Of a live stream, only the latest
+        samples are stored.
+
+        Args:
+            link: Link to the process that reads the stream.
+            description: Description of the film, as `describe_film` returns it.
+            is_recording: Whether the stream is a recording.
+        """
         self.description = description
         self.state: dict[str, Any] = {}
         self.version = 0
@@ -279,8 +291,9 @@ class Hub:
         self.has_ended = False
         self._link = link
         self._dtype = SampleFormat(tuple(description["electrodes"])).dtype
-        self.is_replay = is_recording
-        self.requests: Any = ReplayRequest if is_recording else LiveRequest
+        self.is_recording = is_recording
+        # The type is Any, because the type hints do not cover the union of the kinds of requests.
+        self.request_type: Any = ReplayRequest if is_recording else LiveRequest
         self.tape: Tape = RecordedTape(self._dtype) if is_recording else Tape(self._dtype)
 
     def close(self) -> None:
@@ -357,16 +370,20 @@ class Viewer:
         now_s = time.time()
         self.wake = asyncio.Event()
         self._hub = hub
-        self._playhead = Playhead() if hub.is_replay else None
-        self._next_sample = hub.tape.index(now_s - HISTORY_S)
+        self._playhead = Playhead() if hub.is_recording else None  # the position that is shown
+
+        # Samples and values that the page has received
+        self._next_sample = hub.tape.index(now_s - HISTORY_S)  # number of the first sample that was not sent
         self._begins_anew = True  # whether the next message replaces everything that the page shows
-        self._missed_samples = 0
-        self._state_version = -1
+        self._missed_samples = 0  # number of samples that were overwritten before they could be sent
+        self._state_version = -1  # version of the state that was sent last
+        self._must_send_playhead = True
+
+        # Messages with samples, which the page confirms
         self._sent_messages = 0
         self._confirmed_messages = 0
         self._latest_message_s = now_s
         self._latest_advance_s = now_s
-        self._must_send_playhead = True
 
     def confirm(self, number: int) -> None:
         """Store that the page has drawn the message with this number."""
@@ -389,6 +406,8 @@ class Viewer:
             self._advance(self._playhead, now_s)
         if self._sent_messages - self._confirmed_messages >= MAX_UNCONFIRMED_MESSAGES:
             return []
+
+        # The number of samples in a message is limited by the time since the previous message.
         elapsed_s = now_s - self._latest_message_s
         self._latest_message_s = now_s
         max_samples = int(min(max(MAX_SAMPLE_RATE_HZ * elapsed_s, MIN_MESSAGE_SAMPLES), MAX_MESSAGE_SAMPLES))
@@ -420,7 +439,7 @@ class Viewer:
         self._begins_anew = False
         if stop <= start and not begins_anew:
             return None
-        self._missed_samples += start - self._next_sample
+        self._missed_samples += start - self._next_sample  # they are no longer on the tape
         self._next_sample = stop
         self._sent_messages += 1
         limit = MAX_MESSAGE_SAMPLES if begins_anew else max_samples
@@ -435,14 +454,14 @@ class Viewer:
             return
         playhead.has_jumped = False
         self._begins_anew = True
-        start_s, _ = tape.span()
+        start_s, _ = tape.span()  # time of the first sample of the recording
         self._next_sample = tape.index(start_s + playhead.at_s - HISTORY_S)
 
     def _first_hidden_sample(self) -> int:
         """Return the number of the first sample that the viewer must not receive yet.
 
-        In a recording, this is the first sample after the position. In a live stream, it is the number of the next
-        sample that will arrive.
+        In a recording, this is the first sample after the position. In a live stream, this is the next sample that will
+        arrive.
         """
         tape = self._hub.tape
         if self._playhead is None or not tape.total:

@@ -79,7 +79,10 @@ class ReaderEnd(LinkEnd):
             self.is_open = False
 
     def enable_waiting(self) -> None:
-        """Let sending wait while the pipe is full. A recording needs this, so that all its samples are shown."""
+        """Let sending wait while the pipe is full.
+
+        The stream of a recording waits, so that all samples of the recording are shown.
+        """
         os.set_blocking(self.samples.fileno(), True)
         self.waits = True
 
@@ -119,12 +122,12 @@ class PageEnd(LinkEnd):
         data = self._incomplete
         try:
             data += os.read(self.samples.fileno(), PIPE_BYTES)
-        except BlockingIOError:
+        except BlockingIOError:  # no samples have arrived
             pass
         except OSError:
             self.is_open = False
         else:
-            self.is_open = bool(data)
+            self.is_open = bool(data)  # reading returns no bytes if the reader has closed its end
         complete_bytes = len(data) - len(data) % size
         self._incomplete = data[complete_bytes:]
         return data[:complete_bytes]
@@ -143,8 +146,11 @@ class PageEnd(LinkEnd):
 
 
 def make_link() -> tuple[ReaderEnd, PageEnd]:
-    """Create both ends of a link. Each end may be passed to a process that is started by `spawn`."""
-    page_pipe, reader_pipe = Pipe(duplex=False)
+    """Create both ends of a link. Each end may be passed to a process that is started by `spawn`.
+
+    A pipe carries the samples from the reader to the page. A pair of sockets carries messages in both directions.
+    """
+    page_pipe, reader_pipe = Pipe(duplex=False)  # the end that receives, and the end that sends
     for pipe_end in (page_pipe, reader_pipe):
         os.set_blocking(pipe_end.fileno(), False)
     with suppress(OSError):  # a smaller pipe is sufficient if the system does not allow this size

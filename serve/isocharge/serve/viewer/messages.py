@@ -1,20 +1,20 @@
 """Messages between the server and the live page: the description of the film, binary samples, and requests.
 
 The page reads the description before the first sample. The description contains the geometry, the electrodes, the model
-and the deflection field. The geometry comes from the sensor in the metadata of the model. Parts that are missing there
-are not drawn. The deflection field is a file in the folder of the model. For the films of the released models, it is a
-file of isocharge.
+and the deflection field. The geometry comes from the sensor in the metadata of the model. Parts of the film that the
+sensor does not describe are not drawn. The deflection field is a file in the folder of the model. For the films of the
+released models, the deflection field is a file of isocharge.
 
 A binary message to the page is little-endian: kind (u8, 1), zero (u8), number of samples (u16), number of the message
 (u32), time of sending (Unix time in seconds, f64), number of records that this page has missed (u32), options (u32, bit
 0: discard what was shown before), and the samples. When the page has drawn a message, it sends a confirmation, which is
 a binary message with the number (u32) of the drawn message.
 
-A sample is a prediction record of fixed size. If contacts are tracked, it contains the tracked contact instead of the
-contact of the frame. Several records are coalesced to one sample if there are more records than a browser can show. A
-sample is little-endian: the timestamp (Unix time in seconds, f64); the numbers that the declaration of the record marks
-for the live page (f32 each); the numbers of the other contact (f32 each); the flags (u32, one bit for each flag of
-`isocharge.serve.flags`, and the highest bit for a contact); the number of coalesced records (u32); and the touch
+A sample is a prediction record of fixed size. If contacts are tracked, a sample contains the tracked contact instead of
+the contact of the frame. Several records are coalesced to one sample if there are more records than a browser can show.
+A sample is little-endian: the timestamp (Unix time in seconds, f64); the numbers that the declaration of the record
+marks for the live page (f32 each); the numbers of the other contact (f32 each); the flags (u32, one bit for each flag
+of `isocharge.serve.flags`, and the highest bit for a contact); the number of coalesced records (u32); and the touch
 charges (pC, f32 for each electrode). Zeros fill the sample up to a multiple of eight bytes. An unknown number is NaN.
 The description of the film contains the offset of each number.
 
@@ -116,7 +116,11 @@ class SampleFormat:
         return {"bytes": self.dtype.itemsize, "offsets": offsets}
 
     def pack(self, record: PredictionRecord) -> bytes:
-        """Return a record as the bytes of a sample. The page shows the tracked contact if there is one."""
+        """Return a record as the bytes of a sample.
+
+        The sample contains the tracked contact if there is one, because the page shows it. Unknown numbers become NaN,
+        and each flag is one bit.
+        """
         bits = CONTACT_BIT if record.contact else 0
         for flag in record.flags:
             bits |= FLAG_BITS[flag]
@@ -134,10 +138,11 @@ class SampleFormat:
         charges = [charge_by_electrode.get(name) for name in self.electrodes]
         charge_pC = [math.nan if charge is None else charge for charge in charges]
         timestamp = math.nan if record.timestamp is None else record.timestamp
+        record_count = 1
         try:
-            return self._struct.pack(timestamp, *numbers, bits, 1, *charge_pC)
+            return self._struct.pack(timestamp, *numbers, bits, record_count, *charge_pC)
         except OverflowError:  # a number is beyond the range of float32
-            return self._struct.pack(timestamp, *_clip(numbers), bits, 1, *_clip(charge_pC))
+            return self._struct.pack(timestamp, *_clip(numbers), bits, record_count, *_clip(charge_pC))
 
 
 def _clip(values: Sequence[float]) -> list[float]:

@@ -102,12 +102,13 @@ def _describe_model(name: str, series: StressSeries) -> dict[str, Any]:
     if any(len(outlines.get(electrode, ())) != QUADRILATERAL for electrode in metadata.electrodes):
         raise ModelError(f"{name}: expected electrodes with four corners, got {outlines}; choose another model")
     validity = Validity.of(metadata)
+    compressed_network = gzip.compress((model.folder / "model.onnx").read_bytes(), compresslevel=9, mtime=0)
     return description | {
         "piezo_pC_per_N": piezo["d31"],
         "noise": {"white_pC": metadata.noise.white_pC, "gain": metadata.noise.gain},
         "misfit_limit": validity.misfit_limit,
         "yield_force_N": metadata.yield_force_N,
-        "network": base64.b64encode(gzip.compress((model.folder / "model.onnx").read_bytes(), 9, mtime=0)).decode(),
+        "network": base64.b64encode(compressed_network).decode(),
     }
 
 

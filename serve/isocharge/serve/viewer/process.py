@@ -107,6 +107,7 @@ def run_page(page: Page, announce: Callable[[str], object]) -> None:
         announce(page.address.url(listening, secure=page.tls is not None))
 
         async def serve() -> None:
+            """Answer browsers until the reader has ended."""
             async with PageServer(hub, access).listening(listening, tls_context):
                 await hub.run()
 

@@ -28,6 +28,7 @@ from websockets import http11
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
 from websockets.typing import Subprotocol
 
 from isocharge.common.errors import RequestError, TooMany, UnknownPath
@@ -78,15 +79,19 @@ class Access:
 
 
 def _bearer(subprotocols: Iterable[str]) -> bytes:
-    """Return the Authorization header that corresponds to the subprotocol with the token; empty if there is none."""
+    """Return the Authorization header that corresponds to the subprotocol with the token; empty if there is none.
+
+    A browser cannot set headers when it opens a WebSocket. The page therefore sends the token as a subprotocol, encoded
+    in base64 for URLs without padding.
+    """
     for subprotocol in subprotocols:
         if subprotocol.startswith(BEARER):
             text = subprotocol.removeprefix(BEARER)
-            padding = "=" * (-len(text) % 4)
+            padding = "=" * (-len(text) % 4)  # the decoder needs a multiple of four characters
             try:
                 return b"Bearer " + base64.b64decode(text + padding, altchars=b"-_", validate=True)
             except (binascii.Error, ValueError):
-                return b"Bearer"
+                return b"Bearer"  # a header without a token, which is refused as a wrong token
     return b""
 
 
@@ -179,7 +184,7 @@ class PageConnection(ServerConnection):
         super().connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        """Process received data, or end the connection if there are too many.
+        """Process received data, or end the connection if the client sends too much.
 
         Reading is paused while the client does not read, because responses would otherwise fill the memory.
         """
@@ -242,7 +247,11 @@ class PageServer:
     def _http_response(self, _connection: ServerConnection, request: http11.Request) -> http11.Response | None:
         """Return the response to an HTTP request; None if the request opens a WebSocket.
 
-        The files of the page need no token.
+        The files of the page need no token. The description of the session and the WebSocket need the token.
+
+        Args:
+            _connection: Connection of the request, which is not used.
+            request: The request, of which only the path and the headers are known.
         """
         try:
             path = request.path.partition("?")[0]
@@ -267,7 +276,7 @@ class PageServer:
         response = json_response(
             {
                 "id": self._id,
-                "is_replay": self._hub.is_replay,
+                "is_replay": self._hub.is_recording,
                 "film": self._hub.description,
                 "flags": [{"word": word, "bit": FLAG_BITS[word], "says": says} for word, says in MEANINGS.items()],
             }
@@ -283,14 +292,19 @@ class PageServer:
         try:
             async for message in connection:
                 await self._handle_message(viewer, connection, message)
-        except ConnectionClosed:
+        except ConnectionClosed:  # the viewer has disconnected
             pass
         finally:
             self._hub.viewers.discard(viewer)
             sender.cancel()
 
     async def _send(self, viewer: Viewer, connection: ServerConnection) -> None:
-        """Send messages to a viewer until the stream ends. A viewer that does not read is disconnected."""
+        """Send messages to a viewer until the stream ends. A viewer that does not read is disconnected.
+
+        Args:
+            viewer: The viewer, whose event `wake` is set when there may be something to send.
+            connection: Connection of the viewer.
+        """
         try:
             while not self._hub.has_ended:
                 await viewer.wake.wait()
@@ -298,7 +312,7 @@ class PageServer:
                 async with asyncio.timeout(SEND_TIMEOUT_S):
                     for message in viewer.messages(time.time()):
                         await connection.send(message)
-            await connection.close(1012, "the stream has ended")
+            await connection.close(CloseCode.SERVICE_RESTART, "the stream has ended")
         except TimeoutError:
             connection.transport.abort()
         except ConnectionClosed:
@@ -316,7 +330,7 @@ class PageServer:
             if isinstance(message, bytes):
                 viewer.confirm(confirmed_number(message))
                 return
-            request = parse_json(message, "", RequestError, self._hub.requests)
+            request = parse_json(message, "", RequestError, self._hub.request_type)
             if not self._hub.handle(request, viewer):
                 raise RequestError("the stream has ended, or does not answer")
         except RequestError as error:
@@ -349,5 +363,7 @@ def _file_response(path: Path) -> Response:
     response = response_of(200, CONTENT_TYPES[path.suffix], path.read_bytes())
     response.headers.append((b"content-security-policy", CONTENT_SECURITY_POLICY))
     response.headers.append((b"cache-control", b"no-cache"))
-    response.headers.extend(header for header in PAGE_HEADERS if header[0] != b"content-security-policy")
+    for name, value in PAGE_HEADERS:
+        if name != b"content-security-policy":  # this page has its own policy
+            response.headers.append((name, value))
     return response

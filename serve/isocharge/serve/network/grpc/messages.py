@@ -100,7 +100,11 @@ def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
 
 
 def write_response(answer: InferAnswer) -> Any:
-    """Return the outputs of a model as a ModelInferResponse."""
+    """Return the outputs of a model as a ModelInferResponse.
+
+    The values of an output are raw contents if the request asks for a binary tensor, and otherwise a list of texts or
+    numbers.
+    """
     _, response_type = METHODS["ModelInfer"]
     message = response_type()
     message.model_name = answer.name

@@ -133,6 +133,7 @@ class Service:
                     client=context.peer() if self._traffic.log else None,
                 )
             )
+        # An error has occurred. It ends the call with its status and its message.
         return await context.abort(grpc.StatusCode[status], message)
 
     async def _answer_call(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes | None:

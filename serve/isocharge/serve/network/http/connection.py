@@ -50,11 +50,6 @@ class Phase(Enum):
 class Connection(asyncio.Protocol):
     """One connection of the server.
 
-    Args:
-        handler: Answers the requests.
-        connections: Open connections of the server.
-        loop: Event loop of the server.
-
     Attributes:
         deadline: Time at which the connection is ended if the client has not taken its next step, s, on the clock of
             the event loop.
@@ -62,7 +57,13 @@ class Connection(asyncio.Protocol):
     """
 
     def __init__(self, handler: Handler, connections: "set[Connection]", loop: asyncio.AbstractEventLoop) -> None:
-        """Begin a connection without data. The class describes the arguments."""
+        """Begin a connection without data.
+
+        Args:
+            handler: Answers the requests.
+            connections: Open connections of the server.
+            loop: Event loop of the server.
+        """
         self.deadline = math.inf
         self.has_completed_request = False
         self._handler = handler
@@ -107,14 +108,20 @@ class Connection(asyncio.Protocol):
         """Accept the connection. If there are too many connections, refuse it."""
         self._transport = transport
         peer = transport.get_extra_info("peername")
-        self._client = (str(peer[0]), int(peer[1])) if isinstance(peer, tuple) else None
+        self._client = None  # a Unix socket has no address of the client
+        if isinstance(peer, tuple):
+            host, port, *_ = peer
+            self._client = (str(host), int(port))
         self._connections.add(self)
         self._set_deadline(self._limits.header_seconds)
-        if len(self._connections) > self._limits.connections and not self._end_oldest_unused():
+        is_one_too_many = len(self._connections) > self._limits.connections
+        if is_one_too_many and not self._end_oldest_unused():  # no other connection can make room for this one
             self._refuse(refusal(503, f"all {self._limits.connections} connections are taken; try again later"))
 
     def _end_oldest_unused(self) -> bool:
-        """End the oldest connection on which no complete request has arrived.
+        """End the oldest other connection on which no complete request has arrived.
+
+        The oldest connection is the one whose deadline for the request comes first.
 
         Returns:
             Whether there was such a connection.
@@ -144,16 +151,18 @@ class Connection(asyncio.Protocol):
         must_wait = self._unparsed or self._answering or self._is_blocked
         if must_wait or len(data) > SLICE_BYTES:
             self._unparsed += data
-            if self._next_turn is None:
+            if self._next_turn is None:  # otherwise the event loop will parse the stored data
                 self._parse_stored_data()
             return
 
+        # The data are a request with the same head as the latest request.
         repeats_head = len(data) == self._remembered_bytes and data.startswith(self._remembered_head)
         if repeats_head and self._head is not None:
             body = data[len(self._remembered_head) :]
             self._answer(self._head, body)
             return
 
+        # The data are any other short data.
         begins_request = self._phase is Phase.IDLE
         self._parse(data)
         if begins_request and self._piece_was_answered:
@@ -226,9 +235,9 @@ class Connection(asyncio.Protocol):
         self._resume_reading()
 
     def _resume_reading(self) -> None:
-        """Read more data if all data are parsed.
+        """Read more data if all data are parsed, and otherwise pause reading.
 
-        If the client has ended its data, the connection is closed instead.
+        If all data are parsed and the client has ended its data, the connection is closed instead.
         """
         if self._transport.is_closing():
             return
@@ -387,6 +396,10 @@ class Connection(asyncio.Protocol):
         """Answer a request in another thread, and afterwards the requests that have arrived in the meantime.
 
         If one of the later requests also needs another thread, the remaining requests wait for its answer.
+
+        Args:
+            head: Request line and headers of the request.
+            body: Body of the request.
         """
         response = await asyncio.to_thread(
             self._handler.answer, head.method, head.path, head.headers, body, self._client
@@ -426,7 +439,7 @@ class Connection(asyncio.Protocol):
         if is_last:
             self._transport.close()
         elif self._is_blocked and self._transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
-            self._transport.abort()
+            self._transport.abort()  # the client sends requests but does not read the responses
         self._timed_phase = Phase.IDLE
         self._set_deadline(self._limits.idle_seconds)
 

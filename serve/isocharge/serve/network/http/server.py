@@ -90,7 +90,7 @@ class HttpServer:
         await self._finish(loop)
 
     async def _finish(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Finish the requests that have begun, for at most `GRACE_SECONDS`."""
+        """Finish the requests that have begun, for at most `GRACE_SECONDS`, and then end all remaining connections."""
         for connection in list(self._connections):
             connection.shutdown()
         grace_end = loop.time() + GRACE_SECONDS

@@ -64,7 +64,10 @@ _PATTERNS = [(_pattern(template), route) for route in ROUTES for template in rou
 
 @lru_cache(MAX_REMEMBERED_PATHS)
 def match_path(path: str) -> Match:
-    """Return the route of a path."""
+    """Return the route of a path, with the name and the version of the model that the path contains.
+
+    The name and the version are empty if the path contains none. The result is `NO_ROUTE` if no route has this path.
+    """
     for pattern, route in _PATTERNS:
         found = pattern.fullmatch(path)
         if found is not None:

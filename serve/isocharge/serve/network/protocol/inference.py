@@ -1,4 +1,6 @@
-"""One inference of the Open Inference Protocol. Its steps read the request, run the model and write the response.
+"""One inference of the Open Inference Protocol.
+
+The steps of an inference read the request, run the model and write the response.
 
 A body is JSON, which may be followed by binary tensors. If there are binary tensors, a header contains the length of
 the JSON. The gRPC service converts its messages to the same JSON objects and also uses `parse_request`.
@@ -34,6 +36,9 @@ DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype
 
 FLAGS = "flags"
 """Name of the output with the flags of each press, separated by commas. It is computed only on request."""
+
+MAX_LENGTH_DIGITS = 12
+"""Largest number of digits of the length of a JSON text in a header. No body is so long."""
 
 Rows = np.ndarray[Any, Any]
 """Values of an output, shape (n, width): numbers, or texts for the output `flags`."""
@@ -143,7 +148,7 @@ def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, 
     if header_length is None:
         return parse_request(read_object(body), b"", loaded, max_presses)
     # The digits are tested first, because int() accepts signs, blanks and underscores, and is slow for a long text.
-    is_short_number = header_length.isdigit() and len(header_length) <= 12
+    is_short_number = header_length.isdigit() and len(header_length) <= MAX_LENGTH_DIGITS
     if not is_short_number or int(header_length) > len(body):
         raise RequestError(
             f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
@@ -389,7 +394,7 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
     Raises:
         ModelError: If onnxruntime fails to run the graph.
     """
-    if FLAGS in names:  # the flags are computed from all other outputs
+    if FLAGS in names:  # the flags are computed from all outputs of the graph
         outputs, unchecked, alarms = infer(loaded, charge_pC, loaded.outputs)
         outputs[FLAGS] = _flags(loaded, outputs)
         return {name: outputs[name] for name in names}, unchecked, alarms
@@ -401,7 +406,7 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
     check_output_shapes(outputs, count, loaded.metadata.label)
     if "misfit" not in outputs:
         return outputs, count, 0
-    good_count = int(np.count_nonzero(outputs["misfit"] <= loaded.validity.misfit_limit))
+    good_count = int(np.count_nonzero(outputs["misfit"] <= loaded.validity.misfit_limit))  # a misfit of NaN is not good
     return outputs, 0, count - good_count
 
 

@@ -64,7 +64,7 @@ def _path_item(path: str, route: Route) -> Json:
         operation["requestBody"] = {"content": content}
         if route.body.is_required:
             operation["requestBody"]["required"] = True
-    parameter_names = [name for name in ("model", "version") if f"{{{name}}}" in path]
+    parameter_names = [name for name in ("model", "version") if "{" + name + "}" in path]
     parameters = [{"$ref": f"#/components/parameters/{name}"} for name in parameter_names]
     return {"parameters": parameters, route.method.lower(): operation}
 
@@ -81,7 +81,11 @@ def _path_parameter(name: str, values: set[str]) -> Json:
 
 
 def _schemas(routes: Iterable[Route]) -> dict[str, Any]:
-    """Return the schemas of all bodies and answers by name."""
+    """Return the schemas of all bodies and answers by name.
+
+    The content of a schema is given directly, or derived from a type. A derived schema may refer to further schemas,
+    which the result also contains.
+    """
     used = [ERROR]
     for route in routes:
         used.append(route.answer)

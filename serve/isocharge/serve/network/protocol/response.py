@@ -75,7 +75,11 @@ def refusal(status: int, message: str, error: str | None = None) -> Response:
 
 
 def error_response(error: Exception) -> Response:
-    """Return the response to a request that raised an error."""
+    """Return the response to a request that raised an error.
+
+    The body contains the message. If the method is wrong, a header names the allowed method. If the token is missing or
+    wrong, a header names the required authentication.
+    """
     http_status, _ = statuses(error)
     response = refusal(http_status, client_message(error), type(error).__name__)
     if isinstance(error, errors.WrongMethod):
@@ -111,7 +115,7 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
         raise errors.UnknownEncoding(f"Content-Encoding {_shown(encoding)}: expected gzip, deflate or identity")
     decompressor = zlib.decompressobj(_WINDOW_BITS[encoding])
     try:
-        plain = decompressor.decompress(body, limit + 1)
+        plain = decompressor.decompress(body, limit + 1)  # one byte more shows that the limit is exceeded
     except zlib.error as error:
         raise errors.RequestError(
             f"the body is not {_shown(encoding)}, as its Content-Encoding states: {error}"
@@ -144,12 +148,15 @@ def compress(body: bytes, accepted: bytes) -> tuple[bytes, bytes]:
 
 
 def _accepted_encodings(header: bytes) -> set[bytes]:
-    """Return the names of the encodings in an Accept-Encoding header, except names with the weight 0."""
+    """Return the names of the encodings in an Accept-Encoding header, except names with the weight 0.
+
+    For example, the names in `gzip, deflate;q=0.5, br;q=0` are `gzip` and `deflate`.
+    """
     names = set()
     for part in header.split(b","):
         normalised = part.replace(b" ", b"").lower()
         name, _, weight = normalised.partition(b";q=")
-        is_zero = weight != b"" and weight.strip(b"0.") == b""
+        is_zero = weight != b"" and weight.strip(b"0.") == b""  # such as 0, 0. and 0.000
         if not is_zero:
             names.add(name)
     return names

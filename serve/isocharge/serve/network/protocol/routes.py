@@ -255,7 +255,7 @@ def _show_config(request: Request) -> Response:
 
 
 def _infer(request: Request) -> Response:
-    """Compute the contacts of the presses in a request.
+    """Compute the contacts of the presses in a request, and return them as JSON, which binary tensors may follow.
 
     Only this response is compressed, because the asyncio client of Triton does not decompress other responses.
     """
@@ -266,6 +266,7 @@ def _infer(request: Request) -> Response:
     accepted_encodings = request.headers.get(b"accept-encoding", b"")
     body, encoding = compress(plain_body, accepted_encodings)
 
+    # If binary tensors follow the JSON, a header states the length of the JSON.
     content_type = b"application/json" if json_length is None else b"application/octet-stream"
     response = response_of(200, content_type, body)
     if json_length is not None:

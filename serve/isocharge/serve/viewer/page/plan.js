@@ -57,7 +57,7 @@ export class Plan {
     this.toMillimetres(g);
     g.lineJoin = "round";
     if (film.radius_mm) { g.fillStyle = theme.film; circle(g, 0, 0, film.radius_mm); g.fill(); }
-    this.drawUnnoticed(g);
+    this.drawRegion(g);
     g.lineWidth = px; g.strokeStyle = theme.line;
     this.drawGrid(g);
     g.fillStyle = theme.area; path(g, film.working_area_mm); g.fill();
@@ -79,6 +79,9 @@ export class Plan {
   }
 
   /** Shade the places where most presses are answered with a wrong contact and without a flag. */
+  /** Draw the part of the film where most presses are answered wrongly without a flag. */
+  drawRegion(g) { this.drawUnnoticed(g); }
+
   drawUnnoticed(g) {
     const { unnoticed } = this.film;
     if (!unnoticed) return;

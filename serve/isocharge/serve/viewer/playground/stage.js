@@ -11,6 +11,9 @@ class Stage extends Plan {
     this.reach = VIEW_MM;
   }
 
+  /** The playground computes the mirror region for the chosen force, and `drawMirror` draws it. */
+  drawRegion() {}
+
   /** @param view {{press, sample, kind, trail, curves, lensCurves, mirror}} what is drawn over the film */
   draw(view) {
     const g = this.drawBackground();
