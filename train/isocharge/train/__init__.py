@@ -1,6 +1,10 @@
 """Training of small networks that compute contacts from charges, and calibration of films by measured presses.
 
-A network is trained on a dataset, and released as a folder with an ONNX model and its card:
+A network is trained on a dataset, and released as a folder with an ONNX model and its card. Each of the functions in
+the example can be used without the others. The names in `needs_torch` are imported when they are first used, because
+torch takes a second to import.
+
+Example:
 
     from isocharge.simulate import read_dataset
     from isocharge.train import evaluate, fit, release
@@ -8,9 +12,6 @@ A network is trained on a dataset, and released as a folder with an ONNX model a
     fitted = fit(read_dataset(Path("presses")))
     print(evaluate(fitted))
     release(fitted, Path("models/mine"))
-
-Each of these functions can be used without the others. The names in `needs_torch` are imported when they are first
-used, because torch takes a second to import.
 """
 
 from importlib import import_module
@@ -90,7 +91,13 @@ else:  # hidden from type checkers, which would otherwise accept every misspelt 
     _version_attribute = version_attribute(__name__)
 
     def __getattr__(name):
-        """Import a public name from `needs_torch` when it is first used."""
+        """Import a public name from `needs_torch` when it is first used, and store it in the module.
+
+        The import is delayed, because PyTorch takes long to import.
+
+        Args:
+            name: Name of the attribute.
+        """
         if name not in __all__:
             return _version_attribute(name)
         with require("train"):

@@ -106,7 +106,7 @@ def calibrate_command(
     """Calibrate a film: estimate its parameters from measured presses, and write a model of this film.
 
     Three presses are useful, and eight are recommended. The position of each press must be known, or its force, or
-    both. --next proposes presses, also before the first press. The command names the parameters that the presses do not
+    both. --next proposes presses, even before the first press. The command names the parameters that the presses do not
     determine.
 
     `isocharge train press` guides presses at a port, and writes their file.
@@ -157,7 +157,12 @@ def calibrate_into(presses: MeasuredPresses, problem: CalibrationProblem, output
 
 
 def _fit(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
-    """Return the calibration by presses."""
+    """Calibrate the film by presses, and print the cautions of the calibration.
+
+    Args:
+        presses: The presses.
+        problem: The possible films.
+    """
     say(f"fitting the film to {len(presses)} presses")
     result = calibrate(presses, problem)
     for caution in result.cautions:
@@ -174,8 +179,8 @@ def _print_result(result: CalibrationResult | None, proposed: list[ProposedPress
         json: Whether to print JSON instead of sentences.
     """
     if json:
-        fields = {} if result is None else result_table(result)
-        show_json(fields | {"next": [vars(press) for press in proposed]})
+        result_fields = {} if result is None else result_table(result)
+        show_json(result_fields | {"next": [vars(press) for press in proposed]})
         return
     if result is not None:
         for sentence in result.summary:
@@ -188,7 +193,7 @@ def _print_result(result: CalibrationResult | None, proposed: list[ProposedPress
 
 
 def _with_temperature(presses: MeasuredPresses, temperature_C: float | None) -> MeasuredPresses:
-    """Return the presses with a temperature for the whole film, unless their temperatures are known already."""
+    """Return the presses with one temperature for all, unless the presses already have temperatures."""
     if temperature_C is None or presses.knows_temperature:
         return presses
     return replace(presses, temperature_C=np.full(len(presses), temperature_C))
@@ -232,7 +237,7 @@ def _check_usage(
 
 
 def _check_side_forces(file: Path | None, friction: float, side_force: float, *, is_moved: bool) -> None:
-    """Refuse an option about side forces if neither presses nor a model are given to which it applies.
+    """Refuse an option for side forces if the command has neither presses nor a model to which the option could apply.
 
     Args:
         file: File of presses.

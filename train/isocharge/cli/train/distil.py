@@ -36,10 +36,11 @@ def distil_command(
     """Train a small network on the answers of MODEL, for microcontrollers: about 5,000 weights and biases.
 
     The small network, called the student, has the inputs and outputs of MODEL: contact, standard deviations and misfit.
-    It is trained on presses within the working area and the forces of MODEL, which are simulated first. `isocharge
-    train export-c` writes the student as C source.
+    The student is trained on simulated presses within the working area and the range of forces of MODEL. The command
+    `isocharge train export-c` writes the student as C source.
 
-    A run that was stopped leaves models/NAME/VERSION.part. The same command continues it and makes the same student.
+    A run that was stopped leaves models/NAME/VERSION.part. The same command continues a stopped run and makes the same
+    student.
 
     Example: isocharge train distil four-25um-biaxial -o models/four-25um-biaxial-student
     """
@@ -55,9 +56,10 @@ def distil_command(
         fit_config = student_config("int8")
     else:
         fit_config = student_config("float32")
+
     case = StudentCase.of(load_model(model_folder).metadata)
     options = ReleaseOptions(output, version, fresh=fresh, json=json)
-    version_folder = options.check_version_folder(case.sensor.electrode_names)
+    version_folder = options.check_version_folder(case.sensor.electrode_names)  # raises before the long computation
     with shown_progress():
         presses = simulated_presses(case.sensor, case.probes, case.domain.radius, case.domain.force_range)
     data = student_data(model_folder, presses)

@@ -74,7 +74,8 @@ def fit_command(
             "--sensor",
             metavar="SENSOR",
             help="Sensor of PRESSES.csv: the name of a built-in sensor or a TOML file. Without a file, 24,000 presses "
-            "from 0.05 to 2 N are simulated on this sensor. (default: the sensor of DATASET)",
+            "from 0.05 to 2 N are simulated on this sensor, and 96,000 if it has more than four electrodes. (default: "
+            "the sensor of DATASET)",
         ),
     ] = None,
     probe: Annotated[
@@ -102,20 +103,21 @@ def fit_command(
 ) -> None:
     """Train a network on charges, measure its errors, and write a model folder: ONNX file, card, golden vectors.
 
-    The presses come from DATASET. With --sensor and no DATASET the presses are simulated first, with the probes of
-    --probe and within the radius of --radius.
+    The presses come from DATASET. With --sensor and no DATASET, presses are simulated first. The option --probe states
+    their probes, and --radius their largest distance from the centre.
 
-    From measured presses with --sensor the film is calibrated, as by `isocharge train calibrate`. If there is no
-    network for all films of this sensor, the presses correct the charges of the sensor as described, and a fifth of the
-    presses is held out to measure the errors. From measured presses without --sensor a network is trained on the
-    presses alone. The sensor can then be any sensor with three to eight channels, and every other column of the file is
-    a channel. The errors are measured by cross-validation, in which all presses at a place are left out together.
+    With measured presses and --sensor, the film is calibrated, as `isocharge train calibrate` does. If there is no
+    network for all films of this sensor, the presses instead correct the simulated charges. A fifth of the presses is
+    then held out to measure the errors. With measured presses and no --sensor, a network is trained on the presses
+    alone. The sensor can then be any sensor with three to eight channels, and every other column of the file is a
+    channel. The errors are measured by cross-validation, in which all presses at a place are left out together.
 
-    With --films the pretension, the stiffness, the piezoelectric coefficients, the gains and the positions of the
-    electrodes are drawn at random, as they vary between films. The model folder then also contains films.npz, the
-    network for all these films.
+    With --films, the network is trained on many films. The pretension, stiffness, piezoelectric coefficients, gains and
+    electrode positions of these films are drawn at random. The model folder then also contains films.npz, the network
+    for all these films.
 
-    A run that was stopped leaves models/NAME/VERSION.part. The same command continues it and makes the same model.
+    A run that was stopped leaves models/NAME/VERSION.part. The same command continues a stopped run and makes the same
+    model.
 
     Example: isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
 
@@ -165,7 +167,8 @@ def _release_films_model(film_prior: FilmPrior, films_config: FilmsConfig, optio
         options: Folder and version of the model.
     """
     version_folder = options.check_version_folder(film_prior.sensor.electrode_names)
-    warn_of_stress(film_prior.sensor.film, [film_prior.probe], films_config.force_range[1])
+    _, max_force = films_config.force_range
+    warn_of_stress(film_prior.sensor.film, [film_prior.probe], max_force)
 
     def train(run: ResumableRun) -> FilmsModel:
         """Train the network on all cores of this machine."""
@@ -190,6 +193,7 @@ def _release_presses_model(
     sensor_name = options.model_folder.resolve().name
 
     def train(run: ResumableRun) -> Fitted:
+        """Train the network, and save the state in the run."""
         return fit_presses(presses, sensor_name, fit_config, probes=notations, run=run)
 
     train_and_release(train, presses_identity(presses, fit_config), version_folder, options, release)
@@ -205,7 +209,8 @@ def _release_data_model(data: TrainingData, fit_config: FitConfig, options: Rele
     """
     version_folder = options.check_version_folder(data.sensor.electrode_names)
     probes = [parse_probe(notation) for notation in data.probes]
-    warn_of_stress(data.sensor.film, probes, data.domain.force_range[1])
+    _, max_force = data.domain.force_range
+    warn_of_stress(data.sensor.film, probes, max_force)
 
     def train(run: ResumableRun) -> Fitted:
         """Train the network, and save the state in the run."""
@@ -266,7 +271,7 @@ def _read_presses_of_unknown_sensor(
 def _read_rig(
     file: Path, sensor: str | None, notations: list[str], radius: str, position_std_mm: float, force_std: float
 ) -> Rig:
-    """Read the measured presses of a sensor with a description.
+    """Read presses that were measured with a sensor for which a sensor file exists.
 
     Args:
         file: CSV file of the presses.
@@ -291,13 +296,14 @@ def _read_rig(
         raise InputError("--radius: expected a number of mm with measured presses, got auto")
     if len(notations) != 1:
         raise InputError(f"--probe: expected the one probe that made the presses, got {', '.join(notations)}")
+    (notation,) = notations
     described_sensor = load_sensor(sensor)
     presses = read_press_file(file, described_sensor.electrode_names, position_std_mm, force_std)
-    return Rig(presses, described_sensor, parse_probe(notations[0]), parse_radius_mm(radius))
+    return Rig(presses, described_sensor, parse_probe(notation), parse_radius_mm(radius))
 
 
 def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | None:
-    """Return the problem of calibrating the film of measured presses.
+    """Return the calibration problem for the film of measured presses.
 
     Args:
         rig: The presses, the sensor and the probe.
@@ -314,7 +320,7 @@ def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | N
 
 
 def refuse_training_options(config: Path | None, version: int, radius: str) -> None:
-    """Refuse options of the network's training if the film is calibrated. No network is trained in this case.
+    """Refuse options for the training of a network if presses only calibrate the film.
 
     Args:
         config: File with training settings; None if the option was not given.
@@ -370,7 +376,7 @@ def _film_prior(
         raise InputError(
             "--films: expected --radius in mm, got auto, which is different for each film; give a number of mm"
         )
-    probe = parse_probe(notations[0])
-    if len(notations) != 1 or not isinstance(probe, Circle):
+    first_probe = parse_probe(notations[0])
+    if len(notations) != 1 or not isinstance(first_probe, Circle):
         raise InputError(f"--films: expected one probe circle:RADIUS, got {', '.join(notations)}")
-    return FilmPrior(load_sensor(sensor), probe)
+    return FilmPrior(load_sensor(sensor), first_probe)

@@ -168,7 +168,7 @@ def press_command(
 def _open_session(
     press_file: PressFile, problem: CalibrationProblem, until: float, stds: dict[str, float]
 ) -> PressSession:
-    """Return a session that continues with the presses of the file, if it has any.
+    """Return a session that begins with the presses that are already in the file.
 
     Args:
         press_file: File of the presses.
@@ -194,7 +194,9 @@ def _check_list(contacts: Array, session: PressSession, name: str) -> None:
 
 @contextmanager
 def _open_events(port: SensorPort, problem: CalibrationProblem) -> Iterator[PressEvents]:
-    """Open the port of the board, and yield its readings and the lines that are typed.
+    """Open the port of the board, and yield the source of its readings and of the typed lines.
+
+    The common mode of the device file is not used, because its removal needs a calibrated model.
 
     Args:
         port: Port, device file and keyboard.

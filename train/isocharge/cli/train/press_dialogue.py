@@ -57,11 +57,18 @@ class Screen:
         say(sentence)
 
     def show_phase(self, watched: WatchResult) -> None:
-        """Print the instruction of the present phase, and the charges while a press settles."""
+        """Print the instruction of the present phase, and the charges while a press settles.
+
+        Within one phase, at least `LINE_INTERVAL_s` pass between two lines.
+
+        Args:
+            watched: Result of the watch for the last reading.
+        """
         if watched.phase not in PHASE_TEXTS:
             return
         is_new_phase = watched.phase != self._last_phase
-        if not is_new_phase and watched.held_s - self._last_line_s < LINE_INTERVAL_s:
+        is_too_soon = watched.held_s - self._last_line_s < LINE_INTERVAL_s
+        if not is_new_phase and is_too_soon:
             return
         self._last_phase = watched.phase
         self._last_line_s = watched.held_s
@@ -165,26 +172,34 @@ class Dialogue:
             self._screen.say(f"   row {row_number} is left out: {event.reason}")
 
     def _wait_for(self, *phases: Phase) -> WatchResult:
-        """Wait for the next reading in one of the given phases. Earlier readings only update the displayed phase."""
+        """Wait for the next reading in one of the given phases.
+
+        Earlier readings only update the displayed phase, and typed lines are ignored.
+        """
         while True:
             event = self._events.next()
-            if isinstance(event, str):
+            if isinstance(event, str):  # a typed line
                 continue
             if event.phase in phases:
                 return event
             self._screen.show_phase(event)
 
     def _guide_press(self, *, asks: bool) -> None:
-        """Propose a press, and return when it has been recorded or when another press must be proposed."""
+        """Propose a press, and return when it has been recorded or when another press must be proposed.
+
+        Args:
+            asks: Whether to ask where a steady press was made. Otherwise it counts as made where it was proposed.
+        """
         proposed = self._session.proposed
-        press: SteadyPress | None = None
+        press: SteadyPress | None = None  # the steady press about which a question is open
         self._screen.say(f"{len(self._session) + 1}. Press {describe_press(proposed.contact)} and hold.")
         self._events.arm()
         # Undoing an earlier press changes the proposal, except that the answer about a steady press comes first.
         while press is not None or self._session.proposed is proposed:
             event = self._events.next()
-            if isinstance(event, str):
-                if self._handle_line(event, press, proposed.contact):
+            if isinstance(event, str):  # a typed line
+                is_settled = self._handle_line(event, press, proposed.contact)
+                if is_settled:
                     return
             elif press is not None:
                 continue  # readings do not matter while the question is open
@@ -221,6 +236,9 @@ class Dialogue:
     def _act_on(self, answer: Answer, press: SteadyPress | None, proposed: Array) -> bool:
         """Carry out the command of an answer: quit, skip, take a press or remove one.
 
+        A press can only be taken if it is steady. The command that removes the last press refers to the steady press,
+        if there is one.
+
         Args:
             answer: Answer of the user.
             press: The steady press about which the user was asked; None before the press.
@@ -256,6 +274,8 @@ class Dialogue:
     def _take(self, press: SteadyPress, contact: Array) -> bool:
         """Add a press to the session, and return whether the session accepts it.
 
+        If the session refuses the press, the reason is printed.
+
         Args:
             press: The steady press.
             contact: Contact (x, y, F) of the press, shape (3,), mm and N.
@@ -277,6 +297,9 @@ class Dialogue:
 def _count_rows_made(session: PressSession, contacts: Array) -> int:
     """Return the number of rows in a list of contacts up to and including the last press of the session.
 
+    The number is 0 if the session has no press, or if its last press is not in the list. If several rows are equal to
+    the last press, the last of them counts.
+
     Args:
         session: The session.
         contacts: Contacts of the list, shape (n_row, 3), mm and N.
@@ -284,6 +307,8 @@ def _count_rows_made(session: PressSession, contacts: Array) -> int:
     if not len(session):
         return 0
     last_contact = session.presses.contact[-1]
-    is_last = np.isclose(contacts, last_contact, rtol=0.0, atol=SAME_CONTACT_TOLERANCE, equal_nan=True).all(axis=1)
-    rows = np.flatnonzero(is_last)
-    return int(rows[-1]) + 1 if rows.size else 0
+    is_equal = np.isclose(contacts, last_contact, rtol=0.0, atol=SAME_CONTACT_TOLERANCE, equal_nan=True)
+    equal_rows = np.flatnonzero(is_equal.all(axis=1))
+    if not equal_rows.size:
+        return 0
+    return int(equal_rows[-1]) + 1

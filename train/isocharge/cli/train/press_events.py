@@ -22,8 +22,8 @@ class PressEvents:
 
     The object is a context manager that starts and stops the reading threads.
 
-    The port is also read while a person answers and while a fit runs. No reading is lost, so the watch also detects a
-    probe that is lifted while a question is answered.
+    The port is also read while a person answers a question and while a fit runs. No reading is lost, so the watch also
+    detects a probe that is lifted while a question is answered.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class PressEvents:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Stop reading. A thread that waits for a silent port or keyboard ends with the process."""
+        """Stop reading. A thread that still waits for a silent port or keyboard ends when the process ends."""
         self._stop.set()
         self._port_thread.join(timeout=JOIN_TIMEOUT_s)
 
@@ -76,21 +76,24 @@ class PressEvents:
             arm_count, event = self._queue.get()
             if isinstance(event, Exception):
                 raise event
-            if isinstance(event, str) or arm_count == self._arm_count:
+            is_typed_line = isinstance(event, str)
+            is_recent = arm_count == self._arm_count
+            if is_typed_line or is_recent:
                 return event
 
     def _read_port(self) -> None:
         """Read the port until its end, and put the events of the readings into the queue.
 
         Each event contains the number of earlier calls of `arm`, so that events from before the last call can be
-        discarded. This method runs in a thread of its own.
+        discarded. The method runs in its own thread.
         """
         arm_count = self._arm_count
         try:
             for chunk in self._chunks:
                 if self._stop.is_set():
                     return
-                if arm_count != self._arm_count:
+                was_armed = arm_count != self._arm_count
+                if was_armed:
                     arm_count = self._arm_count
                     self._watch.arm()
                 for reading in self._stream.feed(chunk):

@@ -102,6 +102,8 @@ def report_command(
 def _find_students(student_names: list[str] | None, model_names: list[str]) -> list[Path]:
     """Return the version folders of the small models to compare.
 
+    If no small models are named, the small model of each compared model is searched for under its usual name.
+
     Args:
         student_names: Names or paths from `--student`; None for the models named MODEL-student that exist.
         model_names: Names or paths of the compared models.
@@ -113,7 +115,7 @@ def _find_students(student_names: list[str] | None, model_names: list[str]) -> l
         return [find_model(name) for name in student_names]
     folders = []
     for name in model_names:
-        with suppress(ModelError):
+        with suppress(ModelError):  # a model need not have a student
             folders.append(find_model(f"{name}-student"))
     return folders
 

@@ -82,7 +82,7 @@ class FittingTask:
     quick: bool = False
 
     def presses(self, copies: int) -> LabelledPresses:
-        """Return copies of the training presses with different noise.
+        """Return copies of the training presses with different noise; a quick task has only one copy.
 
         Args:
             copies: Number of copies; 0 for the presses without noise. Measured presses are returned as they are.
@@ -91,8 +91,9 @@ class FittingTask:
             return self.train
         count = 1 if self.quick else copies
         first_seed = self.seed + FIRST_COPY_SEED
-        charge = [self.train.noisy(self.noise, first_seed + copy) for copy in range(count)]
-        return LabelledPresses(np.tile(self.train.contact, (count, 1)), np.concatenate(charge))
+        contact = np.tile(self.train.contact, (count, 1))
+        charge = np.concatenate([self.train.noisy(self.noise, first_seed + copy) for copy in range(count)])
+        return LabelledPresses(contact, charge)
 
     @cached_property
     def validation_charge(self) -> Array:
@@ -151,21 +152,23 @@ class ComparedMethod:
             DatasetError: If the method cannot be fitted to these presses.
         """
         presses = task.presses(self.copies)
-        validation = task.validation
-        inputs = self.inputs(task.validation_charge, validation.contact[:, 2])
+        true_contact = task.validation.contact
+        validation_inputs = self.inputs(task.validation_charge, true_contact[:, 2])  # with the true force if it is used
         grid = list(ParameterGrid(dict(self.candidates)))
         if task.quick:
             grid = grid[:1]
+
         regressors = []
         errors_mm = []
         for parameters in grid:
             regressor = clone(self.regressor).set_params(**parameters)
             regressor.fit(presses.charge, presses.contact)
-            estimate = regressor.predict(inputs)
+            estimate = regressor.predict(validation_inputs)
             regressors.append(regressor)
-            errors_mm.append(rms(position_error(estimate, validation.contact)))
+            errors_mm.append(rms(position_error(estimate, true_contact)))
         best = int(np.argmin(errors_mm))
 
+        # The text that describes the chosen parameters
         descriptions = [describe_parameter(name, value) for name, value in grid[best].items()]
         kind = "noisy" if self.copies else "clean"
         descriptions.append(f"{len(presses)} {kind} presses")
@@ -209,7 +212,7 @@ NUMPY = "NumPy"
 
 
 def compared_methods(task: FittingTask, charge_map: ChargeMap | None = None) -> list[ComparedMethod]:
-    """Return all methods of the comparison except networks.
+    """Return all compared methods except the networks.
 
     Args:
         task: Presses and conditions.
@@ -235,38 +238,50 @@ def polynomial_ridge(task: FittingTask) -> ComparedMethod:
     """Return ridge regression on all monomials up to a degree.
 
     The logarithms are clipped to the range of the training presses, because a polynomial of high degree grows fast
-    beyond it.
+    beyond it. The two largest degrees of `POLYNOMIAL_DEGREES` with at most `MAX_MONOMIALS` monomials are compared.
+
+    Args:
+        task: Presses for the fit.
     """
     n_electrode = task.train.charge.shape[1]
     copies = 5
-    allowed = [
+    allowed_degrees = [
         degree
         for degree in range(1, max(POLYNOMIAL_DEGREES) + 1)
         if comb(n_electrode + degree, degree) <= MAX_MONOMIALS
     ]
-    # Try the two largest degrees of the list that are allowed.
-    degrees = [degree for degree in POLYNOMIAL_DEGREES if degree in allowed][-2:] or [max(allowed)]
+    degrees = [degree for degree in POLYNOMIAL_DEGREES if degree in allowed_degrees][-2:]
+    if not degrees:
+        degrees = [max(allowed_degrees)]
+
     regressor = on_logarithms(
         task.domain,
         box=MinMaxScaler((-1.0, 1.0), clip=True),
         monomials=PolynomialFeatures(),
         ridge=Ridge(solver="cholesky"),
     )
+    # The penalty is proportional to the number of presses, as the sum of the squared errors is.
+    penalties = [penalty_per_press * copies * len(task.train) for penalty_per_press in (1e-11, 1e-8)]
     candidates: dict[str, Sequence[Any]] = {
         "regressor__monomials__degree": degrees,
-        "regressor__ridge__alpha": [share * copies * len(task.train) for share in (1e-11, 1e-8)],
+        "regressor__ridge__alpha": penalties,
     }
     return ComparedMethod(POLYNOMIAL, "learnt", SKLEARN, regressor, copies, candidates)
 
 
 def _triangulations(charge_map: ChargeMap | None) -> list[ComparedMethod]:
-    """Return triangulation without and with the true force. The result is empty if there is no charge map."""
+    """Return triangulation without and with the true force. The result is empty if there is no charge map.
+
+    Args:
+        charge_map: Simulated map from contacts to charges; None if there is none.
+    """
     if charge_map is None:
         return []
     choice = "contours of the simulated charges"
+    without_force = Triangulate(charge_map)
     with_force = Triangulate(charge_map, given_force=True)
     return [
-        ComparedMethod("triangulation", "paper", NUMPY, Triangulate(charge_map), choice=choice),
+        ComparedMethod("triangulation", "paper", NUMPY, without_force, choice=choice),
         ComparedMethod("triangulation, force given", "paper", NUMPY, with_force, given_force=True, choice=choice),
     ]
 
@@ -289,21 +304,29 @@ def _interpolated_table(task: FittingTask) -> ComparedMethod:
 
 
 def _nearest_neighbours(task: FittingTask) -> ComparedMethod:
-    """Return the mean residual of the nearest neighbours, added to a linear regression."""
+    """Return a regressor that adds the mean residual of the nearest neighbours to a linear regression.
+
+    Args:
+        task: Presses and conditions for the fit.
+    """
     neighbours = ResidualRegressor(KNeighborsRegressor())
     regressor = on_logarithms(task.domain, scales=_scaled_axes(), near=neighbours)
     counts = [count for count in (16, 32, 64) if count <= len(task.train)]
     candidates = _axis_scale_candidates(task) | {"regressor__near__regressor__n_neighbors": counts}
-    return ComparedMethod("k-nearest neighbours", "learnt", SKLEARN, regressor, 5, candidates)
+    return ComparedMethod("k-nearest neighbours", "learnt", SKLEARN, regressor, copies=5, candidates=candidates)
 
 
 def _gradient_boosting(task: FittingTask) -> ComparedMethod:
-    """Return gradient boosting of regression trees on the residuals of a linear regression."""
+    """Return gradient boosting of regression trees on the residuals of a linear regression.
+
+    Args:
+        task: Conditions of the fit: the domain, the seed, and whether fewer trees suffice.
+    """
     iterations = 30 if task.quick else 250
     trees = HistGradientBoostingRegressor(max_iter=iterations, early_stopping=False, random_state=task.seed)
     regressor = on_logarithms(task.domain, trees=ResidualRegressor(MultiOutputRegressor(trees)))
     candidates = {"regressor__trees__regressor__estimator__max_leaf_nodes": (31, 63)}
-    return ComparedMethod(BOOSTING, "learnt", SKLEARN, regressor, 3, candidates)
+    return ComparedMethod(BOOSTING, "learnt", SKLEARN, regressor, copies=3, candidates=candidates)
 
 
 def _gaussian_process(task: FittingTask) -> ComparedMethod:

@@ -66,11 +66,14 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         if self.charge_map is not None:
             self.map_ = self.charge_map
         else:
-            names = tuple(str(electrode_index) for electrode_index in range(charge.shape[1]))
+            n_electrode = charge.shape[1]
+            names = tuple(str(electrode_index) for electrode_index in range(n_electrode))
             train, validation = split_by_position(presses, VALIDATION_FRACTION, self.seed)
             self.map_ = ChargeField.fit(self.domain, names, train, validation)
+
         # The search for a contact starts at the start with the most similar charges.
-        start_rows = np.random.default_rng(self.seed).permutation(len(presses))[:N_STARTS]
+        shuffled_rows = np.random.default_rng(self.seed).permutation(len(presses))
+        start_rows = shuffled_rows[:N_STARTS]
         self.features_ = whitening().fit(charge)
         self.starts_ = contact[start_rows]
         self.tree_ = cKDTree(self.features_.transform(charge[start_rows]))
@@ -83,6 +86,8 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
     def _search(self, charge: Array) -> Array:
         """Estimate the contacts of one batch.
+
+        The search is repeated from the next start for presses whose sum of squared residuals is still too large.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
@@ -98,13 +103,14 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
             remaining = np.flatnonzero(square_sum > RESTART_THRESHOLD)
             if not remaining.size:
                 break
-            # The first attempt begins at the nearest start, the second at the next nearest start, and so on.
-            _, nearest = self.tree_.query(features[remaining], [attempt])  # indices of starts, shape (n, 1)
+            # The first attempt begins at the nearest start, the second at the next nearest start, and so on. The query
+            # for the neighbour with the rank `attempt` returns indices of shape (n, 1).
+            _, nearest = self.tree_.query(features[remaining], [attempt])
             start = self.starts_[nearest[:, 0]]
             solution, residual = explain(self.map_, charge[remaining], sigma[remaining], start)
             solution_square_sum = (residual**2).sum(axis=1)
             is_better = solution_square_sum < square_sum[remaining]
-            improved = remaining[is_better]
-            contact[improved] = solution[is_better]
-            square_sum[improved] = solution_square_sum[is_better]
+            improved_rows = remaining[is_better]
+            contact[improved_rows] = solution[is_better]
+            square_sum[improved_rows] = solution_square_sum[is_better]
         return contact

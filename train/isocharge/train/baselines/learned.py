@@ -1,8 +1,8 @@
 """Regressors of scikit-learn with common transformers of the charges and of the contacts.
 
-The inputs are whitened logarithms of the charges. The first principal axis is mostly the mean logarithm, which carries
-the force; the next two are mostly logarithms of ratios, which carry the position. A fourth charge adds an axis that is
-mostly noise. The targets are x, y and ln F, scaled to [-1, 1].
+The inputs are whitened logarithms of the charges. The first principal axis is mostly the mean logarithm, which depends
+on the force. The next two axes are mostly logarithms of ratios, which depend on the position. A fourth charge adds an
+axis that is mostly noise. The targets are x, y and ln F, scaled to [-1, 1].
 """
 
 from typing import Any
@@ -56,7 +56,10 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Transformer that computes ln(max(Q, 1 pC)), or asinh(2 Q / usual size) if the charges have both signs."""
 
     def fit(self, charge: Array, target: object = None) -> "Logarithms":
-        """Determine whether the charges of an electrode have both signs. Noise alone does not count.
+        """Determine the scale of the charges; None if no electrode has charges of both signs.
+
+        The charges of an electrode have both signs if more than the fraction `BOTH_SIGNS` of them is not positive. A
+        smaller fraction can be due to noise alone.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
@@ -79,7 +82,7 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def scale_axes(values: Array, force: float, rest: float) -> Array:
-    """Multiply the principal axes of whitened logarithms by factors.
+    """Transformer that multiplies the principal axes of whitened logarithms by factors.
 
     Args:
         values: Whitened logarithms, shape (n, n_electrode).
@@ -134,7 +137,9 @@ class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         self.seed = seed
 
     def fit(self, values: Array, target: Array) -> "SubsetProcess":
-        """Fit the kernel and then the process.
+        """Fit the kernel to a few points, and then the process with this kernel to more points.
+
+        The points are chosen at random, because the time of a fit grows with the third power of their number.
 
         Args:
             values: Inputs, shape (n, n_input).
@@ -145,11 +150,14 @@ class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         """
         rows = np.random.default_rng(self.seed).permutation(len(values))[: self.points]
         kernel_rows = rows[: self.kernel_points]
+
+        # Each part of the kernel has an initial value and bounds: variance, length scales, and variance of the noise.
         lengths = np.full(values.shape[1], 2.0)
         kernel = ConstantKernel(10.0, (1e-2, 1e5)) * RBF(lengths, (0.1, 100.0)) + WhiteKernel(1e-3, (1e-8, 1.0))
         with catch_warnings():
             simplefilter("ignore", ConvergenceWarning)  # a length scale at its bound is acceptable
             fitted = GaussianProcessRegressor(kernel, normalize_y=True).fit(values[kernel_rows], target[kernel_rows])
+
         self.process_ = GaussianProcessRegressor(fitted.kernel_, optimizer=None, normalize_y=True)
         self.process_.fit(values[rows], target[rows])
         return self

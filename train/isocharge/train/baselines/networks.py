@@ -50,7 +50,7 @@ class OnnxContact(GivenMethod):
         return np.asarray(contact, dtype=float)
 
     def single(self, charge: Array) -> Callable[[], object]:
-        """Return a function that computes one press. Its memory is bound only once, as in `Predictor`.
+        """Return a function that computes one press. The memory of the press is bound only once, as in `Predictor`.
 
         Args:
             charge: Charges of the press, shape (n_electrode,), pC.
@@ -101,7 +101,9 @@ class TrainedNetwork(OnnxContact):
         self.seed = seed
 
     def fit(self, charge: Array, contact: Array) -> Self:
-        """Train the network.
+        """Train the network, and write the graph that computes its contacts.
+
+        Only the contacts are compared, so the misfit perceptron is as small as possible and trained for one step.
 
         Args:
             charge: Charges without noise, shape (n, n_electrode), pC.
@@ -141,10 +143,10 @@ class ReleasedModel(GivenMethod):
         Returns:
             Contact (x, y, F), shape (n, 3), mm and N; its standard deviations, shape (n, 3); misfit, shape (n, 1).
         """
-        answer = self.predictor.predict_batch(charge)
-        contact = np.stack([answer.x_mm, answer.y_mm, answer.force_N], axis=1)
-        std = np.stack([answer.x_std_mm, answer.y_std_mm, answer.force_std_N], axis=1)
-        misfit = np.reshape(answer.misfit, (-1, 1))
+        answers = self.predictor.predict_batch(charge)
+        contact = np.stack([answers.x_mm, answers.y_mm, answers.force_N], axis=1)
+        std = np.stack([answers.x_std_mm, answers.y_std_mm, answers.force_std_N], axis=1)
+        misfit = np.reshape(answers.misfit, (-1, 1))
         return contact.astype(float), std.astype(float), misfit.astype(float)
 
     def single(self, charge: Array) -> Callable[[], object]:

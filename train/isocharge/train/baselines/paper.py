@@ -1,14 +1,14 @@
-"""The methods of Mirbagheri et al. (2007) as regressors: triangulation, the linear band and the lookup table.
+"""The methods of Mirbagheri et al., 2007, as regressors: triangulation, the linear band and the lookup table.
 
-Linear band: up to 0.5 N the charges are taken as proportional to the force, Q = F s(x, y), with one slope s for each
-electrode. The slopes are interpolated between the presses by a polynomial of the position and tabulated on a fine grid.
-The ratios of the charges give the nearest grid point. Near this point, the equation Q = F (s + ds/dx dx + ds/dy dy) is
-linear in F, F dx and F dy. It is solved for these three unknowns. On a slack film the charges are proportional to
-F^(2/3) instead, and the errors of this method show the consequence.
+Linear band: up to 0.5 N, the charges are assumed to be proportional to the force, Q = F s(x, y). There is one slope s
+for each electrode. The slopes are interpolated between the presses by a polynomial of the position and tabulated on a
+fine grid. The ratios of the charges give the nearest grid point. Near this point, the equation Q = F (s + ds/dx dx +
+ds/dy dy) is linear in F, F dx and F dy. It is solved for these three unknowns. On a slack film, the charges are
+proportional to F^(2/3) instead, which causes errors of this method.
 
 Lookup table: an entry consists of a contact, the mean features of its presses, and an affine map. The affine map is
-fitted to the presses in the neighbourhood of the contact. Large neighbourhoods average the noise, and small ones follow
-the curvature of the map; validation chooses the size.
+fitted to the presses in the neighbourhood of the contact. Large neighbourhoods average the noise, and small
+neighbourhoods follow the curvature of the map. The size is chosen by validation.
 """
 
 import numpy as np
@@ -50,9 +50,11 @@ class Triangulate(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         """
         if not self.given_force:
             return self.contours_.locate_with_force(inputs).contact
-        charge, force = np.split(inputs, [inputs.shape[1] - 1], axis=1)
-        in_range = np.clip(force[:, 0], *self.charge_map.domain.force_range)
-        return self.contours_.locate(charge, in_range).contact
+        n_electrode = inputs.shape[1] - 1
+        charge, force_column = np.split(inputs, [n_electrode], axis=1)
+        min_force, max_force = self.charge_map.domain.force_range
+        force = np.clip(force_column[:, 0], min_force, max_force)
+        return self.contours_.locate(charge, force).contact
 
 
 MAX_BAND_FORCE = 0.5
@@ -90,7 +92,7 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         self.degree = degree
 
     def fit(self, charge: Array, contact: Array) -> "LinearBand":
-        """Fit ln(Q / F) of the presses in the band by Chebyshev polynomials of x and y, and tabulate the slopes.
+        """Fit ln(Q / F) of the presses with small forces by Chebyshev polynomials of x and y, and tabulate the slopes.
 
         Args:
             charge: Shape (n, n_electrode), pC.
@@ -109,27 +111,40 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
                 f"linear band: expected at least {MIN_BAND_PRESSES} presses of at most {MAX_BAND_FORCE} N, got "
                 f"{n_band}; sweep smaller forces"
             )
-        if (charge[is_in_band] <= 0.0).any():
+        band_charge = charge[is_in_band]
+        band_position = contact[is_in_band, :2]
+        band_force = contact[is_in_band, 2:]  # shape (n_band, 1)
+        if (band_charge <= 0.0).any():
             raise DatasetError("linear band: expected positive charges, for it interpolates their logarithms")
-        log_charge_per_force = np.log(charge[is_in_band] / contact[is_in_band, 2:])
-        polynomials = self._terms(contact[is_in_band, :2] / self.radius)
+        log_charge_per_force = np.log(band_charge / band_force)
+        polynomials = self._terms(band_position / self.radius)
         coefficients, *_ = np.linalg.lstsq(polynomials, log_charge_per_force, rcond=LEAST_SQUARES_TOLERANCE)
+        self._tabulate(np.asarray(coefficients))
+        return self
 
-        # Tabulate Q / F and its derivatives with respect to x and y on a grid of the unit disk.
+    def _tabulate(self, coefficients: Array) -> None:
+        """Tabulate Q / F and its derivatives with respect to x and y on a grid of the disk.
+
+        Near a grid point, Q is linear in (F, F dx, F dy), so that a pseudoinverse estimates these three values from the
+        charges.
+
+        Args:
+            coefficients: Coefficients of the polynomials for ln(Q / F), shape (n_term, n_electrode).
+        """
         axis = np.linspace(-1.0, 1.0, GRID_POINTS)
         square_grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-        grid = square_grid[np.hypot(square_grid[:, 0], square_grid[:, 1]) <= 1.0]
-        charge_per_force = np.exp(self._terms(grid) @ coefficients)
-        columns = [charge_per_force]
-        for step in DIFFERENCE_STEP * np.eye(2):
-            log_difference = (self._terms(grid + step) - self._terms(grid - step)) @ coefficients
-            columns.append(charge_per_force * log_difference / (2.0 * DIFFERENCE_STEP * self.radius))
+        is_in_disk = np.hypot(square_grid[:, 0], square_grid[:, 1]) <= 1.0
+        grid = square_grid[is_in_disk]  # positions over the radius
 
-        # Near a grid point, Q is linear in (F, F dx, F dy), so that the pseudoinverse estimates these from the charges.
+        charge_per_force = np.exp(self._terms(grid) @ coefficients)
+        value_and_slopes = [charge_per_force]
+        for step in DIFFERENCE_STEP * np.eye(2):  # a step along x, and a step along y
+            log_difference = (self._terms(grid + step) - self._terms(grid - step)) @ coefficients
+            value_and_slopes.append(charge_per_force * log_difference / (2.0 * DIFFERENCE_STEP * self.radius))
+
         self.position_ = grid * self.radius
-        self.inverse_ = np.linalg.pinv(np.stack(columns, axis=2))
+        self.inverse_ = np.linalg.pinv(np.stack(value_and_slopes, axis=2))
         self.tree_ = cKDTree(unit_vectors(charge_per_force))
-        return self
 
     def predict(self, charge: Array) -> Array:
         """Estimate contacts from charges.
@@ -159,6 +174,7 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         Returns:
             Shape (n, n_term).
         """
+        # All products, in the order of their degrees in x and then in y; those above the total degree are removed.
         products = chebyshev.chebvander2d(position[:, 0], position[:, 1], [self.degree, self.degree])
         x_degree, y_degree = np.indices((self.degree + 1, self.degree + 1))
         in_total_degree = (x_degree + y_degree <= self.degree).ravel()
@@ -201,18 +217,23 @@ class AffineTable(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         Returns:
             This estimator.
         """
+        # Mean features of the presses of each entry
         _, entry_of_press, presses_per_entry = np.unique(target, axis=0, return_inverse=True, return_counts=True)
         feature_sums = np.zeros((presses_per_entry.size, values.shape[1]))
         np.add.at(feature_sums, entry_of_press.ravel(), values)
         entries = feature_sums / presses_per_entry[:, None]
 
+        # The maps are fitted in chunks of entries, which limits the memory. A query for ranks 1 to k returns the k
+        # nearest presses, also as an array of shape (n, 1) if k is 1.
         press_tree = cKDTree(values)
         neighbour_ranks = range(1, min(self.neighbours, len(values)) + 1)
         entries_per_chunk = max(1, CHUNK // self.neighbours)
+        chunk_count = len(entries) // entries_per_chunk + 1
         maps = []
-        for centres in np.array_split(entries, len(entries) // entries_per_chunk + 1):
-            _, neighbours = press_tree.query(centres, neighbour_ranks)
-            maps.append(affine_maps(values[neighbours] - centres[:, None], target[neighbours]))
+        for chunk in np.array_split(entries, chunk_count):
+            _, neighbours = press_tree.query(chunk, neighbour_ranks)
+            offset = values[neighbours] - chunk[:, None]
+            maps.append(affine_maps(offset, target[neighbours]))
         self.tree_ = cKDTree(entries)
         self.maps_ = np.concatenate(maps)
         return self
@@ -235,7 +256,9 @@ class AffineTable(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
 
 def affine_maps(offset: Array, target: Array) -> Array:
-    """Fit affine maps by least squares with a ridge on the slopes.
+    """Fit an affine map to the neighbours of each entry by least squares, with a ridge on the slopes.
+
+    The ridge is `RIDGE` times the sum of the squared features of the neighbours.
 
     Args:
         offset: Features of the neighbours relative to each of m entries, shape (m, k, p).
@@ -246,8 +269,11 @@ def affine_maps(offset: Array, target: Array) -> Array:
     """
     n_entry, n_neighbour, n_feature = offset.shape
     columns = np.concatenate([offset, np.ones((n_entry, n_neighbour, 1))], axis=2)
-    normal = columns.transpose(0, 2, 1) @ columns
+    transposed = columns.transpose(0, 2, 1)
+    normal = transposed @ columns  # shape (m, p + 1, p + 1)
+    moment = transposed @ target
+
     slopes = slice(0, n_feature)
     trace = np.trace(normal[:, slopes, slopes], axis1=1, axis2=2)
     normal[:, slopes, slopes] += RIDGE * trace[:, None, None] * np.eye(n_feature)
-    return np.asarray(np.linalg.solve(normal, columns.transpose(0, 2, 1) @ target))
+    return np.asarray(np.linalg.solve(normal, moment))

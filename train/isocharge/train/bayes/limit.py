@@ -75,13 +75,13 @@ def bayes_estimate(
         ChargeError: If there are no charges, or they are not finite or of another number of electrodes.
         InputError: If the noise is zero, or if the map has another range of forces or a smaller radius.
     """
-    charges = charge_map or problem.forward_map(executor)
-    if charges.domain.force_range != problem.force_range:
-        raise InputError(
-            f"forces of the map: expected the problem's, {problem.force_range} N, got {charges.domain.force_range} N"
-        )
-    spline = charges if isinstance(charges, ChargeSpline) else ChargeSpline.of(charges)
-    return Posterior(spline, problem.noise, problem.radius).mean_and_std(charge, executor)
+    used_map = charge_map or problem.forward_map(executor)
+    map_forces = used_map.domain.force_range
+    if map_forces != problem.force_range:
+        raise InputError(f"forces of the map: expected the problem's, {problem.force_range} N, got {map_forces} N")
+    spline = used_map if isinstance(used_map, ChargeSpline) else ChargeSpline.of(used_map)
+    posterior = Posterior(spline, problem.noise, problem.radius)
+    return posterior.mean_and_std(charge, executor)
 
 
 def bayes_limit(
@@ -104,8 +104,9 @@ def bayes_limit(
     Returns:
         Statistics of the errors of the posterior means.
     """
-    charges = charge_map or problem.forward_map(executor)
+    used_map = charge_map or problem.forward_map(executor)
     contact = Sweep(problem.radius, problem.force_range, presses, seed, sampling="random").contacts()
-    charge = problem.noise.add(charges.charges(contact), np.random.default_rng([seed, 1]))
-    estimate, _ = bayes_estimate(problem, charge, charge_map=charges, executor=executor)
+    noise_rng = np.random.default_rng([seed, 1])
+    noisy_charge = problem.noise.add(used_map.charges(contact), noise_rng)
+    estimate, _ = bayes_estimate(problem, noisy_charge, charge_map=used_map, executor=executor)
     return ContactErrorStatistics.of(estimate, contact)

@@ -95,7 +95,7 @@ class Cells:
         return Cells(self.press[rows], self.root[rows], self.centre[rows], self.side)
 
     def divided(self, radius: float) -> "Cells":
-        """Divide each cell into four and drop those outside the disk with this radius, mm."""
+        """Divide each cell into four cells, and drop the cells outside the disk with this radius, mm."""
         parts = self._quarters(0.25)
         return parts[_overlaps_disk(parts.centre, parts.side, radius)]
 
@@ -114,7 +114,7 @@ class Cells:
         yield self[is_on_edge].divided(radius).divided(radius)
 
     def _quarters(self, offset: float) -> "Cells":
-        """Replace each cell by four cells of half the side.
+        """Replace each cell by four cells whose sides are half as long.
 
         Args:
             offset: Distance of their centres from the centre of the cell along x and y, in sides of the cell.
@@ -130,6 +130,8 @@ class Cells:
     def inside(self, radius: float) -> tuple[Array, Array]:
         """Compute the part of each cell that lies in the disk.
 
+        Cells that the edge of the disk crosses are sampled by a grid of points. All other cells lie inside completely.
+
         Args:
             radius: Radius of the disk, mm.
 
@@ -140,12 +142,13 @@ class Cells:
         fraction = np.ones(len(self))
         centroid = self.centre.copy()
 
-        # Cells that the edge of the disk crosses are sampled by a grid of points.
         edge_cells = np.flatnonzero(self.on_edge(radius))
-        points = centroid[edge_cells, None] + _grid(EDGE_POINTS, self.side / EDGE_POINTS)
+        points = centroid[edge_cells, None] + _grid(EDGE_POINTS, self.side / EDGE_POINTS)  # shape (n, n_point, 2)
         is_inside = np.hypot(points[..., 0], points[..., 1]) <= radius
         n_inside = is_inside.sum(axis=1)
         fraction[edge_cells] = np.maximum(n_inside, 0.5) / EDGE_POINTS**2
+
+        # The centroid is the mean of the points inside or, without such points, the nearest point of the disk.
         point_sum = (points * is_inside[..., None]).sum(axis=1)
         mean_point = point_sum / np.maximum(n_inside, 1)[:, None]
         nearest_point = onto_disk(centroid[edge_cells], radius)
@@ -221,8 +224,9 @@ class Posterior:
                 f"expected finite charges of shape (n, {n_electrode}), n at least 1, got shape {charge.shape}"
             )
         chunks = [charge[start : start + CHUNK] for start in range(0, len(charge), CHUNK)]
-        moments = in_order(executor, self._integrate, chunks)
-        mean, std = np.concatenate(list(track(moments, "integrating the posterior", len(chunks))), axis=1)
+        moments_by_chunk = in_order(executor, self._integrate, chunks)
+        tracked_moments = list(track(moments_by_chunk, "integrating the posterior", len(chunks)))
+        mean, std = np.concatenate(tracked_moments, axis=1)
         return mean, std
 
     @cached_property
@@ -234,10 +238,11 @@ class Posterior:
     def _roots(self) -> _RootCells:
         """Cells of the coarsest division, with the charges at their centres and the largest slopes within each cell."""
         cells = Cells.roots(self.radius)
-        # The slopes are computed at 3 x 3 points of each cell.
+        # The slopes are computed at 3 x 3 points of each cell: at its centre, its corners and the centres of its sides.
         points = (cells.centre[:, None] + _grid(3, 0.5 * cells.side)).reshape(-1, 2)
-        slopes = self.charges.scaled_gradients(onto_disk(points, self.radius))
-        point_slope = np.linalg.norm(slopes, axis=-1).max(axis=1)
+        gradients = self.charges.scaled_gradients(onto_disk(points, self.radius))
+        # The largest slope among the terms of each point, and then among the points of each cell
+        point_slope = np.linalg.norm(gradients, axis=-1).max(axis=1)
         largest_slope = point_slope.reshape(len(cells), 9, -1).max(axis=1)
         return _RootCells(cells, self._terms(cells), largest_slope)
 
@@ -248,20 +253,27 @@ class Posterior:
     def _integrate(self, charge: Array) -> Array:
         """Compute the mean and the standard deviation of the posterior of each press.
 
+        The posterior is integrated over the position by cells of several sizes, and over the force by quadrature at the
+        centroid of each cell.
+
         Args:
             charge: Charges with noise, shape (n, n_electrode), pC.
 
         Returns:
             Means and standard deviations of (x, y, F), shape (2, n, 3), mm and N.
         """
+        # Concatenate the cells of all sizes.
         levels = list(self._integration_cells(charge))
         side = np.concatenate([np.full(len(cells), cells.side) for cells in levels])
-        press = np.concatenate([cells.press for cells in levels])
+        press_of_cell = np.concatenate([cells.press for cells in levels])
         fractions, centroids = zip(*(cells.inside(self.radius) for cells in levels), strict=True)
-        order = np.argsort(press, kind="stable")
+
+        # Sort the cells by press, as `_moments` needs them.
+        order = np.argsort(press_of_cell, kind="stable")
         area = (np.concatenate(fractions) * side**2)[order]
         position = np.concatenate(centroids)[order]
-        press = press[order]
+        press = press_of_cell[order]
+
         log_force, log_weight = self._integrate_force(position, charge[press])
         log_weight += np.log(area)[:, None]
         return _moments(press, position, log_force, log_weight)
@@ -341,6 +353,9 @@ class Posterior:
     def _inverse_std(self, cells: Cells, terms: Array, log_force: Array) -> Array:
         """Compute the inverse of the smallest standard deviation of the position if the force is unknown.
 
+        The result is the largest singular value of the matrix of derivatives of the charges, each divided by the noise
+        of its charge.
+
         Args:
             cells: Cells at whose centres the contact is assumed.
             terms: Terms of the charges there, shape (n, n_term, n_electrode).
@@ -356,11 +371,14 @@ class Posterior:
         position_jacobian = np.einsum("nk,nkei->nei", force_weights, gradients)
         force_jacobian = self._profile.slope(log_force, expected)[..., None]
         jacobian = np.concatenate([position_jacobian, force_jacobian], axis=2)
-        largest_to_smallest = singular_values(jacobian / self.noise.sigma(expected)[..., None])
+        whitened_jacobian = jacobian / self.noise.sigma(expected)[..., None]
+        largest_to_smallest = singular_values(whitened_jacobian)
         return np.asarray(largest_to_smallest[:, 0])
 
     def _integrate_force(self, position: Array, charge: Array) -> tuple[Array, Array]:
         """Return the nodes of the integral over the logarithm of the force, and their weights times the likelihood.
+
+        The integral at each position is computed by Gauss-Legendre quadrature.
 
         Args:
             position: Shape (n, 2), mm.
@@ -379,8 +397,9 @@ class Posterior:
         lower = np.maximum(best_log_force - half_width, min_log_force)[:, None]
         upper = np.minimum(best_log_force + half_width, max_log_force)[:, None]
 
-        nodes, weights = np.polynomial.legendre.leggauss(N_FORCE_NODES)
+        nodes, weights = np.polynomial.legendre.leggauss(N_FORCE_NODES)  # for the interval from -1 to 1
         log_force = 0.5 * (lower + upper) + 0.5 * (upper - lower) * nodes
+
         # Expected charges of electrode e at position n and node m, as a sum over the terms k
         expected = np.einsum("nmk,nke->enm", self.charges.force_weights(log_force), terms)
         variance = self.noise.variance(expected)
@@ -392,6 +411,9 @@ class Posterior:
 def _moments(press: Integers, position: Array, log_force: Array, log_weight: Array) -> Array:
     """Compute the mean and the standard deviation of (x, y, F) for every press.
 
+    Both are computed from weighted sums over all positions of the press and over all forces at each position. The mean
+    of the force is E[1/F] / E[1/F^2].
+
     Args:
         press: Number of the press of each position, ascending, shape (n_position,).
         position: Shape (n_position, 2), mm.
@@ -399,10 +421,13 @@ def _moments(press: Integers, position: Array, log_force: Array, log_weight: Arr
         log_weight: Logarithms of the weights of these contacts, shape (n_position, n_node).
 
     Returns:
-        Shape (2, n_press, 3), mm and N.
+        Means and then standard deviations, shape (2, n_press, 3), mm and N.
     """
-    first_row = np.flatnonzero(np.diff(press, prepend=-1))  # the rows of a press follow each other
+    # The rows of a press follow each other, so `reduceat` with the first row of each press gives values by press.
+    first_row = np.flatnonzero(np.diff(press, prepend=-1))
     n_row = np.diff(first_row, append=press.size)
+
+    # The largest weight of each press is scaled to 1, so that the exponentials do not underflow.
     largest_log_weight = np.maximum.reduceat(log_weight.max(axis=1), first_row)
     weight = np.exp(log_weight - np.repeat(largest_log_weight, n_row)[:, None])
     force = np.exp(log_force)

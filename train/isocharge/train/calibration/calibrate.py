@@ -14,6 +14,7 @@ from isocharge.train.calibration.closed_back import CLOSED_BACK_CAUTION, has_clo
 from isocharge.train.calibration.diagnosis import (
     FAR_FROM_ALL_FILMS,
     MOSTLY_OUTSIDE,
+    UNUSUAL_FILM,
     check_channels,
     check_places,
     find_mistakes,
@@ -67,6 +68,9 @@ CLOSE_MM = 1.0
 def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
     """Estimate the film on which presses were made.
 
+    The presses are checked, and the film is fitted to them. The result is refused if no film explains the presses. The
+    stated errors are then increased if the presses scatter too much, or if there are only a few presses.
+
     Args:
         presses: The presses in the order in which they were made, with position, force or both, and their standard
             deviations. Presses without both show how a film has changed since an earlier calibration, if it has more
@@ -78,18 +82,14 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
             reason if it is found.
     """
     presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
-    check_places(presses, problem.prior.sensor.film.radius)
-    check_channels(presses, problem.charges)
-    _check_enough_measured(presses, problem)
-    presses, domain_cautions = _within_domain(presses, problem)
-    if misfit(presses, problem.charges) > MISLEADING_MISFIT and find_mistakes(presses, problem.charges):
-        refuse_closed_back(presses, problem.charges)
-        raise unexplained_error(presses, problem.charges, FAR_FROM_ALL_FILMS)
+    presses, domain_cautions = _checked_presses(presses, problem)
+
     at_C = None
     if presses.knows_temperature:
         at_C = float(temperatures(presses).mean())
         problem = replace(problem, earlier=problem.before.at_temperature(at_C, problem.prior))
     data = PressData.of(presses, problem.noise, problem.charges.domain)
+
     with threadpool_limits(1):  # many small matrices: a second thread only waits
         posterior = fit_film(problem.charges, data, problem.before, at_C)
         side_force_map = None
@@ -97,6 +97,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
             posterior, side_force_map = _fit_with_friction(problem, data, posterior, at_C)
         elif problem.side_force > 0.0:
             side_force_map = solve_side_forces(problem.charges, posterior.parameters)
+
     _refuse_unexplained(presses, problem, posterior)
     posterior, scatter_cautions = _scaled_by_scatter(posterior)
     posterior = _with_unseen_mistakes(posterior, problem.before)
@@ -104,26 +105,59 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
     return CalibrationResult(problem, presses, posterior, cautions, side_force_map=side_force_map)
 
 
+def _checked_presses(presses: MeasuredPresses, problem: CalibrationProblem) -> tuple[MeasuredPresses, list[str]]:
+    """Return the presses within the domain of the films, after all checks that need no fit.
+
+    Args:
+        presses: The presses, with the electrodes in the order of the problem.
+        problem: The possible films.
+
+    Returns:
+        The presses, and warnings about presses outside the domain.
+
+    Raises:
+        PressError: If the records of the presses are impossible, or a common mistake explains them far better than any
+            film.
+    """
+    check_places(presses, problem.prior.sensor.film.radius)
+    check_channels(presses, problem.charges)
+    _check_enough_measured(presses, problem)
+    inside_presses, cautions = _within_domain(presses, problem)
+    is_far_from_films = misfit(inside_presses, problem.charges) > MISLEADING_MISFIT
+    if is_far_from_films and find_mistakes(inside_presses, problem.charges):
+        refuse_closed_back(inside_presses, problem.charges)
+        raise unexplained_error(inside_presses, problem.charges, FAR_FROM_ALL_FILMS)
+    return inside_presses, cautions
+
+
 def _fit_with_friction(
     problem: CalibrationProblem, data: PressData, posterior: FilmPosterior, at_C: float | None
 ) -> tuple[FilmPosterior, SideForceMap]:
     """Estimate a film from presses with friction, and compute the effect of side forces on this film.
+
+    The effect of the friction on the charges depends on the film and on the coefficient of friction. Therefore, the
+    effect and the film are computed in turn until the parameters of the film hardly change.
 
     Args:
         problem: The films, and the expected coefficient of friction.
         data: The presses.
         posterior: Estimate of the film if the presses have no friction.
         at_C: Temperature of the film, degrees Celsius; None if temperatures were not measured.
+
+    Returns:
+        The estimate of the film, and the effects of side forces from which it was computed.
     """
-    coefficient = problem.friction
+    friction_coefficient = problem.friction
     for _ in range(MAX_FRICTION_ROUNDS):
         side_force_map = solve_side_forces(problem.charges, posterior.parameters)
-        data_with_friction = with_friction(data, problem.charges, side_force_map, posterior.contact, coefficient)
+        data_with_friction = with_friction(
+            data, problem.charges, side_force_map, posterior.contact, friction_coefficient
+        )
         fitted = fit_film(problem.charges, data_with_friction, problem.before, at_C, friction=problem.friction)
-        change = np.abs(fitted.parameters - posterior.parameters) / problem.prior.std
+        parameter_change = np.abs(fitted.parameters - posterior.parameters) / problem.prior.std
         posterior = fitted
-        coefficient = posterior.nuisances[FRICTION.name].value
-        if change.max() < MAX_FRICTION_STEP:
+        friction_coefficient = posterior.nuisances[FRICTION.name].value
+        if parameter_change.max() < MAX_FRICTION_STEP:
             break
     return posterior, side_force_map
 
@@ -131,34 +165,48 @@ def _fit_with_friction(
 def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tuple[MeasuredPresses, list[str]]:
     """Return the presses within the positions and forces of the films, and a warning about the other presses.
 
+    Args:
+        presses: The presses.
+        problem: The possible films, which have charges only within a domain.
+
     Raises:
-        PressError: If most presses lie outside.
+        PressError: If more than half of the presses lie outside.
     """
     domain = problem.charges.domain
     is_outside = domain.is_outside(presses.contact)
     if not is_outside.any():
         return presses, []
-    low, high = domain.force_range
-    words = row_words(presses[is_outside].lines, presses.row_noun)
+    min_force, max_force = domain.force_range
+    outside_rows = row_words(presses[is_outside].lines, presses.row_noun)
     sentence = (
-        f"{words}: a calibration takes presses within {domain.radius:.3g} mm of the "
-        f"centre and of {low:.2g} to {high:.2g} N"
+        f"{outside_rows}: a calibration takes presses within {domain.radius:.3g} mm of the "
+        f"centre and of {min_force:.2g} to {max_force:.2g} N"
     )
-    if is_outside.mean() > 0.5:
-        if len(presses) == 1:
-            raise PressError(sentence)
+    is_mostly_outside = is_outside.mean() > 0.5
+    if is_mostly_outside and len(presses) == 1:
+        raise PressError(sentence)
+    if is_mostly_outside:
         raise unexplained_error(presses, problem.charges, MOSTLY_OUTSIDE)
     return presses[~is_outside], [f"{sentence}; left out"]
 
 
 def _scaled_by_scatter(posterior: FilmPosterior) -> tuple[FilmPosterior, list[str]]:
-    """Increase the stated errors if the presses scatter more than expected, by Birge's ratio (1932).
+    """Increase the stated errors if the presses scatter more than expected.
+
+    The variances are multiplied by chi2 divided by its degrees of freedom, the square of Birge's ratio (1932). The
+    variances remain unchanged if chance explains the scatter.
+
+    Args:
+        posterior: The estimate of the film.
 
     Returns:
         The estimate, and a caution if the errors were increased.
     """
     chi2, degrees_of_freedom = posterior.total
-    if degrees_of_freedom == 0.0 or scipy.stats.chi2.sf(chi2, degrees_of_freedom) >= UNCERTAIN_PROBABILITY:
+    if degrees_of_freedom == 0.0:
+        return posterior, []
+    probability_of_chance = scipy.stats.chi2.sf(chi2, degrees_of_freedom)
+    if probability_of_chance >= UNCERTAIN_PROBABILITY:
         return posterior, []
     variance_ratio = chi2 / degrees_of_freedom
     caution = (
@@ -182,8 +230,13 @@ def _check_enough_measured(presses: MeasuredPresses, problem: CalibrationProblem
 def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> None:
     """Raise PressError if no film explains the presses, or only an improbable film does.
 
-    A few presses with a common mistake may agree with a film that is possible but unusual. The presses are then
-    compared with those of common mistakes.
+    A few presses with a common mistake may agree with a film that is possible but unusual. For an unusual film, an
+    error is therefore also raised if the correction of a common mistake explains the presses far better.
+
+    Args:
+        presses: The presses.
+        problem: The possible films.
+        posterior: The estimate of the film from these presses.
     """
     chi2, degrees_of_freedom = posterior.total
     is_unexplained = (
@@ -191,16 +244,25 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
         and chi2 / degrees_of_freedom > UNEXPLAINED_CHI2
         and scipy.stats.chi2.sf(chi2, degrees_of_freedom) < UNEXPLAINED_PROBABILITY
     )
-    # Squared Mahalanobis distance of the film from its description.
+
+    # Squared Mahalanobis distance of the estimated film from the film that was expected before the presses.
     deviation = (posterior.parameters - problem.before.parameters) / problem.prior.std
     squared_distance = float(deviation @ np.linalg.solve(problem.before.covariance, deviation))
     film_probability = scipy.stats.chi2.sf(squared_distance, deviation.size)
+    is_improbable = film_probability < STRAINED_PROBABILITY
+
     is_unusual = posterior.imperfect or posterior.bad.any() or film_probability < ODD_PROBABILITY
     is_mistaken = is_unusual and bool(find_mistakes(presses, problem.charges))
-    if is_unexplained or film_probability < STRAINED_PROBABILITY or is_mistaken:
-        refuse_closed_back(presses, problem.charges)
-        worst = max(chi2 / max(degrees_of_freedom, 1.0), squared_distance / deviation.size)
-        raise unexplained_error(presses, problem.charges, large_residual(float(np.sqrt(worst))))
+    if not (is_unexplained or is_improbable or is_mistaken):
+        return
+
+    refuse_closed_back(presses, problem.charges)
+    reason = UNUSUAL_FILM
+    if is_unexplained or is_improbable:
+        press_ratio = chi2 / max(degrees_of_freedom, 1.0)
+        film_ratio = squared_distance / deviation.size
+        reason = large_residual(float(np.sqrt(max(press_ratio, film_ratio))))
+    raise unexplained_error(presses, problem.charges, reason)
 
 
 def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> FilmPosterior:
@@ -213,23 +275,35 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
         posterior: The estimate after the presses.
         before: The estimate before the presses.
     """
+    # Presses that were left out as wrong make further mistakes likely, unless many good presses agree with each other.
     good_count = int((~posterior.bad).sum())
     left_out_count = int(posterior.bad.sum())
-    probability = min(left_out_count / (good_count * good_count), 0.5)
+    mistake_probability = min(left_out_count / (good_count * good_count), 0.5)
     if good_count <= FEW:
-        probability += MISTAKE_PROBABILITY * good_count
-    joint = (1.0 - probability) * posterior.joint
-    estimated = slice(0, len(before.unknowns))
-    joint[estimated, estimated] += probability * before.unknown_covariance
+        mistake_probability += MISTAKE_PROBABILITY * good_count
+    correct_probability = 1.0 - mistake_probability
+
+    joint = correct_probability * posterior.joint
+    # The estimate before the presses contains the first of the unknowns of the posterior.
+    prior_unknowns = slice(0, len(before.unknowns))
+    joint[prior_unknowns, prior_unknowns] += mistake_probability * before.unknown_covariance
+    parameters = slice(0, len(before.parameters))
+
+    # Without the presses, the warming is not correlated with the unknowns.
     warming = posterior.warming
     if warming is not None:
-        warming = warming._replace(covariance=(1.0 - probability) * warming.covariance)
-    parameters = slice(0, len(before.parameters))
+        warming = warming._replace(covariance=correct_probability * warming.covariance)
     return replace(posterior, joint=joint, covariance=joint[parameters, parameters], warming=warming)
 
 
 def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> Iterator[str]:
-    """Yield warnings about the presses and the estimate, one sentence each."""
+    """Yield warnings about the presses and the estimate, one sentence each.
+
+    Args:
+        presses: All presses of the calibration.
+        problem: The possible films.
+        posterior: The estimate of the film, which says which presses are bad.
+    """
     if posterior.bad.any():
         lines = row_words(presses[posterior.bad].lines, presses.row_noun)
         yield f"{lines}: left out, because no film explains them together with the others; check them"
@@ -251,13 +325,23 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
             "their stated standard deviation: are force and charges read at the same moment, or does charge leak in "
             "between? An effect that lowers charges at random also lowers their mean. The stated errors include it"
         )
-    limited = _parameters_at_bounds(problem, posterior)
-    if limited:
+    limited_parameters = _parameters_at_bounds(problem, posterior)
+    if limited_parameters:
         yield (
-            f"at the limit of the allowed difference from the sensor file: {', '.join(limited)}; the errors may be "
-            "larger than stated. Do the sensor file, and the origin and axes of the stage, belong to this film?"
+            f"at the limit of the allowed difference from the sensor file: {', '.join(limited_parameters)}; the errors "
+            "may be larger than stated. Do the sensor file, and the origin and axes of the stage, belong to this film?"
         )
-    positions = good.contact[np.isfinite(good.contact[:, 0]), :2]
+    yield from _position_cautions(good)
+
+
+def _position_cautions(presses: MeasuredPresses) -> Iterator[str]:
+    """Yield a warning if no press has a known position, or if all known positions lie close to each other.
+
+    Args:
+        presses: The presses that were not left out. Unknown positions are NaN.
+    """
+    has_position = np.isfinite(presses.contact[:, 0])
+    positions = presses.contact[has_position, :2]
     if len(positions) == 0:
         yield (
             "no position is known: positions will be correct only up to the shift and the rotation of the electrodes, "
@@ -275,11 +359,17 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
 def _parameters_at_bounds(problem: CalibrationProblem, posterior: FilmPosterior) -> list[str]:
     """Return the names of the parameters whose estimates lie on a bound.
 
-    A pretension of zero is a physical limit and does not count.
+    A lower bound that is not negative, such as a pretension of zero, is a physical limit and does not count.
+
+    Args:
+        problem: The possible films, with the bounds of their parameters.
+        posterior: The estimate of the film.
     """
     prior = problem.prior
     lower, upper = prior.bounds
     margin = BOUND_DISTANCE * prior.std
-    is_low = (posterior.parameters < lower + margin) & (lower < 0.0)
-    is_high = posterior.parameters > upper - margin
-    return [name for name, is_limited in zip(prior.names, is_low | is_high, strict=True) if is_limited]
+    is_physical_limit = lower >= 0.0
+    is_at_lower = (posterior.parameters < lower + margin) & ~is_physical_limit
+    is_at_upper = posterior.parameters > upper - margin
+    is_at_bound = is_at_lower | is_at_upper
+    return [name for name, is_limited in zip(prior.names, is_at_bound, strict=True) if is_limited]

@@ -1,6 +1,6 @@
 """Writer and reader of the estimate of a film in `calibration.json`.
 
-The file contains each parameter with its standard deviation. It also contains the correlations of all parameters,
+The file contains each parameter with its standard deviation. The file also contains the correlations of all parameters,
 rounded to six digits. If the film has a discrepancy, the file also contains its coefficients. The standard deviations
 and correlations then refer to the parameters and the coefficients. If temperatures were measured, the file also
 contains the change of the pretension with temperature.
@@ -130,15 +130,18 @@ def _discrepancy_table(posterior: FilmPosterior) -> dict[str, Any] | None:
 def _temperature_table(posterior: FilmPosterior) -> dict[str, Any] | None:
     """Return the change of the pretension with temperature for the file, in C and Pa/K.
 
-    A calibration without temperatures gives None. The table includes the correlations with the other unknowns in the
-    file.
+    The table includes the correlations of the change with the other unknowns in the file: the parameters, and the
+    coefficients if the film has imperfections. A calibration without temperatures gives None.
+
+    Args:
+        posterior: The estimate of the film.
     """
     warming = posterior.warming
     if warming is None:
         return None
     film_covariance = posterior.joint if posterior.imperfect else posterior.covariance
     film_std = np.sqrt(np.diag(film_covariance))
-    covariance_with_film = warming.covariance[: film_std.size]
+    covariance_with_film = warming.covariance[: film_std.size]  # without the unknowns that are not in the file
     correlations = _over_std(covariance_with_film, warming.std * film_std)
     return {
         "at_C": warming.at_C,
@@ -171,44 +174,89 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
             f"{path}: a calibration of {shown(table.sensor)} with the parameters {cut(', '.join(names))}; expected "
             f"{prior.sensor.name!r} with {', '.join(prior.names)}"
         )
+
+    # The unknowns of the film are its parameters, followed by its coefficients if the file has them.
     parameters, parameter_std = _read_parameters(path, table, prior)
     parameter_correlations = _correlations(path, "correlations", table.correlations, parameter_std)
     if table.discrepancy is None:
         coefficients = np.empty(0)
-        std = parameter_std
-        correlations = parameter_correlations
+        film_std = parameter_std
+        film_correlations = parameter_correlations
     else:
-        coefficients, std = _read_coefficients(path, table.discrepancy, problem, parameter_std)
-        correlations = _correlations(path, "discrepancy.correlations", table.discrepancy.correlations, std)
-        shared_correlations = correlations[: len(names), : len(names)]
-        if np.abs(shared_correlations - parameter_correlations).max() > 2.0 * CORRELATION_TOLERANCE:
-            raise PressError(
-                f"{path}: discrepancy.correlations: expected those of the parameters, as under correlations, in the "
-                f"first {len(names)} rows, got others; calibrate anew"
-            )
+        coefficients, film_std = _read_coefficients(path, table.discrepancy, problem, parameter_std)
+        film_correlations = _film_correlations(path, table.discrepancy, film_std, parameter_correlations)
+
     if table.temperature is None:
-        covariance = _possible(path, correlations) * np.outer(std, std)
+        film_covariance = _possible(path, film_correlations) * np.outer(film_std, film_std)
         warming = None
     else:
-        correlations = _with_temperature(path, table.temperature, correlations, std)
-        change = table.temperature.pretension_per_K
-        change_std = change.std / PASCAL_FACTOR
-        all_std = np.append(std, change_std)
-        all_covariance = _possible(path, correlations) * np.outer(all_std, all_std)
-        covariance = all_covariance[: std.size, : std.size]
-        warming = Warming(
-            MPa_per_K=change.value / PASCAL_FACTOR,
-            std=change_std,
-            at_C=table.temperature.at_C,
-            covariance=all_covariance[: std.size, std.size],
-        )
+        film_covariance, warming = _read_temperature(path, table.temperature, film_correlations, film_std)
     return FilmEstimate(
         parameters=parameters,
-        covariance=covariance[: len(names), : len(names)],
+        covariance=film_covariance[: len(names), : len(names)],
         coefficients=coefficients,
-        joint=covariance if coefficients.size else np.empty((0, 0)),
+        joint=film_covariance if coefficients.size else np.empty((0, 0)),
         warming=warming,
     )
+
+
+def _film_correlations(path: Path, table: _Discrepancy, film_std: Array, parameter_correlations: Array) -> Array:
+    """Read the correlations of parameters and coefficients, and compare them with those of the parameters alone.
+
+    Args:
+        path: The file, for error messages.
+        table: Section `discrepancy` of the file.
+        film_std: Standard deviations of parameters and coefficients, shape (n,).
+        parameter_correlations: Correlations of the parameters, from the section `correlations`, shape (n_parameter,
+            n_parameter).
+
+    Returns:
+        Correlations, shape (n, n).
+
+    Raises:
+        PressError: If the matrix is not a matrix of correlations, or contradicts those of the parameters.
+    """
+    correlations = _correlations(path, "discrepancy.correlations", table.correlations, film_std)
+    n_parameter = len(parameter_correlations)
+    shared_correlations = correlations[:n_parameter, :n_parameter]
+    if np.abs(shared_correlations - parameter_correlations).max() > 2.0 * CORRELATION_TOLERANCE:
+        raise PressError(
+            f"{path}: discrepancy.correlations: expected those of the parameters, as under correlations, in the "
+            f"first {n_parameter} rows, got others; calibrate anew"
+        )
+    return correlations
+
+
+def _read_temperature(
+    path: Path, table: _Temperature, film_correlations: Array, film_std: Array
+) -> tuple[Array, Warming]:
+    """Read the change of the pretension with temperature.
+
+    Args:
+        path: The file, for error messages.
+        table: Section `temperature` of the file, in Pa/K and degrees Celsius.
+        film_correlations: Correlations of the unknowns of the film, shape (n, n).
+        film_std: Standard deviations of the unknowns of the film, shape (n,).
+
+    Returns:
+        Covariance of the unknowns of the film, shape (n, n), and the change of the pretension in MPa/K.
+
+    Raises:
+        PressError: If the section is not possible together with the unknowns of the film.
+    """
+    correlations = _with_temperature(path, table, film_correlations, film_std)
+    change = table.pretension_per_K
+    change_std = change.std / PASCAL_FACTOR
+    std = np.append(film_std, change_std)
+    covariance = _possible(path, correlations) * np.outer(std, std)
+    n_film = film_std.size  # index of the change, which follows the unknowns of the film
+    warming = Warming(
+        MPa_per_K=change.value / PASCAL_FACTOR,
+        std=change_std,
+        at_C=table.at_C,
+        covariance=covariance[:n_film, n_film],
+    )
+    return covariance[:n_film, :n_film], warming
 
 
 def _read_parameters(path: Path, table: _CalibrationFile, prior: FilmPrior) -> tuple[Array, Array]:
@@ -225,10 +273,10 @@ def _read_parameters(path: Path, table: _CalibrationFile, prior: FilmPrior) -> t
     Raises:
         PressError: If a value is outside the bounds, or a standard deviation is too large.
     """
-    units = prior.file_factors
-    lower, upper = (bound * units for bound in prior.bounds)  # in the units of the file
-    tolerance = BOUND_TOLERANCE * prior.std * units
-    largest_std = LARGEST_STD * prior.std * units
+    file_factors = prior.file_factors  # factors from the units of the prior to those of the file
+    lower, upper = (bound * file_factors for bound in prior.bounds)
+    tolerance = BOUND_TOLERANCE * prior.std * file_factors
+    largest_std = LARGEST_STD * prior.std * file_factors
     for index, (name, estimate) in enumerate(table.parameters.items()):
         if not lower[index] - tolerance[index] <= estimate.value <= upper[index] + tolerance[index]:
             raise PressError(
@@ -239,8 +287,8 @@ def _read_parameters(path: Path, table: _CalibrationFile, prior: FilmPrior) -> t
             raise PressError(
                 f"{path}: parameters.{name}.std: expected at most {largest_std[index]:.6g}, got {estimate.std:g}"
             )
-    parameters = np.array([estimate.value for estimate in table.parameters.values()]) / units
-    std = np.array([estimate.std for estimate in table.parameters.values()]) / units / prior.std
+    parameters = np.array([estimate.value for estimate in table.parameters.values()]) / file_factors
+    std = np.array([estimate.std for estimate in table.parameters.values()]) / file_factors / prior.std
     return parameters, std
 
 
@@ -263,26 +311,33 @@ def _read_coefficients(
         PressError: If there are too few or too many numbers, if a number is too large, or if the standard deviations
             contradict those of the parameters.
     """
-    expected_count = problem.charges.n_coefficient
-    if len(table.coefficients) != expected_count:
+    coefficient_count = problem.charges.n_coefficient
+    if len(table.coefficients) != coefficient_count:
         raise PressError(
-            f"{path}: discrepancy.coefficients: expected {expected_count} numbers, got {len(table.coefficients)}; "
+            f"{path}: discrepancy.coefficients: expected {coefficient_count} numbers, got {len(table.coefficients)}; "
             "calibrate anew"
         )
-    if len(table.std) != parameter_std.size + expected_count:
+    std_count = parameter_std.size + coefficient_count
+    if len(table.std) != std_count:
         raise PressError(
-            f"{path}: discrepancy.std: expected {parameter_std.size + expected_count} numbers, one for each parameter "
-            f"and coefficient, got {len(table.std)}; calibrate anew"
+            f"{path}: discrepancy.std: expected {std_count} numbers, one for each parameter and coefficient, got "
+            f"{len(table.std)}; calibrate anew"
         )
+
     coefficients = np.array(table.coefficients)
     std = np.array(table.std)
-    for key, values, largest in (
+    for key, values, limit in (
         ("coefficients", coefficients, LARGEST_COEFFICIENT),
         ("std", std, LARGEST_STD),
     ):
-        index = int(np.abs(values).argmax())
-        if abs(values[index]) > largest:
-            raise PressError(f"{path}: discrepancy.{key}[{index}]: expected at most {largest:g}, got {values[index]:g}")
+        largest_index = int(np.abs(values).argmax())
+        largest_value = values[largest_index]
+        if abs(largest_value) > limit:
+            raise PressError(
+                f"{path}: discrepancy.{key}[{largest_index}]: expected at most {limit:g}, got {largest_value:g}"
+            )
+
+    # The first standard deviations are those of the parameters, which the file contains twice.
     if not np.allclose(std[: parameter_std.size], parameter_std, rtol=1e-6, atol=1e-12):
         raise PressError(
             f"{path}: discrepancy.std: expected the standard deviations of the parameters, over those of the prior, in "
@@ -292,7 +347,7 @@ def _read_coefficients(
 
 
 def _with_temperature(path: Path, table: _Temperature, correlations: Array, std: Array) -> Array:
-    """Append the correlations of the change of the pretension with temperature to a matrix of correlations.
+    """Append the change of the pretension with temperature, as a last row and column, to a matrix of correlations.
 
     Args:
         path: The file, for error messages.
@@ -321,7 +376,9 @@ def _with_temperature(path: Path, table: _Temperature, correlations: Array, std:
             f"got {len(given_row)}"
         )
     may_be_null = (std == 0.0) | (change.std == 0.0)  # the correlation of a constant is not defined
-    temperature_row = _numbers(path, "temperature.correlations", [given_row], may_be_null[None])[0]
+    # `_numbers` reads a matrix, so the row is given and returned as a matrix of one row.
+    (temperature_row,) = _numbers(path, "temperature.correlations", [given_row], may_be_null[None])
+
     extended = np.eye(std.size + 1)
     extended[:-1, :-1] = correlations
     extended[-1, :-1] = temperature_row
@@ -344,11 +401,13 @@ def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Arra
     Raises:
         PressError: If the matrix has another shape, or is not a matrix of correlations.
     """
-    if [len(row) for row in rows] != [std.size] * std.size:
+    is_square = len(rows) == std.size and all(len(row) == std.size for row in rows)
+    if not is_square:
         raise PressError(f"{path}: {key}: expected {std.size} rows of as many numbers")
-    may_be_null = np.add.outer(std == 0.0, std == 0.0)
-    matrix = _numbers(path, key, rows, may_be_null)
-    diagonal = np.where(std == 0.0, 1.0, np.diag(matrix))
+    is_constant = std == 0.0
+    matrix = _numbers(path, key, rows, may_be_null=is_constant[:, None] | is_constant[None, :])
+
+    diagonal = np.where(is_constant, 1.0, np.diag(matrix))
     deviation_from_one = np.abs(diagonal - 1.0)
     if deviation_from_one.max() > CORRELATION_TOLERANCE:
         index = int(deviation_from_one.argmax())
@@ -356,6 +415,7 @@ def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Arra
             f"{path}: {key}[{index}][{index}]: expected 1, the correlation of an unknown with itself, "
             f"got {diagonal[index]:g}"
         )
+
     asymmetry = np.abs(matrix - matrix.T)
     if asymmetry.max() > CORRELATION_TOLERANCE:
         row, column = np.unravel_index(int(asymmetry.argmax()), asymmetry.shape)
@@ -363,7 +423,7 @@ def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Arra
             f"{path}: {key}: expected a symmetric matrix, got {matrix[row, column]:g} in row {row + 1}, column "
             f"{column + 1} and {matrix[column, row]:g} in row {column + 1}, column {row + 1}"
         )
-    np.fill_diagonal(matrix, 1.0)
+    np.fill_diagonal(matrix, 1.0)  # removes rounding errors, and the zeros of unknowns without variance
     return matrix
 
 
@@ -380,18 +440,19 @@ def _numbers(path: Path, key: str, rows: list[list[Correlation]], may_be_null: B
         PressError: If a row contains null where a number is needed.
     """
     matrix = np.array([[np.nan if value is None else value for value in row] for row in rows])
-    is_missing = np.isnan(matrix) & ~may_be_null
+    is_null = np.isnan(matrix)
+    is_missing = is_null & ~may_be_null
     if is_missing.any():
         row, column = np.argwhere(is_missing)[0]
         raise PressError(
             f"{path}: {key}: expected a number from -1 to 1 in row {row + 1}, column {column + 1}, got null; calibrate "
             "anew"
         )
-    return np.where(np.isnan(matrix), 0.0, matrix)
+    return np.where(is_null, 0.0, matrix)
 
 
 def _possible(path: Path, correlations: Array) -> Array:
-    """Replace small negative eigenvalues of a correlation matrix, which are caused by rounding, by zero.
+    """Return the correlation matrix without the small negative eigenvalues that rounding causes.
 
     Args:
         path: The file, for the error message.
@@ -404,11 +465,12 @@ def _possible(path: Path, correlations: Array) -> Array:
         PressError: If an eigenvalue is too negative for rounding, so that the matrix cannot contain correlations.
     """
     eigenvalues, vectors = np.linalg.eigh(correlations)
-    if eigenvalues[0] < -EIGENVALUE_TOLERANCE:
+    smallest_eigenvalue = eigenvalues[0]
+    if smallest_eigenvalue < -EIGENVALUE_TOLERANCE:
         raise PressError(
             f"{path}: correlations: expected a positive semidefinite matrix, got one with the eigenvalue "
-            f"{eigenvalues[0]:.3g}: no unknowns have these correlations together; calibrate anew"
+            f"{smallest_eigenvalue:.3g}: no unknowns have these correlations together; calibrate anew"
         )
-    if eigenvalues[0] >= 0.0:
+    if smallest_eigenvalue >= 0.0:
         return correlations
     return np.asarray((vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T)

@@ -46,6 +46,9 @@ CLOSED_BACK_CAUTION = (
 def has_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> bool:
     """Return whether films with a closed back explain the presses much better than films with a vented back.
 
+    At most `MAX_EXAMINED` presses are examined, because every press on a film with a closed back needs a solve. The
+    solves are omitted if a film with a vented back explains the presses well.
+
     Args:
         presses: The presses. Those without a place or a force are not used.
         charges: Charges of the films of the calibration.
@@ -55,10 +58,14 @@ def has_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> bool:
         return False
     evenly_spaced_rows = np.linspace(0, len(placed) - 1, MAX_EXAMINED).round().astype(int)
     examined = placed[np.unique(evenly_spaced_rows)]
+
+    # The charges are computed for a few pretensions, and interpolated between them.
     vented_charges = _interpolated(expected_charges(charges, examined.contact))
     vented_misfit = charge_misfit(charges, examined.contact, examined.charge_pC, vented_charges)
-    if not MIN_VENTED_MISFIT < vented_misfit < np.inf:
+    needs_other_explanation = MIN_VENTED_MISFIT < vented_misfit < np.inf
+    if not needs_other_explanation:
         return False
+
     contact = charges.into_domain(examined.contact)
     try:
         solved_charges = np.array([_closed_charges(charges, share, contact) for share in PRETENSIONS])
@@ -102,11 +109,11 @@ def _interpolated(charge: Array) -> Array:
 
 
 def _closed_charges(charges: FilmCharges, pretension_share: float, contact: Array) -> Array:
-    """Compute the charges of the mean film of the prior with a closed back.
+    """Compute the charges of the mean film of the prior with a closed back and a given pretension.
 
     Args:
         charges: Charges of the films of the calibration.
-        pretension_share: Pretension over the largest pretension of the prior.
+        pretension_share: Pretension divided by the largest pretension of the prior.
         contact: Presses (x, y, F), shape (n, 3), mm and N.
 
     Returns:
@@ -119,8 +126,8 @@ def _closed_charges(charges: FilmCharges, pretension_share: float, contact: Arra
     back_volume = CAVITY_DEPTH_mm * np.pi * sensor.film.radius**2
     closed = replace(sensor, film=replace(sensor.film, back_volume=back_volume))
     settings = SolveSettings(accuracy=ACCURACY)
-    rows = [
-        touch_charge(closed, press(closed.coated_film, probe, (x, y), force, settings))
-        for x, y, force in contact.tolist()
-    ]
-    return np.array(rows)
+    charge_rows = []
+    for x, y, force in contact.tolist():
+        solved_press = press(closed.coated_film, probe, (x, y), force, settings)
+        charge_rows.append(touch_charge(closed, solved_press))
+    return np.array(charge_rows)

@@ -8,12 +8,12 @@ contact is then the change that compensates the difference of the charges best:
 J and P are the derivatives of the charges with respect to the contact and to the parameters, and W is the inverse of
 the noise variance. If the parameters have the covariance C, the errors of the contacts have the covariance G C G'.
 Noise alone causes errors with the covariance (J' W J)^-1, which is the Cramer-Rao limit. The matrix J' W J also
-contains the prior of a contact. By the prior, the contact lies in the working area and in the range of forces. The
-errors are therefore finite where the charge map folds.
+contains the prior of a contact. According to this prior, the contact lies in the working area and in the range of
+forces. The errors are therefore finite where the charge map folds.
 
 The information that a press adds about the film depends on the contact, but hardly on the measured charges. The best
-next press can therefore be chosen before it is made. Presses are chosen one after the other. Each of them is the best
-press given the previous presses (a greedy A-optimal design, Pukelsheim 1993).
+next press can therefore be chosen before it is made. Presses are chosen one after the other. Each further press is the
+best one given the previous presses (a greedy A-optimal design, Pukelsheim 1993).
 """
 
 from dataclasses import dataclass
@@ -115,13 +115,15 @@ class ContactSensitivity:
         contact = spread_contacts(domain, N_CONTACTS)
         contact_slopes, film_slopes = _whitened_slopes(problem, parameters, contact)
 
-        # Covariance of a contact by noise, from the information of the charges and of the prior
+        # Covariance of a contact by noise, from the information of the charges and of the prior. The prior of ln F is
+        # uniform, so its standard deviation is its width divided by the root of 12.
         min_force, max_force = domain.force_range
         log_force_std = max(np.log(max_force / min_force), 0.1) / np.sqrt(12.0)
         prior_std = np.array([0.5 * domain.radius, 0.5 * domain.radius, log_force_std])
         charge_information = np.einsum("nki,nkj->nij", contact_slopes, contact_slopes)
         noise_covariance = np.linalg.inv(charge_information + np.diag(prior_std**-2))
 
+        # The estimated contact moves by the gain times the change of the charges over their noise.
         charge = problem.charges.charges(parameters, contact)
         sigma = problem.noise.sigma(charge)
         whitened_gain = noise_covariance @ contact_slopes.swapaxes(1, 2)
@@ -181,7 +183,7 @@ def spread_contacts(domain: Domain, count: int) -> Array:
 
 
 def _whitened_slopes(problem: CalibrationProblem, parameters: Array, contact: Array) -> tuple[Array, Array]:
-    """Return the derivatives of the charges in units of their noise.
+    """Return the derivatives of the charges, each divided by the noise standard deviation of its charge.
 
     Args:
         problem: The films.
@@ -195,7 +197,8 @@ def _whitened_slopes(problem: CalibrationProblem, parameters: Array, contact: Ar
     charges = problem.charges
     contact_slopes = charges.by_contact(parameters, contact)
     film_slopes = charges.by_parameter(parameters, contact, contact_slopes)
-    weight = 1.0 / problem.noise.sigma(charges.charges(parameters, contact))[:, :, None]
+    noise_std = problem.noise.sigma(charges.charges(parameters, contact))  # shape (n, n_electrode)
+    weight = 1.0 / noise_std[:, :, None]
     return weight * contact_slopes, weight * film_slopes
 
 
@@ -235,6 +238,8 @@ def _information_roots(
         Shape (n, n_electrode + 3, n_unknown).
     """
     contact_slopes, film_slopes = _whitened_slopes(problem, parameters, contact)
+
+    # The measured contact is the contact itself with errors, so it does not depend on the film.
     rig_weights = np.array([1.0 / position_std_mm, 1.0 / position_std_mm, 1.0 / force_std])
     rig_contact_slopes = np.broadcast_to(np.diag(rig_weights), (len(contact), 3, 3))
     rig_film_slopes = np.zeros((len(contact), 3, film_slopes.shape[2]))
@@ -279,6 +284,9 @@ def next_presses(
 ) -> list[ProposedPress]:
     """Choose the presses to make next, the best one first.
 
+    The presses are chosen one after the other from many candidates. Each chosen press is the candidate that reduces the
+    expected error of contacts most, given the presses chosen before.
+
     Args:
         problem: The films.
         count: Number of presses.
@@ -297,27 +305,48 @@ def next_presses(
     if avoid_mm is None:
         avoid_mm = np.empty((0, 2))
     candidates = _candidates(problem.domain.radius, problem.proposed_forces, avoid_mm)
-    roots = _information_roots(problem, film.unknowns, candidates, position_std_mm, force_std)
+    # R of each candidate, shape (n_candidate, n_residual, n_unknown)
+    information_roots = _information_roots(problem, film.unknowns, candidates, position_std_mm, force_std)
     error_weights = sensitivity.error_weights()
     covariance = film.unknown_covariance
     proposed = []
     for _ in range(count):
-        # A press with the information R' R reduces the covariance C by (R C)' (1 + R C R')^-1 (R C). The benefit of
-        # the press is the reduction of the mean squared error, the trace of the error weights times this matrix.
-        projection = roots @ covariance
-        innovation = np.eye(roots.shape[1]) + projection @ roots.swapaxes(1, 2)
-        weighted_projection = projection @ error_weights @ projection.swapaxes(1, 2)
-        benefit = np.einsum("nij,nji->n", np.linalg.inv(innovation), weighted_projection)
-        best = int(np.argmax(benefit))
-        covariance = covariance - projection[best].T @ np.linalg.solve(innovation[best], projection[best])
+        best, covariance = _best_candidate(information_roots, covariance, error_weights)
         error = sensitivity.contact_error(covariance)
         x, y, force = candidates[best].tolist()
         proposed.append(ProposedPress(x, y, force, error.position_mm, error.force_percent))
     return proposed
 
 
+def _best_candidate(information_roots: Array, covariance: Array, error_weights: Array) -> tuple[int, Array]:
+    """Return the candidate that reduces the mean squared error most, and the covariance after this press.
+
+    A press with the information R' R reduces the covariance C by (R C)' (1 + R C R')^-1 (R C). The reduction of the
+    mean squared error is the trace of the error weights times this matrix.
+
+    Args:
+        information_roots: Matrix R of each candidate, shape (n, n_residual, n_unknown).
+        covariance: Covariance C of the film's unknowns before the press, shape (n_unknown, n_unknown).
+        error_weights: Matrix S for which the trace of S C is the mean squared error, shape (n_unknown, n_unknown).
+
+    Returns:
+        Index of the candidate, and the covariance after the press.
+    """
+    n_residual = information_roots.shape[1]
+    projection = information_roots @ covariance  # R C
+    innovation = np.eye(n_residual) + projection @ information_roots.swapaxes(1, 2)  # 1 + R C R'
+    weighted_projection = projection @ error_weights @ projection.swapaxes(1, 2)  # R C S C R'
+    error_reduction = np.einsum("nij,nji->n", np.linalg.inv(innovation), weighted_projection)  # traces of products
+    best = int(np.argmax(error_reduction))
+    covariance_reduction = projection[best].T @ np.linalg.solve(innovation[best], projection[best])
+    return best, covariance - covariance_reduction
+
+
 def _candidates(radius: float, force_range: tuple[float, float], avoid_mm: Array) -> Array:
-    """Return the candidates for the next press, with positions and forces rounded so that a person can set them.
+    """Return the candidates for the next press: every allowed position with every force.
+
+    The positions are distributed evenly over the working area. Positions and forces are rounded so that a person can
+    set them.
 
     Args:
         radius: Largest distance of a press from the centre, mm.
@@ -342,8 +371,10 @@ def _candidates(radius: float, force_range: tuple[float, float], avoid_mm: Array
     if not len(positions):
         raise PressError(f"no place within {radius:.3g} mm of the centre is left to press; skip fewer")
 
+    # The candidate forces are fractions of the logarithmic range of forces.
     min_force, max_force = force_range
     exact_forces = min_force * (max_force / min_force) ** np.array(CANDIDATE_FORCES)
     rounded_forces = np.round(exact_forces / FORCE_GRID_N) * FORCE_GRID_N
-    forces = np.unique(np.clip(np.maximum(rounded_forces, FORCE_GRID_N), min_force, max_force))
+    positive_forces = np.maximum(rounded_forces, FORCE_GRID_N)
+    forces = np.unique(np.clip(positive_forces, min_force, max_force))
     return np.array([(x, y, force) for x, y in positions for force in forces])

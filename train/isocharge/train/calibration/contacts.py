@@ -69,6 +69,9 @@ def with_force(contact: Array) -> Array:
 def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> AdjustedContacts:
     """Find the contacts that agree best with both the measured charges and the contacts measured by the rig.
 
+    The sum of squared residuals of each press is minimised over its contact (x, y, ln F). The search uses scaled
+    contacts, in which the domain is the unit disk times [-1, 1].
+
     Args:
         charges: The films.
         unknowns: Unknowns of the film under the presses, as `FilmCharges.film` takes them.
@@ -77,16 +80,16 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
     """
     layout = charges.layout
     domain = charges.domain
-    films, shares = neighbouring_films(charges, unknowns, data)
+    films, film_weights = neighbouring_films(charges, unknowns, data)
     forward_maps = [charges.forward_map(film[layout.parameters]) for film in films]
 
     # The factor of imperfections and discrepancy on the charges changes slowly with the contact. It takes long to
-    # compute, so it is approximated as a linear function of the contact.
+    # compute, so it is approximated as a linear function of the contact about the start.
     start_factor = np.ones_like(data.charge)
     factor_slopes = np.zeros((*data.charge.shape, 3))
     if unknowns[layout.coefficients].any():
-        factors = [_values_and_slopes(partial(charges.factor, film), with_force(start)) for film in films]
-        start_factor, factor_slopes = _interpolated(factors, shares)
+        film_factors = [_values_and_slopes(partial(charges.factor, film), with_force(start)) for film in films]
+        start_factor, factor_slopes = _interpolated(film_factors, film_weights)
 
     def residuals(rows: Integers, scaled_contact: Array) -> tuple[Array, Array]:
         """Return the residuals of some presses, and their derivatives with respect to the scaled contact.
@@ -99,15 +102,16 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
             Residuals, shape (k, n_electrode + 3), and derivatives, shape (k, 3, n_electrode + 3).
         """
         contact = scaled_contact * domain.scale + domain.centre
-        displacement = (contact - start[rows])[:, None]
+        displacement = (contact - start[rows])[:, None]  # shape (k, 1, 3)
         factor = start_factor[rows] + (factor_slopes[rows] * displacement).sum(axis=2)
         film_charges = [_values_and_slopes(forward_map.charges, with_force(contact)) for forward_map in forward_maps]
-        charge, charge_slopes = _interpolated(film_charges, shares[rows])
-        # Derivatives of factor * charge by the product rule
+        charge, charge_slopes = _interpolated(film_charges, film_weights[rows])
+
+        # Derivatives of factor * charge by the product rule, shape (k, n_electrode, 3)
         product_slopes = factor[:, :, None] * charge_slopes + charge[:, :, None] * factor_slopes[rows]
         presses = data[rows]
-        slopes = presses.residual_slopes(product_slopes) * domain.scale
-        return presses.residual(factor * charge, contact), slopes.swapaxes(1, 2)
+        residual_slopes = presses.residual_slopes(product_slopes) * domain.scale  # per unit of the scaled contact
+        return presses.residual(factor * charge, contact), residual_slopes.swapaxes(1, 2)
 
     scaled_start = (start - domain.centre) / domain.scale
     scaled_contact, residual = minimise(residuals, scaled_start, min_change=MIN_CHANGE)
@@ -129,42 +133,43 @@ def neighbouring_films(charges: FilmCharges, unknowns: Array, data: PressData) -
     """
     pretension = charges.layout.parameter("pretension")
     lower, upper = charges.prior.bounds
-    bounds = float(lower[pretension]), float(upper[pretension])
-    nodes, shares = data.pretension_nodes(float(unknowns[pretension]), bounds)
+    pretension_bounds = float(lower[pretension]), float(upper[pretension])
+    node_pretensions, film_weights = data.pretension_nodes(float(unknowns[pretension]), pretension_bounds)
     films = []
-    for node in nodes:
+    for node_pretension in node_pretensions:
         film = unknowns.copy()
-        film[pretension] = node
+        film[pretension] = node_pretension
         films.append(film)
-    return films, shares
+    return films, film_weights
 
 
-def _interpolated(film_values_and_slopes: list[tuple[Array, Array]], shares: Array) -> tuple[Array, Array]:
+def _interpolated(film_values_and_slopes: list[tuple[Array, Array]], film_weights: Array) -> tuple[Array, Array]:
     """Interpolate the values and derivatives at presses between neighbouring films.
 
     Args:
         film_values_and_slopes: Values and derivatives on each of k films, as `_values_and_slopes` returns them.
-        shares: Weight of each film in each press, shape (n, k).
+        film_weights: Weight of each film in each press, shape (n, k).
     """
-    values = weighted_sum([film_values for film_values, _ in film_values_and_slopes], shares)
-    slopes = weighted_sum([film_slopes for _, film_slopes in film_values_and_slopes], shares)
+    values = weighted_sum([film_values for film_values, _ in film_values_and_slopes], film_weights)
+    slopes = weighted_sum([film_slopes for _, film_slopes in film_values_and_slopes], film_weights)
     return values, slopes
 
 
-def weighted_sum(arrays: Sequence[Array], shares: Array) -> Array:
+def weighted_sum(arrays: Sequence[Array], weights: Array) -> Array:
     """Return the weighted sum of arrays, with different weights for each row.
 
     Args:
         arrays: The k arrays, each of shape (n, ...).
-        shares: Weight of each array in each row, shape (n, k).
+        weights: Weight of each array in each row, shape (n, k).
 
     Returns:
         The sum, shape (n, ...).
     """
     total = np.zeros_like(arrays[0])
-    for array, share in zip(arrays, shares.T, strict=True):
+    for array, row_weights in zip(arrays, weights.T, strict=True):
+        # The weights of the rows get axes of length 1, so that they are broadcast over the other axes of the array.
         trailing_axes = tuple(range(1, array.ndim))
-        total = total + array * np.expand_dims(share, trailing_axes)
+        total = total + array * np.expand_dims(row_weights, trailing_axes)
     return total
 
 
@@ -184,7 +189,8 @@ def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tu
     displaced[1, :, 0] += x_step
     displaced[2, :, 1] += y_step
     displaced[3, :, 2] *= np.exp(log_force_step)
-    value, value_x, value_y, value_force = function(displaced.reshape(-1, 3)).reshape(4, len(contact), -1)
+    displaced_values = function(displaced.reshape(-1, 3)).reshape(4, len(contact), -1)
+    value, value_x, value_y, value_force = displaced_values
     slopes = [
         (value_x - value) / x_step,
         (value_y - value) / y_step,
@@ -214,14 +220,17 @@ def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> Ar
     if not is_position_unknown.any():
         return start
 
+    # Candidates (x, y, F) with a typical force, from positions x + i y that are distributed evenly over the domain.
     lattice = charges.domain.radius * sunflower(CANDIDATE_POSITIONS)
     typical_force = np.exp(np.median(data.contact[is_position_unknown, 2]))
     candidates = np.column_stack([lattice.real, lattice.imag, np.full(CANDIDATE_POSITIONS, typical_force)])
+
     log_charge = np.log(np.maximum(data.charge[is_position_unknown], 1.0))
     log_measured = np.where(data.has_charge[is_position_unknown], log_charge, np.nan)
     # The ratios agree if the logarithms of measured and computed charges differ by the same amount on all electrodes,
     # so that the variance of these differences is zero.
-    log_quotient = log_measured[:, None] - np.log(charges.charges(unknowns, candidates))
+    candidate_charge = charges.charges(unknowns, candidates)
+    log_quotient = log_measured[:, None] - np.log(candidate_charge)  # shape (n_unknown, n_candidate, n_electrode)
     closest = np.nanvar(log_quotient, axis=2).argmin(axis=1)
     start[is_position_unknown, :2] = candidates[closest, :2]
     return start

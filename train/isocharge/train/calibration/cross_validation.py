@@ -59,6 +59,9 @@ def cross_validate(
 ) -> HeldOutAnswers | None:
     """Estimate the contacts of measured presses with networks of films that were fitted without these presses.
 
+    The presses are divided into `FOLD_COUNT` folds by their places. For each fold, the film is fitted to the presses of
+    the other folds, and its network estimates the contacts of the fold.
+
     Args:
         problem: Films that the sensor may have.
         presses: The presses to which the film was fitted.
@@ -74,7 +77,9 @@ def cross_validate(
     is_judged = complete(presses) & ~posterior.bad & ~problem.domain.is_outside(presses.contact)
     if is_judged.sum() < FEWEST_MEASURED:
         return None
-    fold = np.full(len(presses), -1)
+    # Presses that cannot be judged are in no fold, so the film is fitted to them in every round.
+    no_fold = -1
+    fold = np.full(len(presses), no_fold)
     fold[is_judged] = folds_by_place(presses.contact[is_judged], FOLD_COUNT)
 
     contact = np.empty((len(presses), 3))
@@ -89,20 +94,28 @@ def cross_validate(
             )
         answers = network_of(film).predict(presses.charge_pC[is_held_out])
         contact[is_held_out], std[is_held_out], misfit[is_held_out] = answers
-    force_std_N = presses.force_std * presses.contact[:, 2]
-    measured_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, force_std_N])
+
     # The difference between estimated and measured contacts has the errors of both.
-    std = np.hypot(std, measured_std)
+    force_N = presses.contact[:, 2]
+    rig_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std * force_N])
+    std = np.hypot(std, rig_std)
     return HeldOutAnswers(
         LabelledPresses(presses.contact[is_judged], presses.charge_pC[is_judged], measured=True),
         Answers(contact[is_judged], std[is_judged], misfit[is_judged]),
     )
 
 
-def _thinned(chosen: Booleans) -> Booleans:
-    """Return at most `MAX_FITTED_PRESSES` of the chosen presses, evenly spaced, shape (n,)."""
-    rows = np.flatnonzero(chosen)
-    stride = max(1, math.ceil(len(rows) / MAX_FITTED_PRESSES))
-    thinned = np.zeros_like(chosen)
-    thinned[rows[::stride]] = True
-    return thinned
+def _thinned(is_chosen: Booleans) -> Booleans:
+    """Select at most `MAX_FITTED_PRESSES` of the chosen presses, evenly spaced.
+
+    Args:
+        is_chosen: Whether each press is chosen, shape (n,).
+
+    Returns:
+        Whether each press is selected, shape (n,).
+    """
+    chosen_rows = np.flatnonzero(is_chosen)
+    stride = max(1, math.ceil(len(chosen_rows) / MAX_FITTED_PRESSES))
+    is_selected = np.zeros_like(is_chosen)
+    is_selected[chosen_rows[::stride]] = True
+    return is_selected

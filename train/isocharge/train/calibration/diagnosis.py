@@ -76,6 +76,15 @@ OFFSET_STD = 0.6
 
 The piezoelectric coefficients cause such an offset."""
 
+MIN_CHARGE_pC = 1e-3
+"""Smaller charges, which have no useful logarithm, are set to this value in comparisons of logarithms, pC."""
+
+MAX_SQUARED_DEVIATION = 4.0
+"""Limit of the squared deviation of a logarithm of charges, which bounds the effect of outliers."""
+
+MAX_OUTSIDE_FRACTION = 0.2
+"""Largest fraction of presses outside the domain for which a misfit is computed."""
+
 CLEARER = 0.25
 """Ratio of the misfit with the correction of a mistake to that without it, below which the mistake is named."""
 
@@ -95,7 +104,7 @@ AXES = (
 
 
 def check_places(presses: MeasuredPresses, radius: float) -> None:
-    """Raise an error if a press lies off the film, or the positions were written in metres.
+    """Raise an error if a press lies off the film, or if the positions were probably written in metres.
 
     Args:
         presses: The presses. Positions that were not measured are NaN.
@@ -105,7 +114,8 @@ def check_places(presses: MeasuredPresses, radius: float) -> None:
         PressError: If a position is off the film, or all positions lie within `MIN_POSITION_RANGE_MM` of each other.
     """
     places = presses.contact[:, :2]
-    outside_rows = np.flatnonzero(np.hypot(*places.T) >= radius)
+    distance = np.hypot(places[:, 0], places[:, 1])
+    outside_rows = np.flatnonzero(distance >= radius)
     if outside_rows.size:
         row = outside_rows[0]
         raise PressError(
@@ -131,32 +141,51 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
         PressError: If there is such a channel.
     """
     charge = presses.charge_pC
-    placed = presses.contact[presses.placed]
     for name, channel_charge in zip(presses.electrodes, charge.T, strict=True):
         if np.isnan(channel_charge).all():
             raise PressError(f"electrode {name!r}: no press has a charge of it; a calibration needs all electrodes")
+
+    # The charges of each channel relative to those of the others: measured, and smallest among the films.
     ratios = _charge_ratios(charge)
     smallest_film_ratios = np.ones_like(ratios)
-    if len(placed):
-        film_ratios = [_charge_ratios(film_charge) for film_charge in expected_charges(charges, placed)]
+    placed_contact = presses.contact[presses.placed]
+    if len(placed_contact):
+        film_ratios = [_charge_ratios(film_charge) for film_charge in expected_charges(charges, placed_contact)]
         smallest_film_ratios = np.minimum(np.min(film_ratios, axis=0), 1.0)
-    for channel, name in enumerate(presses.electrodes):
-        channel_charge = charge[:, channel]
-        ratio = ratios[channel]
-        if ratio < MAX_DEAD_RATIO * smallest_film_ratios[channel]:
-            raise PressError(
-                f"electrode {name!r} is dead: half of its charges are below "
-                f"{np.nanmedian(np.abs(channel_charge)):.3g} pC, {100.0 * ratio:.2g} % of those of the others; check "
-                "the channel, its cable and its amplifier"
-            )
-        negative_count = np.sum(channel_charge < 0.0)
-        measured_count = np.sum(np.isfinite(channel_charge))
-        # The charges of channels with a small ratio may be negative on taut uniaxial films.
-        if negative_count > MAX_NEGATIVE_FRACTION * measured_count and ratio > MIN_REVERSED_RATIO:
-            raise PressError(
-                f"electrode {name!r}: {negative_count} of its {measured_count} charges are negative; a press gives a "
-                "positive charge: exchange its wires or its sign"
-            )
+
+    for name, channel_charge, ratio, film_ratio in zip(
+        presses.electrodes, charge.T, ratios, smallest_film_ratios, strict=True
+    ):
+        _check_channel(name, channel_charge, ratio, film_ratio)
+
+
+def _check_channel(name: str, charge: Array, ratio: float, smallest_film_ratio: float) -> None:
+    """Raise an error if a channel is dead or has the wrong sign.
+
+    Args:
+        name: Name of the electrode.
+        charge: Charges of the channel, shape (n,), pC; NaN where a charge was not measured.
+        ratio: Median charge of the channel divided by the median charge of the other channels.
+        smallest_film_ratio: The smallest such ratio among the films of the calibration.
+
+    Raises:
+        PressError: If the channel is dead or has the wrong sign.
+    """
+    if ratio < MAX_DEAD_RATIO * smallest_film_ratio:
+        raise PressError(
+            f"electrode {name!r} is dead: half of its charges are below "
+            f"{np.nanmedian(np.abs(charge)):.3g} pC, {100.0 * ratio:.2g} % of those of the others; check "
+            "the channel, its cable and its amplifier"
+        )
+    negative_count = np.sum(charge < 0.0)
+    measured_count = np.sum(np.isfinite(charge))
+    is_mostly_negative = negative_count > MAX_NEGATIVE_FRACTION * measured_count
+    # The charges of channels with a small ratio may be negative on taut uniaxial films.
+    if is_mostly_negative and ratio > MIN_REVERSED_RATIO:
+        raise PressError(
+            f"electrode {name!r}: {negative_count} of its {measured_count} charges are negative; a press gives a "
+            "positive charge: exchange its wires or its sign"
+        )
 
 
 def _charge_ratios(charge: Array) -> Array:
@@ -196,6 +225,9 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     """Find the mistakes whose correction makes the presses agree far better with a film.
 
+    A mistake is returned if its correction reduces the misfit at least by the factor `CLEARER`. The misfit must also be
+    nearly as small as after the best correction.
+
     Args:
         presses: The measured presses.
         charges: Charges of the films of the calibration.
@@ -210,15 +242,21 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
 
     # The charges of the films are computed for all corrected contacts at once, which is faster.
     all_contacts = np.concatenate([correction.contact for correction in corrections])
-    film_charges = np.split(expected_charges(charges, all_contacts), len(corrections), axis=1)
-    misfits = {
-        correction.sentence: charge_misfit(charges, correction.contact, correction.charge, expected)
-        for correction, expected in zip(corrections, film_charges, strict=True)
+    charges_by_correction = np.split(expected_charges(charges, all_contacts), len(corrections), axis=1)
+    misfit_by_sentence = {
+        correction.sentence: charge_misfit(charges, correction.contact, correction.charge, film_charges)
+        for correction, film_charges in zip(corrections, charges_by_correction, strict=True)
     }
-    limit = CLEARER * misfit(presses, charges)
-    best_first = sorted(misfits, key=lambda sentence: misfits[sentence])
-    largest = MAX_MISFIT_RATIO * misfits[best_first[0]]
-    return [sentence for sentence in best_first if misfits[sentence] < limit and misfits[sentence] <= largest]
+
+    smallest_misfit = min(misfit_by_sentence.values())
+    limit_for_improvement = CLEARER * misfit(presses, charges)
+    limit_for_similarity = MAX_MISFIT_RATIO * smallest_misfit
+    best_first = sorted(misfit_by_sentence.items(), key=lambda item: item[1])
+    return [
+        sentence
+        for sentence, corrected_misfit in best_first
+        if corrected_misfit < limit_for_improvement and corrected_misfit <= limit_for_similarity
+    ]
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
@@ -235,8 +273,9 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
 def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected: Array) -> float:
     """Compute the difference between measured charges and those of the most similar of several films.
 
-    The difference is the mean squared logarithm of the ratio of measured to expected charges. Its unit is the spread of
-    the films.
+    The difference is computed from the logarithms of the ratios of measured to expected charges. The difference has two
+    parts: the mean squared scatter of these logarithms about their median, and the squared median. Each part is in
+    units of the spread of the films.
 
     Args:
         charges: The films of the calibration. If many contacts lie outside their domain, the misfit is infinite.
@@ -245,15 +284,20 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
         expected: Charges of each film, shape (n_film, n, n_electrode), pC.
     """
     is_outside = (charges.into_domain(contact) != contact).any(axis=1)
-    if is_outside.mean() > 0.2:
+    if is_outside.mean() > MAX_OUTSIDE_FRACTION:
         return np.inf
-    # For each film, the offset common to all charges, and the mean squared deviation from this offset. The limit of 4
-    # bounds the effect of outliers.
-    log_ratio = np.log(np.maximum(charge, 1e-3)) - np.log(np.maximum(expected, 1e-3))
+    # For each film, the offset common to all charges, and the mean squared deviation from this offset
+    log_ratio = _log_charge(charge) - _log_charge(expected)  # shape (n_film, n, n_electrode)
     offset = np.nanmedian(log_ratio, axis=(1, 2))
-    squared_deviation = np.minimum((log_ratio - offset[:, None, None]) ** 2, 4.0)
+    squared_deviation = np.minimum((log_ratio - offset[:, None, None]) ** 2, MAX_SQUARED_DEVIATION)
     scatter = np.nanmean(squared_deviation, axis=(1, 2))
-    return float(np.min(scatter / SCATTER_STD**2 + (offset / OFFSET_STD) ** 2))
+    film_misfit = scatter / SCATTER_STD**2 + (offset / OFFSET_STD) ** 2
+    return float(np.min(film_misfit))
+
+
+def _log_charge(charge: Array) -> Array:
+    """Return the logarithms of charges, which are first limited to at least `MIN_CHARGE_pC`; NaN remains NaN."""
+    return np.asarray(np.log(np.maximum(charge, MIN_CHARGE_pC)))
 
 
 class Correction(NamedTuple):
@@ -273,6 +317,8 @@ class Correction(NamedTuple):
 def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[Correction]:
     """Yield the presses after the correction of each mistake that is considered.
 
+    The mistakes are swapped charge columns, rotated or reflected axes of the rig, and wrong units.
+
     Args:
         presses: The measured presses, with place and force.
         charges: Charges of the films of the calibration, from which possible orders of the columns follow.
@@ -280,13 +326,17 @@ def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterat
     contact = presses.contact
     charge = presses.charge_pC
     electrodes = presses.electrodes
-    for order in _fitting_orders(presses, charges):
-        swapped = ", ".join(electrodes[electrode_index] for electrode_index in order)
-        sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {swapped}"
-        yield Correction(sentence, contact, charge[:, np.argsort(order)])
+    for electrode_of_column in _fitting_orders(presses, charges):
+        held_names = ", ".join(electrodes[electrode_index] for electrode_index in electrode_of_column)
+        sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {held_names}"
+        column_of_electrode = np.argsort(electrode_of_column)  # the inverse permutation
+        yield Correction(sentence, contact, charge[:, column_of_electrode])
+
     for description, matrix in AXES:
-        rotated = np.column_stack([contact[:, :2] @ matrix.T, contact[:, 2]])
-        yield Correction(f"the rig's axes are not the film's: {description}", rotated, charge)
+        position = contact[:, :2] @ matrix.T
+        rotated_contact = np.column_stack([position, contact[:, 2]])
+        yield Correction(f"the rig's axes are not the film's: {description}", rotated_contact, charge)
+
     for unit in OTHER_UNITS:
         position_factor = unit.factor if unit.values == "positions" else 1.0
         force_factor = unit.factor if unit.values == "forces" else 1.0
@@ -312,12 +362,13 @@ def _fitting_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple
         For each order, the index of the electrode that each column holds. The order as written is not among them.
     """
     orders = set()
-    log_measured = np.log(np.maximum(presses.charge_pC, 1e-3))
+    log_measured = _log_charge(presses.charge_pC)
     for expected in expected_charges(charges, presses.contact):
-        log_expected = np.log(np.maximum(expected, 1e-3))
+        log_expected = _log_charge(expected)
         log_ratio = log_measured[:, :, None] - log_expected[:, None]  # shape (n, n_column, n_electrode)
-        squared_deviation = np.minimum((log_ratio - np.nanmedian(log_ratio)) ** 2, 4.0)
-        distance = np.nansum(squared_deviation, axis=0)
+        # The median is subtracted, because a common factor of all charges does not matter.
+        squared_deviation = np.minimum((log_ratio - np.nanmedian(log_ratio)) ** 2, MAX_SQUARED_DEVIATION)
+        distance = np.nansum(squared_deviation, axis=0)  # shape (n_column, n_electrode)
         _, electrode_of_column = linear_sum_assignment(distance)
         orders.add(tuple(electrode_of_column.tolist()))
     as_written = tuple(range(len(presses.electrodes)))
@@ -329,6 +380,9 @@ FAR_FROM_ALL_FILMS = "their charges are very different from those of its films"
 
 MOSTLY_OUTSIDE = "most of them lie outside the places and forces of a calibration"
 """Reason why presses are refused if few of them remain for a fit."""
+
+UNUSUAL_FILM = "only a film that differs unusually from its description has such charges"
+"""Reason why presses are refused if the correction of a common mistake explains them far better."""
 
 
 def large_residual(residual_over_noise: float) -> str:
@@ -343,8 +397,8 @@ def large_residual(residual_over_noise: float) -> str:
 def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: str) -> PressError:
     """Return the error for presses that no film of the sensor explains.
 
-    The message names up to three mistakes that would explain the presses. If none is found, it asks for a check of the
-    setup.
+    The message names up to three mistakes that would explain the presses. If no mistake is found, the message asks for
+    a check of the setup.
 
     Args:
         presses: The presses as they are written in the file.

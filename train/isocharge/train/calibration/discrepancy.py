@@ -1,15 +1,15 @@
 """Discrepancy of a film: a smooth factor on the charges of each electrode that no parameter describes.
 
-No list of parameters describes every property of a real film. The remaining effects are modelled as a Gaussian process
+A real film has properties that no parameter describes. Their effects are modelled as a Gaussian process
 for each electrode (Kennedy and O'Hagan 2001) of finite rank, with products of Chebyshev polynomials in the place and
 the logarithm l of the force:
 
     ln Q_e = ln Q_e(map) + sum c_eijm T_i(x / r) T_j(y / r) T_m(l),    i + j + m <= degree, m <= 2.
 
 The coefficients have the mean zero and the standard deviation s FADING^(i + j + m). Another part of the discrepancy is
-the same for all electrodes. It is needed because all charges are smaller where a film is stiffer than its parameters
-imply. The standard deviation of this part is COMMON times as large. The size s is unknown. The module `hypotheses`
-computes the probabilities of several sizes from the presses.
+the same for all electrodes. This common part is needed because all charges are smaller where a film is stiffer than its
+parameters imply. The standard deviation of this part is COMMON times as large. The size s is unknown. The module
+`hypotheses` computes the probabilities of several sizes from the presses.
 """
 
 from functools import cache
@@ -42,9 +42,10 @@ area, the error of this approximation is below the noise."""
 
 
 def terms(contact: Array, domain: Domain) -> Array:
-    """Compute the polynomials of the discrepancy, each times the standard deviation of its coefficient for s=1.
+    """Compute the polynomials of the discrepancy, each times the standard deviation of its coefficient.
 
-    For a contact outside the domain, the values at the nearest contact of the domain are returned.
+    The standard deviations are those for a discrepancy of the size s = 1. For a contact outside the domain, the values
+    at the nearest contact of the domain are returned.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -53,6 +54,7 @@ def terms(contact: Array, domain: Domain) -> Array:
     Returns:
         T_i(x / r) T_j(y / r) T_m(l) FADING^(i + j + m), shape (n, n_term), dimensionless.
     """
+    # Scaled contacts in the unit disk times [-1, 1], to which contacts outside the domain are moved.
     unit_contact = domain.to_unit(contact)
     distance = np.hypot(unit_contact[:, 0], unit_contact[:, 1])
     unit_contact[:, :2] /= np.maximum(distance, 1.0)[:, None]

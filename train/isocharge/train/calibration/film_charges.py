@@ -13,11 +13,10 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate import Film, ForwardMap, Probe
-from isocharge.simulate.forward.charge_map import Domain, FunctionMap, differences
-from isocharge.simulate.forward.film_family import FilmFamily
+from isocharge.simulate.forward.charge_map import FunctionMap, differences
 from isocharge.simulate.forward.film_modes import MODES, ModeMap
 from isocharge.simulate.numerics.disk import onto_disk
-from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
+from isocharge.simulate.sensor.film_prior import SHARED
 from isocharge.train.calibration.discrepancy import term_count, terms
 from isocharge.train.calibration.film_maps import CONTACT_STEPS, STEP, FilmMaps, log_force_derivative
 from isocharge.train.calibration.imperfections import (
@@ -44,30 +43,12 @@ MIN_FACTOR = 0.05
 
 
 @dataclass(frozen=True)
-class FilmCharges:
-    """Charges of all films of a prior, including the effects of imperfections, traces and discrepancy.
-
-    Attributes:
-        prior: Distribution of the films, which declares the parameters.
-        family: Solved films, between which the forward maps are interpolated.
-    """
-
-    prior: FilmPrior
-    family: FilmFamily
-
-    @cached_property
-    def maps(self) -> FilmMaps:
-        """Forward maps of the films without imperfections, traces and discrepancy."""
-        return FilmMaps(self.prior, self.family)
-
-    @property
-    def domain(self) -> Domain:
-        """Contacts for which every film of the prior has charges, with a margin for the finite differences."""
-        return self.maps.domain
+class FilmCharges(FilmMaps):
+    """Charges of all films of a prior, including the effects of imperfections, traces and discrepancy."""
 
     @cached_property
     def modes(self) -> tuple[str, ...]:
-        """Names of the modes of these films. There are none if no modes of the family were solved."""
+        """Names of the modes of these films. The names are empty if no modes of the family were solved."""
         return tuple(MODES) if self.family.imperfections else ()
 
     @cached_property
@@ -82,7 +63,7 @@ class FilmCharges:
 
     @cached_property
     def _is_uneven_tension(self) -> Booleans:
-        """Which modes are an uneven tension, shape (n_mode,).
+        """Whether each mode is an uneven tension, shape (n_mode,).
 
         To second order, these modes act like a lower mean tension.
         """
@@ -113,14 +94,6 @@ class FilmCharges:
         names = self.prior.sensor.electrode_names
         return {name: (float(width), float(std)) for name, width, std in zip(names, widths, stds, strict=True)}
 
-    def forward_map(self, parameters: Array) -> ForwardMap:
-        """Return the forward map of one film without modes, traces and discrepancy.
-
-        Args:
-            parameters: Parameters of the film, shape (n_parameter,).
-        """
-        return self.maps.forward_map(parameters)
-
     def film(self, unknowns: Array) -> FunctionMap:
         """Return the charges of one film as a function of the contact.
 
@@ -140,6 +113,9 @@ class FilmCharges:
     def factor(self, unknowns: Array, contact: Array, charge: Array | None = None) -> Array:
         """Compute the factors by which modes, traces and discrepancy change the charges of a film.
 
+        The discrepancy is a polynomial of the contact for ln(factor). Modes and traces with negligible coefficients are
+        left out, because their charges take time to compute.
+
         Args:
             unknowns: Parameters and coefficients, as in `film`.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -150,26 +126,47 @@ class FilmCharges:
             Factors, shape (n, n_electrode), dimensionless.
         """
         layout = self.layout
-        parameters = unknowns[layout.parameters]
-        mode_coefficients = unknowns[layout.modes]
-        trace_coefficients = unknowns[layout.traces]
-        term_coefficients = unknowns[layout.terms]
         factor = np.ones((len(contact), len(self.prior.sensor.electrodes)))
         if np.abs(unknowns[layout.imperfections]).max(initial=0.0) > NEGLIGIBLE:
-            forward_map = self.forward_map(parameters)
-            charge = forward_map.charges(contact) if charge is None else charge
-            if np.abs(trace_coefficients).max() > NEGLIGIBLE:
-                factor += trace_charges(forward_map, self._trace_lines, contact) @ trace_coefficients / charge
-            if np.abs(mode_coefficients).max(initial=0.0) > NEGLIGIBLE:
-                modes = self._mode_charges(parameters, contact, charge)
-                unevenness, _ = self._unevenness(self._pretension(parameters), mode_coefficients)
-                factor += modes.mode_jacobian @ mode_coefficients / charge
-                factor *= np.exp(unevenness * modes.log_unevenness)
-            factor = np.maximum(factor, MIN_FACTOR)
+            if charge is None:
+                charge = self.forward_map(unknowns[layout.parameters]).charges(contact)
+            factor = self._imperfection_factor(unknowns, contact, charge)
+
+        term_coefficients = unknowns[layout.terms]
         if term_coefficients.any():
             log_factor = terms(contact, self.domain) @ term_coefficients.reshape(term_count(), -1)
             factor = factor * np.exp(log_factor)
         return factor
+
+    def _imperfection_factor(self, unknowns: Array, contact: Array, charge: Array) -> Array:
+        """Compute the factors by which modes and traces change the charges of a film.
+
+        Modes and traces add charges, so the factor is 1 plus the added charges over the charges without them. An uneven
+        tension also causes a factor of second order. The result is at least `MIN_FACTOR`.
+
+        Args:
+            unknowns: Parameters and coefficients, as in `film`.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges without modes and traces, shape (n, n_electrode), pC.
+
+        Returns:
+            Factors, shape (n, n_electrode), dimensionless.
+        """
+        layout = self.layout
+        parameters = unknowns[layout.parameters]
+        mode_coefficients = unknowns[layout.modes]
+        trace_coefficients = unknowns[layout.traces]
+        factor = np.ones_like(charge)
+        if np.abs(trace_coefficients).max() > NEGLIGIBLE:
+            forward_map = self.forward_map(parameters)
+            trace_jacobian = trace_charges(forward_map, self._trace_lines, contact)  # shape (n, n_electrode, n_trace)
+            factor += trace_jacobian @ trace_coefficients / charge
+        if np.abs(mode_coefficients).max(initial=0.0) > NEGLIGIBLE:
+            modes = self._mode_charges(parameters, contact, charge)
+            unevenness, _ = self._unevenness(self._pretension(parameters), mode_coefficients)
+            factor += modes.mode_jacobian @ mode_coefficients / charge
+            factor *= np.exp(unevenness * modes.log_unevenness)
+        return np.maximum(factor, MIN_FACTOR)
 
     def _pretension(self, unknowns: Array) -> float:
         """Return the pretension of a film, MPa."""
@@ -177,6 +174,9 @@ class FilmCharges:
 
     def _mode_charges(self, parameters: Array, contact: Array, charge: Array) -> ModeCharges:
         """Return the effects of the modes on the charges of presses, from a cache if possible.
+
+        The cache contains the results for two films. A result is used again for the same sensor and contacts. For other
+        contacts on the same film, only its modes are used again.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -189,6 +189,7 @@ class FilmCharges:
             no_modes = np.zeros((*charge.shape, 0))
             return ModeCharges(None, sensor, contact, mode_jacobian=no_modes, log_unevenness=np.zeros_like(charge))
 
+        # The modes depend only on film and probe. Their charges also depend on the sensor and on the contacts.
         key = (sensor.film, forward_map.probe)
         cached = self._cached_modes.get(key)
         if cached is not None and cached.sensor == sensor and np.array_equal(cached.contact, contact):
@@ -197,7 +198,9 @@ class FilmCharges:
         if modes is None:
             modes = self.family.imperfections.mode_map(forward_map, self.modes)
         computed = self._computed_mode_charges(modes, forward_map, parameters, contact, charge)
-        if key not in self._cached_modes and len(self._cached_modes) > 1:
+
+        is_cache_full = len(self._cached_modes) > 1
+        if key not in self._cached_modes and is_cache_full:
             oldest_key = next(iter(self._cached_modes))
             del self._cached_modes[oldest_key]
         self._cached_modes[key] = computed
@@ -215,15 +218,15 @@ class FilmCharges:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             charge: Charges of these contacts without modes, shape (n, n_electrode), pC.
         """
+        # The modes belong to a film, and are evaluated here with the electrodes and the gains of this sensor.
         sensor = forward_map.sensor
         fields = replace(modes.fields, sensor=sensor) if modes.fields is not None else None
-        mode_jacobian = replace(modes, film=forward_map, fields=fields).mode_jacobian(contact)
+        modes_of_sensor = replace(modes, film=forward_map, fields=fields)
+        mode_jacobian = modes_of_sensor.mode_jacobian(contact) * self._mode_stds
 
-        pretension_derivative = self.maps.difference("pretension", parameters, contact, charge)
-        log_tension_derivative = self._pretension(parameters) * pretension_derivative / charge
-        return ModeCharges(
-            modes, sensor, contact, mode_jacobian * self._mode_stds, log_unevenness(log_tension_derivative)
-        )
+        pretension_derivative = self.difference("pretension", parameters, contact, charge)
+        log_tension_derivative = self._pretension(parameters) * pretension_derivative / charge  # d ln Q / d ln T
+        return ModeCharges(modes, sensor, contact, mode_jacobian, log_unevenness(log_tension_derivative))
 
     @cached_property
     def _cached_modes(self) -> dict[tuple[Film, Probe], ModeCharges]:
@@ -294,7 +297,7 @@ class FilmCharges:
         force_derivative = by_contact[:, :, 2]
         if coefficients.any():
             force_derivative = log_force_derivative(film, contact)
-        film_jacobian = self.maps.parameter_jacobian(film, parameters, contact, charge, force_derivative)
+        film_jacobian = self.parameter_jacobian(film, parameters, contact, charge, force_derivative)
         film_jacobian *= self.prior.std
         if not coefficients.size:
             return np.asarray(film_jacobian)
@@ -364,13 +367,15 @@ class FilmCharges:
         if np.abs(film[self.layout.imperfections]).max() < LARGEST_LOCAL_COEFFICIENT:
             return {}
         factor = self.factor(film, contact)
-        log_force_step = CONTACT_STEPS[2]
+        _, _, log_force_step = CONTACT_STEPS
         factor_with_force = self.factor(film, contact * [1.0, 1.0, np.exp(log_force_step)])
         force_derivative = (factor_with_force - factor) / log_force_step
 
         film_with_tension, step = self._stepped(film, "pretension")
         tension_step = step * self.prior.std[self.layout.parameter("pretension")]
         tension_derivative = (self.factor(film_with_tension, contact) - factor) / tension_step
+
+        # Chain rule for factor = f(F / (E h a), T / E)
         derivatives = {
             "pretension": tension_derivative,
             "young": -force_derivative - self._pretension(film) * tension_derivative,
@@ -381,8 +386,8 @@ class FilmCharges:
     def _trace_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
         """Compute the derivatives of ln(factor of traces) with respect to the parameters that do not change the load.
 
-        These are the piezoelectric coefficients, the place of the electrodes and the radius of the probe. A trace and
-        its electrode lie at different places, so the relative changes of their charges are different.
+        These parameters are the piezoelectric coefficients, the place of the electrodes and the radius of the probe. A
+        trace and its electrode lie at different places, so the relative changes of their charges are different.
 
         Args:
             unknowns: Parameters and coefficients of the film.

@@ -5,8 +5,8 @@ The result is written as `film_directions.npz`; see `serve.model.film_directions
 At a given pretension, the other unknowns of a film have the covariance C = R R'. Let M be the derivative of the misfit
 vectors with respect to the unknowns, in units of the noise. The right singular vectors of M R are combinations of the
 unknowns. These combinations are independent before any touch, and their effects on the misfits of touches are
-orthogonal (the likelihood-informed directions of Cui et al. 2014). Touches hardly identify a combination with a small
-singular value. Such a combination is left out.
+orthogonal. The combinations are known as likelihood-informed directions (Cui et al., 2014). Touches hardly identify a
+combination with a small singular value. Such a combination is left out.
 """
 
 import numpy as np
@@ -35,21 +35,32 @@ LEAST_VARIANCE = 1e-12
 
 
 def film_directions(result: CalibrationResult) -> FilmDirections:
-    """Compute the directions in which a calibrated film is uncertain when it is used."""
+    """Compute the directions in which a calibrated film is uncertain when it is used.
+
+    A direction is a combination of the unknowns of the film, with a standard deviation of 1. The directions are sorted
+    by the misfit that they cause, and those that cause only a small misfit are left out. The pretension has its own
+    estimate in the service, so the directions are uncorrelated with it.
+
+    Args:
+        result: The calibration of the film.
+    """
     problem = result.problem
     estimate = result.posterior.drifted(problem.prior)
     pretension = problem.prior.index("pretension")
     covariance = estimate.unknown_covariance
-    by_pretension = covariance[:, pretension] / covariance[pretension, pretension]
+    n_unknown = len(covariance)
     # The covariance of the unknowns at a given pretension is that of all unknowns less the part due to the pretension.
+    by_pretension = covariance[:, pretension] / covariance[pretension, pretension]  # regression on the pretension
     root = _root(covariance - np.outer(by_pretension, covariance[pretension]))
 
+    # The singular vectors are orthogonal combinations of the columns of the root, the largest misfit first.
     sensitivity = result.sensitivity
-    unknowns = slice(0, len(covariance))
+    unknowns = slice(0, n_unknown)
     misfit = sensitivity.misfit_jacobian[:, :, unknowns]
-    _, sizes, combinations = np.linalg.svd(misfit.reshape(-1, len(covariance)) @ root, full_matrices=False)
+    _, sizes, combinations = np.linalg.svd(misfit.reshape(-1, n_unknown) @ root, full_matrices=False)
     is_visible = sizes > LEAST_MISFIT * np.sqrt(len(misfit))
-    visible = combinations[is_visible][:MAX_DIRECTIONS]
+    visible = combinations[is_visible][:MAX_DIRECTIONS]  # shape (n_direction, n_unknown)
+
     # Sum over the unknowns u, for each contact n, direction k and electrode e
     log_changes = np.einsum("neu,ku->nke", sensitivity.log_charge_jacobian[:, :, unknowns], visible @ root.T)
     mean_by_pretension = visible @ np.linalg.pinv(root) @ by_pretension
@@ -69,11 +80,25 @@ def _root(covariance: Array) -> Array:
 
 
 def _fitted_series(domain: Domain, contact: Array, log_changes: Array) -> Array:
-    """Fit the series of `FilmDirections` to changes of ln Q at contacts, shape (n, n_direction, n_electrode)."""
-    count = len(contact)
+    """Fit the series of `FilmDirections` to changes of ln Q.
+
+    The series has the highest degrees of `DEGREES` for which there are enough contacts. If there are too few contacts
+    for all of them, it has the last degrees.
+
+    Args:
+        domain: Domain of the series.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        log_changes: Changes of ln Q at the contacts, shape (n, n_direction, n_electrode).
+
+    Returns:
+        Coefficients of the series. Their last two axes are those of the directions and electrodes.
+    """
+    n_contact, n_direction, n_electrode = log_changes.shape
     for degree, force_degree in DEGREES:
-        term_count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
-        if CONTACTS_PER_TERM * term_count <= count:
+        position_term_count = (degree + 1) * (degree + 2) // 2
+        term_count = position_term_count * (force_degree + 1)
+        if CONTACTS_PER_TERM * term_count <= n_contact:
             break
-    series = fit_series(domain.to_unit(contact), log_changes.reshape(count, -1), degree, force_degree)
-    return series.reshape(*series.shape[:3], *log_changes.shape[1:])
+    columns = log_changes.reshape(n_contact, -1)  # `fit_series` expects one column for each fitted function
+    series = fit_series(domain.to_unit(contact), columns, degree, force_degree)
+    return series.reshape(*series.shape[:3], n_direction, n_electrode)

@@ -1,8 +1,8 @@
 """Robust estimation of the film that explains measured presses.
 
 `FitProblem` solves the least-squares problem. If the residual of a press is larger than noise explains, the press gets
-a lower weight (Student's t distribution, Lange et al. 1989). A single bad press therefore does not change the film.
-Presses whose residuals are still too large are then left out and reported.
+a lower weight, as for errors with Student's t distribution (Lange et al., 1989). A single bad press therefore does not
+change the film. Presses whose residuals are still too large are then left out and reported.
 """
 
 from dataclasses import dataclass, field, replace
@@ -92,7 +92,7 @@ class FilmPosterior(FilmEstimate):
         return self._probability_of_any(effect)
 
     def _probability_of_any(self, *effects: str) -> float:
-        """Return the probability that the session has at least one of some effects."""
+        """Return the probability that the session has at least one of several effects."""
         return sum(
             probability
             for hypothesis, probability in self.probabilities.items()
@@ -100,7 +100,11 @@ class FilmPosterior(FilmEstimate):
         )
 
     def scaled(self, factor: float) -> "FilmPosterior":
-        """Return the estimate with all variances multiplied by a factor."""
+        """Return the estimate with all variances multiplied by a factor.
+
+        Args:
+            factor: Factor on the variances.
+        """
         warming = self.warming
         if warming is not None:
             std = warming.std * float(np.sqrt(factor))
@@ -112,6 +116,10 @@ class FilmPosterior(FilmEstimate):
 
         If the film probably has neither imperfections nor a discrepancy, the estimate contains only the parameters of
         the film.
+
+        Args:
+            prior: Distribution of the films.
+            knows_temperature: Whether the temperature at the later time is known.
         """
         if self.imperfect:
             return super().drifted(prior, knows_temperature=knows_temperature)
@@ -133,6 +141,9 @@ def fit_film(
 ) -> FilmPosterior:
     """Estimate the film from presses, some of which may be bad.
 
+    The film is fitted to all presses first. If some residuals are too large, the presses that agree with each other are
+    searched for, and only they are fitted.
+
     Args:
         charges: The films.
         data: The presses.
@@ -145,12 +156,14 @@ def fit_film(
     degrees_of_freedom = _degrees_of_freedom(data)
     every_press = np.ones(len(data), dtype=bool)
     is_kept = every_press
-    solved = problem.solve(data, is_kept, problem.mean, Hypothesis())
-    if len(data) >= MIN_PRESSES_TO_JUDGE and _is_suspicious(solved.contacts.chi2, degrees_of_freedom):
+    no_effects = Hypothesis()
+    solved = problem.solve(data, is_kept, problem.mean, no_effects)
+    can_be_judged = len(data) >= MIN_PRESSES_TO_JUDGE
+    if can_be_judged and _is_suspicious(solved.contacts.chi2, degrees_of_freedom):
         is_kept, start = _agreeing_presses(problem, data, solved, degrees_of_freedom)
-        kept = data[is_kept]
-        solved = problem.solve(kept, np.ones(len(kept)), start, Hypothesis())
-    settled = problem.settle(data, is_kept, degrees_of_freedom, solved, Hypothesis())
+        kept_data = data[is_kept]
+        solved = problem.solve(kept_data, np.ones(len(kept_data)), start, no_effects)
+    settled = problem.settle(data, is_kept, degrees_of_freedom, solved, no_effects)
 
     # If the film has imperfections, the presses that were left out may be good ones. The film is fitted to all presses
     # if this is more probable than that these presses were recorded wrongly.
@@ -187,6 +200,8 @@ def refit_film(
         friction: Expected coefficient of friction of the presses; 0 for presses without friction.
     """
     problem = FitProblem.of(charges, initial, knows_temperature=at_C is not None, friction=friction)
+
+    # The unknowns of the previous estimate, with its parameters in units of their prior standard deviations
     layout = problem.layout
     start = np.zeros(layout.count)
     start[layout.parameters] = previous.parameters / charges.prior.std
@@ -194,8 +209,8 @@ def refit_film(
     start[layout.nuisances] = [previous.nuisances[nuisance.name].value for nuisance in NUISANCES]
 
     every_press = np.ones(len(data), dtype=bool)
-    hypothesis = max(previous.probabilities, key=lambda each: previous.probabilities[each])
-    solved = problem.solve(data, every_press, start, hypothesis)
+    most_probable = max(previous.probabilities, key=lambda hypothesis: previous.probabilities[hypothesis])
+    solved = problem.solve(data, every_press, start, most_probable)
     degrees_of_freedom = _degrees_of_freedom(data)
     settled = problem.settle(data, every_press, degrees_of_freedom, solved, Hypothesis())
     return _posterior(problem, data, degrees_of_freedom, settled, at_C)
@@ -228,6 +243,9 @@ def _agreeing_presses(
 ) -> tuple[Booleans, Array]:
     """Find the film with which most presses agree.
 
+    The film is fitted repeatedly. Presses with large residuals get smaller weights, as for errors with Student's t
+    distribution. Presses whose residuals remain too large are then left out.
+
     Args:
         problem: The least-squares problem.
         data: The presses.
@@ -252,10 +270,10 @@ def _agreeing_presses(
     expected_median = np.maximum(scipy.stats.chi2.median(degrees_of_freedom), 0.1)
     typical_ratio = max(1.0, float(np.median(chi2 / expected_median)))
     limit = scipy.stats.chi2.isf(BAD_PROBABILITY / len(data), degrees_of_freedom) * typical_ratio
-    is_kept = chi2 <= limit
-    if np.mean(~is_kept) > MAX_BAD_SHARE:
-        is_kept = np.ones_like(is_kept)
-    return is_kept, solved.unknowns
+    is_good = chi2 <= limit
+    if np.mean(~is_good) > MAX_BAD_SHARE:  # no film explains most presses: leave out none of them
+        is_good = np.ones_like(is_good)
+    return is_good, solved.unknowns
 
 
 def _log_density_of_mistakes(data: PressData, is_mistake: Booleans) -> float:
@@ -284,17 +302,22 @@ def _posterior(
     layout = problem.layout
     mixture = settled.mixture
     unknowns = np.clip(problem.mean + mixture.mean, *problem.bounds)
-    scatter_variance = sum(weight * each.force_scatter**2 for each, weight in mixture.probabilities.items())
+    scatter_variance = sum(
+        probability * hypothesis.force_scatter**2 for hypothesis, probability in mixture.probabilities.items()
+    )
     force_scatter = float(np.sqrt(scatter_variance))
+
+    # The contacts of the fit are a good start only if they include those of all presses.
     start = settled.solved.contacts.contact if settled.is_kept.all() else None
     contacts = problem.adjusted_contacts(unknowns, data.with_force_scatter(mixture.best.force_scatter), start)
+
     nuisances = _nuisance_estimates(layout, unknowns, mixture.covariance)
     joint = mixture.covariance[layout.film, layout.film] + problem.gain_covariance(nuisances, force_scatter)
     warming = None
     if at_C is not None:
         change = nuisances[PRETENSION_PER_KELVIN.name]
-        row = layout.nuisance(PRETENSION_PER_KELVIN.name)
-        warming = Warming(change.value, change.std, at_C, mixture.covariance[row, layout.film])
+        change_index = layout.nuisance(PRETENSION_PER_KELVIN.name)
+        warming = Warming(change.value, change.std, at_C, mixture.covariance[change_index, layout.film])
     return FilmPosterior(
         parameters=unknowns[layout.parameters] * problem.charges.prior.std,
         covariance=joint[layout.parameters, layout.parameters],

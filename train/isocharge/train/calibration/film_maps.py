@@ -1,7 +1,7 @@
 """Charges of presses on the perfect films of a prior, and their derivatives with respect to the parameters.
 
-A perfect film has no imperfections, no traces that the sensor file does not describe, and no discrepancy. It is
-described by the parameters of `FilmPrior` alone.
+A perfect film has no imperfections, no traces that the sensor file does not describe, and no discrepancy. A perfect
+film is described by the parameters of `FilmPrior` alone.
 """
 
 from dataclasses import dataclass, replace
@@ -31,6 +31,9 @@ CACHED_MAPS = 8
 EDGE = 1.0 - 1e-6
 """Share of the radius and of the forces of the family within which presses are evaluated."""
 
+FORCE_MARGIN = 1.01
+"""Factor by which the range of forces is reduced at both ends, for the finite differences with respect to the force."""
+
 
 @dataclass(frozen=True)
 class FilmMaps:
@@ -46,28 +49,34 @@ class FilmMaps:
 
     @cached_property
     def domain(self) -> Domain:
-        """Contacts for which every film of the prior has charges, with a margin for the finite differences."""
+        """Contacts for which every film of the prior has charges, with a margin for the finite differences.
+
+        The stiffest film limits the smallest force, and the softest film limits the largest force.
+        """
         film = self.prior.sensor.film
         young = self.prior.index("young")
         thickness = self.prior.index("thickness")
+        # The parameters of Young's modulus and thickness are logarithms of factors.
         stiffness = film.young * film.thickness * film.radius
-        min_stiffness, max_stiffness = (
-            stiffness * np.exp(bound[young] + bound[thickness]) for bound in self.prior.bounds
-        )
+        lower, upper = self.prior.bounds
+        min_stiffness = stiffness * np.exp(lower[young] + lower[thickness])
+        max_stiffness = stiffness * np.exp(upper[young] + upper[thickness])
 
         # The family is limited in the distance over the radius, and in the load F / (E h a).
         _, max_distance = self.family.limits["distance"]
         min_load, max_load = self.family.limits["load"]
-        radius = EDGE * max_distance * film.radius - CONTACT_STEPS[0]
-        min_force = float(min_load * max_stiffness) * (2.0 - EDGE) * 1.01
-        max_force = float(max_load * min_stiffness) * EDGE / 1.01
+        position_step, _, _ = CONTACT_STEPS
+        radius = EDGE * max_distance * film.radius - position_step
+        min_force = float(min_load * max_stiffness) * (2.0 - EDGE) * FORCE_MARGIN
+        max_force = float(max_load * min_stiffness) * EDGE / FORCE_MARGIN
         return Domain(radius, (min_force, max_force))
 
     def forward_map(self, parameters: Array) -> ForwardMap:
         """Return the forward map of one film.
 
-        If films differ only in piezoelectric coefficients, gains and electrodes, their stresses are equal. The last few
-        stresses are cached.
+        Films that differ only in piezoelectric coefficients, gains and electrodes have the same stresses. The forward
+        maps are therefore cached by film and probe, and a cached map is returned with the requested sensor. At most
+        `CACHED_MAPS` maps are kept.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -76,7 +85,8 @@ class FilmMaps:
         key = (sensor.film, probe)
         if key not in self._maps:
             if len(self._maps) >= CACHED_MAPS:
-                del self._maps[next(iter(self._maps))]
+                oldest_key = next(iter(self._maps))
+                del self._maps[oldest_key]
             self._maps[key] = self.family.forward_map(sensor, probe)
         return replace(self._maps[key], sensor=sensor)
 
@@ -89,6 +99,9 @@ class FilmMaps:
     ) -> Array:
         """Compute the derivatives of the charges of a film with respect to the parameters.
 
+        Only some derivatives need finite differences. The other derivatives follow from the scaling laws of the film,
+        and from the fact that the charges are linear in d31, d32 and the gains.
+
         Args:
             film: Forward map of the film.
             parameters: Parameters of the film, shape (n_parameter,).
@@ -100,19 +113,25 @@ class FilmMaps:
             Shape (n, n_electrode, n_parameter), pC per unit of the parameter.
         """
         pretension = parameters[self.prior.index("pretension")]
-        columns = {name: self.difference(name, parameters, contact, charge) for name in STEPPED}
+        derivatives = {name: self.difference(name, parameters, contact, charge) for name in STEPPED}
+
         # Chain rule for Q = E q(F / (E h a), T / E, h / a), with respect to ln E and ln h
-        columns["young"] = charge - force_derivative - pretension * columns["pretension"]
-        columns["thickness"] = columns["thickness"] - force_derivative
+        derivatives["young"] = charge - force_derivative - pretension * derivatives["pretension"]
+        derivatives["thickness"] = derivatives["thickness"] - force_derivative
+
+        # The charge is the sum of a part proportional to d31 and a part proportional to d32. The derivative with
+        # respect to ln d32 is the second part, and the derivative with respect to ln d31 is the rest of the charge.
         piezo = film.sensor.piezo
-        columns["d32"] = np.zeros_like(charge)
+        derivatives["d32"] = np.zeros_like(charge)
         if piezo.d32 != 0.0:
             d32_alone = replace(film, sensor=replace(film.sensor, piezo=replace(piezo, d31=0.0)))
-            columns["d32"] = d32_alone.charges(contact)
-        columns["d31"] = charge - columns["d32"]
-        shared = np.stack([columns[name] for name in SHARED], axis=2)
+            derivatives["d32"] = d32_alone.charges(contact)
+        derivatives["d31"] = charge - derivatives["d32"]
+
+        # The parameters are in the order of `SHARED`, followed by the ln gain of each electrode.
+        shared_jacobian = np.stack([derivatives[name] for name in SHARED], axis=2)
         gain_jacobian = charge[:, :, None] * np.eye(charge.shape[1])
-        return np.concatenate([shared, gain_jacobian], axis=2)
+        return np.concatenate([shared_jacobian, gain_jacobian], axis=2)
 
     def difference(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
         """Compute the derivative of the charges with respect to one parameter by a finite difference.
@@ -136,11 +155,12 @@ class FilmMaps:
             step = -step
         stepped = parameters.copy()
         stepped[index] += step
-        change = stepped[index] - parameters[index]
+        rounded_step = stepped[index] - parameters[index]  # the change that floating-point numbers really have
         stepped_contact = contact
         if name == "thickness":
-            stepped_contact = contact * [1.0, 1.0, np.exp(change)]  # keeps F / h constant
-        return np.asarray((self.forward_map(stepped).charges(stepped_contact) - charge) / change)
+            stepped_contact = contact * [1.0, 1.0, np.exp(rounded_step)]  # keeps F / h constant
+        stepped_charge = self.forward_map(stepped).charges(stepped_contact)
+        return np.asarray((stepped_charge - charge) / rounded_step)
 
 
 def log_force_derivative(film: ForwardMap, contact: Array) -> Array:
@@ -153,8 +173,8 @@ def log_force_derivative(film: ForwardMap, contact: Array) -> Array:
     Returns:
         Shape (n, n_electrode), pC.
     """
-    log_force_step = CONTACT_STEPS[2]
-    force_factor = np.array([1.0, 1.0, np.exp(log_force_step)])
+    _, _, log_force_step = CONTACT_STEPS
+    force_factor = np.array([1.0, 1.0, np.exp(log_force_step)])  # changes only the force of (x, y, F)
     charge_above = film.charges(contact * force_factor)
     charge_below = film.charges(contact / force_factor)
     return np.asarray((charge_above - charge_below) / (2.0 * log_force_step))

@@ -1,7 +1,8 @@
 """Least-squares problem of a calibration, whose solution is the film that explains presses best.
 
 The unknowns p minimise the sum of two parts. The first part contains the squared residuals of the charges and of the
-rig, for each press at the contact where they are smallest. The second part is the prior, |(p - mean) / std|^2.
+rig. The residuals of each press are computed at the contact where the sum of their squares is smallest. The second part
+is the prior, |(p - mean) / std|^2.
 
 The problem is solved by SciPy's trust-region method. The contacts are eliminated in every step (variable projection,
 Golub and Pereyra 1973), so that only the unknowns of the film remain.
@@ -122,36 +123,43 @@ class FitProblem:
     def of(
         cls, charges: FilmCharges, initial: FilmEstimate, *, knows_temperature: bool, friction: float = 0.0
     ) -> "FitProblem":
-        """Return the problem of a film.
+        """Return the problem of a film, with the mean and the covariance of all unknowns before the presses.
+
+        Unknowns without a prior variance stay at their mean, unless a hypothesis adds a variance.
 
         Args:
             charges: The films.
             initial: Estimate of the film before the presses. Coefficients that it does not have are zero.
             knows_temperature: Whether the temperatures of the presses are known, so that the nuisances of temperature
                 are unknowns.
-            friction: Expected coefficient of friction, and its standard deviation; 0 for presses without friction.
+            friction: Expected coefficient of friction, which is also its standard deviation; 0 for presses without
+                friction.
         """
         layout = charges.layout
         mean = np.zeros(layout.count)
         covariance = np.zeros((layout.count, layout.count))
+
+        # The unknowns of the film come first: the parameters, and the coefficients if the estimate has them.
+        film_unknowns = slice(0, initial.unknowns.size)
         mean[layout.parameters] = initial.parameters / charges.prior.std
         if initial.coefficients.size:
             mean[layout.coefficients] = initial.coefficients
-        estimated = slice(0, initial.unknowns.size)
-        covariance[estimated, estimated] = initial.unknown_covariance
+        covariance[film_unknowns, film_unknowns] = initial.unknown_covariance
+
         if knows_temperature:
             for nuisance in NUISANCES:
-                place = layout.nuisance(nuisance.name)
-                covariance[place, place] = nuisance.std_with_temperatures**2
+                index = layout.nuisance(nuisance.name)
+                covariance[index, index] = nuisance.std_with_temperatures**2
         if knows_temperature and initial.warming is not None:
-            place = layout.nuisance(PRETENSION_PER_KELVIN.name)
-            mean[place] = initial.warming.MPa_per_K
-            covariance[place, place] = initial.warming.std**2
-            covariance[estimated, place] = initial.warming.covariance
-            covariance[place, estimated] = initial.warming.covariance
-        place = layout.nuisance(FRICTION.name)
-        mean[place] = friction
-        covariance[place, place] = friction**2
+            change_index = layout.nuisance(PRETENSION_PER_KELVIN.name)
+            mean[change_index] = initial.warming.MPa_per_K
+            covariance[change_index, change_index] = initial.warming.std**2
+            covariance[film_unknowns, change_index] = initial.warming.covariance
+            covariance[change_index, film_unknowns] = initial.warming.covariance
+
+        friction_index = layout.nuisance(FRICTION.name)
+        mean[friction_index] = friction
+        covariance[friction_index, friction_index] = friction**2
         return cls(charges, mean, covariance)
 
     @property
@@ -165,11 +173,13 @@ class FitProblem:
 
         The bounds of parameters are in units of their prior standard deviations. All other unknowns are unbounded.
         """
-        lower = np.full(self.layout.count, -np.inf)
-        upper = np.full(self.layout.count, np.inf)
-        parameter_lower, parameter_upper = self.charges.prior.bounds
-        lower[self.layout.parameters] = parameter_lower / self.charges.prior.std
-        upper[self.layout.parameters] = parameter_upper / self.charges.prior.std
+        layout = self.layout
+        prior = self.charges.prior
+        parameter_lower, parameter_upper = prior.bounds
+        lower = np.full(layout.count, -np.inf)
+        upper = np.full(layout.count, np.inf)
+        lower[layout.parameters] = parameter_lower / prior.std
+        upper[layout.parameters] = parameter_upper / prior.std
         return lower, upper
 
     def solve(self, data: PressData, weight: Array | Booleans, start: Array, hypothesis: Hypothesis) -> SolvedFilm:
@@ -188,24 +198,29 @@ class FitProblem:
         has_coefficients = bool(active[self.layout.coefficients].any())
         whitening = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(active, active)]))
         lower, upper = (bound[active] for bound in self.bounds)
-        latest: list[tuple[Array, SolvedFilm]] = []
+        latest: tuple[Array, SolvedFilm] | None = None
 
         def film_at(active_unknowns: Array) -> SolvedFilm:
-            """Adjust the contacts to a film.
+            """Return the film with given unknowns, and the contacts that agree best with this film.
 
             The latest film is stored, because SciPy evaluates the residuals and the derivatives of each film
-            separately.
+            separately. The search for the contacts begins at the contacts of the latest film.
+
+            Args:
+                active_unknowns: The unknowns that the hypothesis includes, shape (n_active,). The others have their
+                    mean.
             """
+            nonlocal latest
             start_of_contacts = None
-            if latest:
-                [(latest_unknowns, latest_film)] = latest
+            if latest is not None:
+                latest_unknowns, latest_film = latest
                 if np.array_equal(latest_unknowns, active_unknowns):
                     return latest_film
                 start_of_contacts = latest_film.contacts.contact
             unknowns = self.mean.copy()
             unknowns[active] = active_unknowns
             film = SolvedFilm(unknowns, self.adjusted_contacts(unknowns, data, start_of_contacts))
-            latest[:] = [(active_unknowns.copy(), film)]
+            latest = (active_unknowns.copy(), film)
             return film
 
         def residual(active_unknowns: Array) -> Array:
@@ -215,7 +230,7 @@ class FitProblem:
             return np.concatenate([press_residual.ravel(), prior_residual])
 
         def jacobian(active_unknowns: Array) -> Array:
-            """Return the derivatives of these residuals, shape (n_residual, n_active)."""
+            """Return the derivatives of the residuals of all presses and of the prior, shape (n_residual, n_active)."""
             film = film_at(active_unknowns)
             derivatives = self.derivatives(film, data, with_coefficients=has_coefficients)
             press_rows = derivatives[:, :, active] * root_weight[:, None, None]
@@ -256,18 +271,20 @@ class FitProblem:
         if hypothesis != Hypothesis():
             solved = self._solve_kept(data, is_kept, solved.unknowns, hypothesis)
         for round_index in range(MAX_ROUNDS):
-            is_last_round = round_index == MAX_ROUNDS - 1
             mixture = self.mixture(data[is_kept], solved)
             # Distance from the film at which the residuals are linearised to the estimate of the linear model.
             step = self.mean + mixture.mean - solved.unknowns
             is_step_small = np.abs(step[self.layout.parameters]).max() < MAX_LINEAR_STEP
-            kept_next = is_kept
+
+            is_kept_next = is_kept
             if not is_kept.all():
-                kept_next = is_kept | self.agrees(data, solved, mixture, degrees_of_freedom)
-            is_selection_stable = np.array_equal(kept_next, is_kept)
+                is_kept_next = is_kept | self.agrees(data, solved, mixture, degrees_of_freedom)
+            is_selection_stable = np.array_equal(is_kept_next, is_kept)
+
+            is_last_round = round_index == MAX_ROUNDS - 1
             if is_last_round or (is_step_small and is_selection_stable):
                 break
-            is_kept = kept_next
+            is_kept = is_kept_next
             solved = self._solve_kept(data, is_kept, solved.unknowns, mixture.best)
         return SettledFit(is_kept, solved, mixture)
 
@@ -279,8 +296,11 @@ class FitProblem:
     def agrees(self, data: PressData, solved: SolvedFilm, mixture: Mixture, degrees_of_freedom: Array) -> Booleans:
         """Return which presses agree with a film, given its uncertainty, shape (n,).
 
+        A press agrees if the sum of its squared residuals, weighted with their covariance, does not exceed a quantile
+        of the chi-squared distribution.
+
         Args:
-            data: The presses, of which the fit need not have used all.
+            data: The presses. They may include presses that the fit did not use.
             solved: The film at which the residuals are linearised.
             mixture: The estimate of the unknowns.
             degrees_of_freedom: Measured numbers beyond three for each press, shape (n,).
@@ -288,11 +308,14 @@ class FitProblem:
         data = data.with_force_scatter(mixture.best.force_scatter)
         contacts = self.adjusted_contacts(solved.unknowns, data)
         jacobian = self.derivatives(SolvedFilm(solved.unknowns, contacts), data)
-        residual = contacts.residual + jacobian @ (self.mean + mixture.mean - solved.unknowns)
+        # Residuals for the estimated unknowns, by the linear model about the solved film.
+        step = self.mean + mixture.mean - solved.unknowns
+        residual = contacts.residual + jacobian @ step
         # Covariance of the residuals of each press: measurement noise (1) plus the uncertainty of the film.
-        covariance = np.eye(jacobian.shape[1]) + jacobian @ mixture.covariance @ jacobian.swapaxes(1, 2)
-        whitened = np.linalg.solve(covariance, residual[:, :, None])[:, :, 0]
-        chi2 = (residual * whitened).sum(axis=1)
+        residual_count = jacobian.shape[1]
+        covariance = np.eye(residual_count) + jacobian @ mixture.covariance @ jacobian.swapaxes(1, 2)
+        weighted_residual = np.linalg.solve(covariance, residual[:, :, None])[:, :, 0]
+        chi2 = (residual * weighted_residual).sum(axis=1)
         limit = scipy.stats.chi2.isf(BAD_PROBABILITY / len(data), np.maximum(degrees_of_freedom, 1.0))
         return np.asarray(chi2 <= limit)
 
@@ -303,7 +326,10 @@ class FitProblem:
 
         Args:
             data: The presses.
-            solved: This film.
+            solved: The film that explains the presses, with their contacts on it.
+
+        Returns:
+            The mixture of the estimates of all hypotheses. Its mean is the difference from the mean before the presses.
         """
         unknowns = solved.unknowns
         contacts = self.adjusted_contacts(unknowns, data, solved.contacts.contact)
@@ -316,19 +342,24 @@ class FitProblem:
         force_derivative = self._force_derivative(unknowns, data, contacts)
         length = np.linalg.norm(force_derivative, axis=1)
         direction = force_derivative / np.maximum(length, SMALLEST_DERIVATIVE)[:, None]
-        # sum over the residuals k of each press n, for each unknown u
+        # Jacobian and residual in this direction: sums over the residuals k of each press n, for each unknown u
         jacobian_along = np.einsum("nk,nku->nu", direction, jacobian)
         residual_along = (direction * contacts.residual).sum(axis=1)
-        models = {
-            scatter: model.with_added_noise(jacobian_along, residual_along, deviation, (scatter * length) ** 2)
-            for scatter in FORCE_SCATTERS
-        }
-        mixture = mix_hypotheses(models, self._prior_covariance)
-        bounded = _most_probable_within(self.bounds, self.mean + mixture.mean, mixture.covariance)
-        return mixture._replace(mean=bounded - self.mean)
+        models_by_scatter = {}
+        for scatter in FORCE_SCATTERS:
+            added_variance = (scatter * length) ** 2
+            models_by_scatter[scatter] = model.with_added_noise(
+                jacobian_along, residual_along, deviation, added_variance
+            )
+
+        mixture = mix_hypotheses(models_by_scatter, self._prior_covariance)
+        bounded_unknowns = _most_probable_within(self.bounds, self.mean + mixture.mean, mixture.covariance)
+        return mixture._replace(mean=bounded_unknowns - self.mean)
 
     def adjusted_contacts(self, unknowns: Array, data: PressData, start: Array | None = None) -> AdjustedContacts:
         """Return the contact of each press that agrees best with a film.
+
+        The effects of the nuisances are first subtracted from the charges of the presses.
 
         Args:
             unknowns: Unknowns of the film, shape (n_unknown,).
@@ -342,13 +373,15 @@ class FitProblem:
         return adjust_contacts(self.charges, film, corrected, start)
 
     def derivatives(self, solved: SolvedFilm, data: PressData, *, with_coefficients: bool = True) -> Array:
-        """Return the derivatives of the residuals with respect to the unknowns. The contacts are adjusted to each film.
+        """Return the derivatives of the residuals with respect to the unknowns.
+
+        A change of the unknowns also moves the adjusted contacts. The derivatives include the effect of this movement.
 
         Args:
             solved: The film, and the contacts of the presses on it.
             data: The presses.
-            with_coefficients: Whether to compute the derivatives by coefficients, which takes time. They are zero
-                otherwise.
+            with_coefficients: Whether to compute the derivatives with respect to the coefficients, which takes time.
+                They are zero otherwise.
 
         Returns:
             Shape (n, n_electrode + 3, n_unknown).
@@ -356,40 +389,48 @@ class FitProblem:
         layout = self.layout
         film_unknowns = layout.film if with_coefficients else layout.parameters
         contact = with_force(solved.contacts.contact)
-        films, shares = self._neighbouring_films(solved.unknowns, data)
+        # Derivatives of the charges on neighbouring films, between which the charges of each press are interpolated.
+        films, film_weights = self._neighbouring_films(solved.unknowns, data)
         charge_by_contact = [self.charges.by_contact(film, contact) for film in films]
         charge_by_film = [
             self.charges.by_parameter(film[film_unknowns], contact, by_contact)
             for film, by_contact in zip(films, charge_by_contact, strict=True)
         ]
 
+        # The film changes only the residuals of the charges, the first of each press. The nuisances change the charges
+        # directly, or they change the pretension.
         jacobian = np.zeros((*data.measured.shape, layout.count))
         charge_rows = slice(0, data.charge.shape[1])
-        jacobian[:, charge_rows, film_unknowns] = data.weight[:, :, None] * weighted_sum(charge_by_film, shares)
+        jacobian[:, charge_rows, film_unknowns] = data.weight[:, :, None] * weighted_sum(charge_by_film, film_weights)
         pretension = layout.parameter("pretension")
         by_pretension = jacobian[:, :, pretension] / self.charges.prior.std[pretension]
         jacobian[:, :, layout.nuisances] = nuisance_derivatives(data, by_pretension)
 
-        residual_by_contact = data.residual_slopes(weighted_sum(charge_by_contact, shares))
+        residual_by_contact = data.residual_slopes(weighted_sum(charge_by_contact, film_weights))
         return derivatives_with_adjusted_contacts(jacobian, residual_by_contact)
 
     def gain_covariance(self, nuisances: dict[str, NuisanceEstimate], force_scatter: float) -> Array:
         """Return the additional covariance of the film's unknowns when the film is used after the session.
 
         A drift or a scatter of the forces in the session leaves the mean of all gains uncertain, because later presses
-        may be affected differently.
+        may be affected differently. The additional error is the same for all gains.
 
         Args:
             nuisances: Estimates of the nuisances of the session by name.
             force_scatter: Relative standard deviation of the forces.
+
+        Returns:
+            Covariance, shape (n_film_unknown, n_film_unknown), in units of the prior standard deviations.
         """
-        std = 0.0
+        # The errors are independent, so that the root of the sum of their squares is taken.
+        gain_std = 0.0
         for nuisance in NUISANCES:
-            std = float(np.hypot(std, nuisance.gain_std(nuisances[nuisance.name])))
-        std = float(np.hypot(std, MEAN_OVER_STD * force_scatter))
-        direction = np.zeros(self.layout.film_count)
-        direction[self.charges.prior.gains] = std / self.charges.prior.spread.gain
-        return np.outer(direction, direction)
+            gain_std = float(np.hypot(gain_std, nuisance.gain_std(nuisances[nuisance.name])))
+        gain_std = float(np.hypot(gain_std, MEAN_OVER_STD * force_scatter))
+
+        common_error = np.zeros(self.layout.film_count)
+        common_error[self.charges.prior.gains] = gain_std / self.charges.prior.spread.gain
+        return np.outer(common_error, common_error)
 
     def _prior_covariance(self, hypothesis: Hypothesis) -> Array:
         """Return the covariance of the unknowns before the presses for a hypothesis, shape (n_unknown, n_unknown)."""
@@ -413,19 +454,31 @@ class FitProblem:
         """Return the derivatives of the residuals with respect to the stated force, shape (n, n_electrode + 3).
 
         The contacts are adjusted to the stated force.
+
+        Args:
+            unknowns: Unknowns of the film, shape (n_unknown,).
+            data: The presses.
+            contacts: The adjusted contacts of the presses on this film.
         """
         contact = with_force(contacts.contact)
-        films, shares = self._neighbouring_films(unknowns, data)
-        charge_by_contact = weighted_sum([self.charges.by_contact(film, contact) for film in films], shares)
-        by_force = data.force_derivative()[:, :, None]
-        return derivatives_with_adjusted_contacts(by_force, data.residual_slopes(charge_by_contact))[:, :, 0]
+        films, film_weights = self._neighbouring_films(unknowns, data)
+        charge_by_contact = weighted_sum([self.charges.by_contact(film, contact) for film in films], film_weights)
+        residual_by_contact = data.residual_slopes(charge_by_contact)
+        # The stated force is treated as one unknown, so the arrays have a last axis of length 1.
+        residual_by_force = data.force_derivative()[:, :, None]
+        return derivatives_with_adjusted_contacts(residual_by_force, residual_by_contact)[:, :, 0]
 
 
 def _most_probable_within(bounds: tuple[Array, Array], mean: Array, covariance: Array) -> Array:
     """Return the most probable unknowns of a normal distribution within bounds, shape (n_unknown,).
 
     The unknown that is farthest beyond its bound is moved onto the bound, and the others change by their correlation
-    with it. This is repeated until no unknown is beyond its bound.
+    with it. These steps are repeated until no unknown is beyond its bound.
+
+    Args:
+        bounds: Lower and upper bounds, each of shape (n_unknown,).
+        mean: Mean of the normal distribution, shape (n_unknown,).
+        covariance: Covariance of the normal distribution, shape (n_unknown, n_unknown).
     """
     unknowns = mean
     for _ in range(len(mean)):
@@ -436,5 +489,6 @@ def _most_probable_within(bounds: tuple[Array, Array], mean: Array, covariance: 
         # Change of each unknown for a change of 1 of the unknown that is moved onto its bound.
         regression = covariance[:, farthest] / covariance[farthest, farthest]
         unknowns = unknowns - excess[farthest] * regression
+        # Covariance of the other unknowns at a given value of the moved unknown
         covariance = covariance - np.outer(regression, covariance[farthest])
     return np.clip(unknowns, *bounds)

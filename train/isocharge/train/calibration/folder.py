@@ -10,7 +10,7 @@
     FOLDER/<version>/calibration.png     picture of the calibration
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the files of the last version
 
-A further calibration in the same folder becomes its next version. A server loads this version when it reloads its
+A further calibration in the same folder becomes its next version. A server loads the new version when it reloads its
 models. Programs only read the version folders. The copies above them are for people. Before each calibration, the
 copies are written again from the last version, because an earlier process may have been killed before it wrote them.
 """
@@ -34,14 +34,12 @@ from isocharge.serve.model.film_directions import FILE as DIRECTIONS
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, version_folders
 from isocharge.serve.model.pretensions import FILE as PRETENSIONS
-from isocharge.simulate.plots.figure import picture_bytes
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.calibration.calibration_file import film_table, read_film
 from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.cross_validation import FOLD_COUNT
 from isocharge.train.calibration.film_directions import film_directions
 from isocharge.train.calibration.following import pretensions_of
-from isocharge.train.calibration.picture import calibration_picture
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.result import CalibrationResult, film_without_presses
 from isocharge.train.model_release.release import release
@@ -66,15 +64,21 @@ CARD = "card.md"
 def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
     """Raise ModelError if a calibration cannot be written to a folder because of its name or its content.
 
+    A calibration can be written to a new folder, to an empty folder, or to a folder of earlier calibrations. Hidden
+    files are ignored.
+
     Args:
         folder: The folder, which need not exist.
         electrodes: Names of the electrodes.
     """
     versions = version_folders(folder)
-    check_target(folder, max(versions, default=0) + 1, electrodes)
-    if not folder.exists() or any((version / RESULT).is_file() for version in versions.values()):
+    next_version = max(versions, default=0) + 1
+    check_target(folder, next_version, electrodes)
+    has_calibration = any((version / RESULT).is_file() for version in versions.values())
+    if not folder.exists() or has_calibration:
         return
-    if any(not path.name.startswith(".") for path in folder.iterdir()):
+    has_other_files = any(not path.name.startswith(".") for path in folder.iterdir())
+    if has_other_files:
         raise ModelError(f"{folder}: expected a new folder or one of an earlier calibration; choose another --output")
 
 
@@ -82,8 +86,9 @@ def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
 def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[None]:
     """Lock a folder for a calibration as long as the `with` block runs.
 
-    Before the block, unfinished files of a process that was killed are removed, and the copies of the last version are
-    written again.
+    Before the block, drafts of a process that was killed are removed, and the readable files of the last version are
+    copied to the folder again. After the block, the folder and the parents that were created for it are removed if they
+    are empty.
 
     Args:
         folder: The folder.
@@ -95,31 +100,36 @@ def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[No
         OutputError: If the folder cannot be written.
     """
     check_calibration_folder(folder, problem.electrodes)
-    missing = [folder, *(parent for parent in folder.parents if not parent.exists())]
+    folder_and_new_parents = [folder, *(parent for parent in folder.parents if not parent.exists())]
     with as_output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try:
             with locked(folder):
                 for draft in folder.glob(".*.draft"):
-                    shutil.rmtree(draft, ignore_errors=True)
-                    draft.unlink(missing_ok=True)
+                    shutil.rmtree(draft, ignore_errors=True)  # removes a folder, and ignores a file
+                    draft.unlink(missing_ok=True)  # removes a file
                 _publish(folder)
                 yield
         finally:
-            remove_empty(missing)
+            remove_empty(folder_and_new_parents)
 
 
 def _publish(folder: Path) -> None:
-    """Copy the readable files of the last version to the folder above it, if they differ."""
+    """Copy the readable files of the last version to the folder above it, if they differ.
+
+    Args:
+        folder: Folder of the calibration, which contains the version folders.
+    """
     calibrated_versions = _calibrated_versions(folder)
     if not calibrated_versions:
         return
     last_version = calibrated_versions[-1]
     for name in (SENSOR, PICTURE, CARD, RESULT):
-        data = (last_version / name).read_bytes()
+        content = (last_version / name).read_bytes()
         copy = folder / name
-        if not copy.is_file() or copy.read_bytes() != data:
-            write_whole(copy, data)
+        is_up_to_date = copy.is_file() and copy.read_bytes() == content
+        if not is_up_to_date:
+            write_whole(copy, content)
 
 
 def _calibrated_versions(folder: Path) -> list[Path]:
@@ -150,7 +160,20 @@ def write_calibration(result: CalibrationResult, folder: Path, command: str = ""
 
 
 def _release(result: CalibrationResult, folder: Path, command: str) -> Path:
-    """Write the next version folder with all files of a calibration; see `write_calibration`."""
+    """Write the next version folder with the model and all files of a calibration; see `write_calibration`.
+
+    The presses are not written if the calibration was moved to another temperature, because no presses were made at
+    this temperature. The files for following the pretension are written only if the pretension can be followed.
+
+    Args:
+        result: The calibration.
+        folder: Folder of the calibration.
+        command: Command that makes this calibration again, for the card.
+    """
+    # Imported late, because matplotlib takes long to import and `train fit` does not need it.
+    from isocharge.simulate.plots.figure import picture_bytes
+    from isocharge.train.calibration.picture import calibration_picture
+
     files = {
         RESULT: json.dumps(plain_values(result_table(result)), indent=1, allow_nan=False).encode(),
         SENSOR: sensor_to_toml(result.film[0]).encode(),
@@ -163,13 +186,15 @@ def _release(result: CalibrationResult, folder: Path, command: str) -> Path:
     if pretensions is not None:
         files[PRETENSIONS] = pretensions.to_bytes()
         files[DIRECTIONS] = film_directions(result).to_bytes()
-    return release(
+
+    released = release(
         replace(fitted, provenance=Provenance(files=files)),
         folder,
         version=max(version_folders(folder), default=0) + 1,
         command=command,
         card=lambda about, _: _card(result, about),
-    ).folder
+    )
+    return released.folder
 
 
 def result_table(result: CalibrationResult) -> dict[str, Any]:
@@ -245,13 +270,16 @@ def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> Calibr
             f"{path}: expected a calibration that contains the change of the film with temperature, got one without; "
             "calibrate with presses that have a column temperature_C and cover a few degrees"
         )
-    version = "/".join(path.parts[-3:-1])  # folder of the model and number of the version, which contain the file
+    # The path is FOLDER/VERSION/calibration.json, and the text names the folder and the version.
+    version_folder = path.parent
+    version = "/".join(version_folder.parts[-2:])
     moved = f"moved from {film.warming.at_C:.1f} C, {version}, to {to_C:.1f} C by the change in its calibration"
-    return film_without_presses(replace(problem, earlier=film), film.at_temperature(to_C, problem.prior), moved)
+    moved_film = film.at_temperature(to_C, problem.prior)
+    return film_without_presses(replace(problem, earlier=film), moved_film, moved)
 
 
 def _read(folder: Path, problem: CalibrationProblem) -> tuple[Path, FilmEstimate]:
-    """Return the path of the file of an earlier calibration, and the film in this file.
+    """Find the file of an earlier calibration, and read the film from this file.
 
     If the folder is a version folder, its own file is used. Otherwise, the file of the last version in the folder is
     used.
@@ -263,22 +291,27 @@ def _read(folder: Path, problem: CalibrationProblem) -> tuple[Path, FilmEstimate
 
 
 def _card(result: CalibrationResult, about: ModelMetadata) -> str:
-    """Return the text of the card."""
+    """Return the text of the card of a calibrated model, in Markdown.
+
+    Args:
+        result: The calibration.
+        about: Metadata of the model.
+    """
     sensor, probe = result.film
-    low, high = about.force_range_N
-    made = f"{result.moved}," if result.moved else f"calibrated on {len(result.presses)} presses"
-    sentences = "\n".join(f"- {sentence}" for sentence in result.summary)
-    rows = "\n".join(
+    min_force, max_force = about.force_range_N
+    origin = f"{result.moved}," if result.moved else f"calibrated on {len(result.presses)} presses"
+    summary_list = "\n".join(f"- {sentence}" for sentence in result.summary)
+    quantity_rows = "\n".join(
         f"| `{quantity.name}` | {quantity.meaning} | {quantity.value:.4g} | {quantity.std:.2g} | "
         f"{quantity.before_std:.2g} | {'yes' if quantity.identified else 'no'} |"
         for quantity in result.quantities.values()
     )
     return f"""# {about.name}, version {about.version}: a calibrated film
 
-The sensor `{sensor.name}`, {made} with `{probe.notation}` (radius as found).
-The model answers within {result.problem.domain.radius:g} mm of the centre, {low:g} to {high:g} N.
+The sensor `{sensor.name}`, {origin} with `{probe.notation}` (radius as found).
+The model answers within {result.problem.domain.radius:g} mm of the centre, {min_force:g} to {max_force:g} N.
 
-{sentences}
+{summary_list}
 
 ![error left, quantities, misses]({PICTURE})
 
@@ -286,7 +319,7 @@ The model answers within {result.problem.domain.radius:g} mm of the centre, {low
 
 | quantity | what it is | value | standard deviation | before | identified |
 |---|---|---|---|---|---|
-{rows}
+{quantity_rows}
 
 Identified: the presses at least halved its standard deviation. `sensor.toml` has single parameters, of which only the
 combinations above are known; `calibration.json` has their correlations.
@@ -304,12 +337,20 @@ combinations above are known; `calibration.json` has their correlations.
 
 
 def _errors_section(result: CalibrationResult, about: ModelMetadata) -> str:
-    """Return a table of errors, and sentences about the presses on which these errors were measured."""
-    introduction = "On new simulated presses on the film as calibrated, with noise:"
-    conclusion = (
-        "What not knowing the film leaves is added to these errors; `contact_std` contains it, as a common factor."
-    )
-    if result.held_out is not None:
+    """Return a table of errors, and sentences about the presses on which these errors were measured.
+
+    The errors were measured on held-out presses if there are enough of them, and on simulated presses otherwise.
+
+    Args:
+        result: The calibration.
+        about: Metadata of the model, which contain the errors.
+    """
+    if result.held_out is None:
+        introduction = "On new simulated presses on the film as calibrated, with noise:"
+        conclusion = (
+            "What not knowing the film leaves is added to these errors; `contact_std` contains it, as a common factor."
+        )
+    else:
         introduction = (
             f"On {len(result.held_out.presses)} measured presses. They are divided by their places into {FOLD_COUNT} "
             "parts, and each part is\nanswered by a calibration without it:"

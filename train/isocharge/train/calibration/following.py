@@ -1,7 +1,7 @@
 """Weights with which a service follows the pretension of a calibrated film: the file `pretensions.npz`.
 
 The file contains networks of the film at several pretensions. All other parameters are those of the calibration. Each
-network is adapted to the discrepancy and to the remaining uncertainty of the film in the same way as the model itself.
+network is adapted to the discrepancy and to the remaining uncertainty of the film, as the model itself is.
 """
 
 from dataclasses import replace
@@ -38,6 +38,8 @@ MAX_TYPICAL_MISFIT = 1.5
 def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretensions | None:
     """Compute the weights of the network of a calibrated film at other pretensions.
 
+    One network is computed for each of several pretensions. The service interpolates between these networks.
+
     Args:
         result: The calibration.
         network: The network of the model.
@@ -50,26 +52,32 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
     posterior = result.posterior
     if len(problem.electrodes) <= 3:
         return None
+
     prior = problem.prior
     pretension = prior.index("pretension")
     calibrated_MPa = float(posterior.parameters[pretension])
     lower, upper = (float(bound[pretension]) for bound in prior.bounds)
     nodes = _nodes(calibrated_MPa, lower, upper)
+
+    # The networks have the same layers. Each array of weights is stacked over the nodes, shape (N_NODES, ...).
     arrays_of_networks = [_arrays(node_network) for node_network in _networks_at(nodes, result, network)]
-    weights = [np.stack(arrays) for arrays in zip(*arrays_of_networks, strict=True)]
+    stacked_weights = [np.stack(arrays) for arrays in zip(*arrays_of_networks, strict=True)]
+
     drifted_std = np.sqrt(np.diag(posterior.drifted(prior).covariance)) * prior.std
     pretensions = Pretensions(
         node_MPa=nodes,
         calibrated_MPa=calibrated_MPa,
         std_MPa=float(drifted_std[pretension]),
-        floor_MPa=_floor(result),
+        floor_MPa=_lasting_std_MPa(result),
         misfit_rms=1.0,
         misfit_unit=MISFIT_UNIT,
         limits_pC=(LOWEST_CHARGE, HIGHEST_CHARGE),
         typical_pC=network.features.typical_pC,
         activation=network.layers.activation.name,
-        weights=dict(zip(_constants(network), weights, strict=True)),
+        weights=dict(zip(_constants(network), stacked_weights, strict=True)),
     )
+
+    # The misfits of the networks are computed with `misfit_rms` = 1, and determine its final value.
     typical_misfit = _typical_misfit(pretensions, result)
     if typical_misfit > MAX_TYPICAL_MISFIT:
         return None
@@ -84,16 +92,17 @@ def _networks_at(pretensions_MPa: Array, result: CalibrationResult, network: Fol
         result: The calibration.
         network: Network of the model, which is returned for the calibrated pretension.
     """
-    posterior = result.posterior
+    calibrated_parameters = result.posterior.parameters
     pretension = result.problem.prior.index("pretension")
     networks = []
     for pretension_MPa in pretensions_MPa:
-        if pretension_MPa == posterior.parameters[pretension]:
+        if pretension_MPa == calibrated_parameters[pretension]:
             networks.append(network)
-        else:
-            parameters = posterior.parameters.copy()
-            parameters[pretension] = pretension_MPa
-            networks.append(_with_correlations_of(network, result.fitted_film(parameters).network))
+            continue
+        parameters = calibrated_parameters.copy()
+        parameters[pretension] = pretension_MPa
+        film_network = result.fitted_film(parameters).network
+        networks.append(_with_correlations_of(network, film_network))
     return networks
 
 
@@ -118,7 +127,8 @@ def _typical_misfit(pretensions: Pretensions, result: CalibrationResult) -> floa
 def _nodes(calibrated: float, lower: float, upper: float) -> Array:
     """Return Chebyshev nodes around the calibrated pretension, shape (N_NODES,), MPa.
 
-    The node that is closest to the calibrated pretension is moved to the calibrated pretension.
+    The nodes are stretched so that the first and the last of them lie at the ends of the range. The node that is
+    closest to the calibrated pretension is moved to the calibrated pretension.
 
     Args:
         calibrated: The calibrated pretension, MPa.
@@ -129,7 +139,8 @@ def _nodes(calibrated: float, lower: float, upper: float) -> Array:
     high = min(upper, calibrated + MAX_PRETENSION_CHANGE_MPa)
     angle = np.pi * (np.arange(N_NODES) + 0.5) / N_NODES
     nodes = 0.5 * (low + high) - 0.5 * (high - low) * np.cos(angle) / np.cos(angle[0])
-    nodes[np.abs(nodes - calibrated).argmin()] = calibrated
+    closest_node = np.abs(nodes - calibrated).argmin()
+    nodes[closest_node] = calibrated
     return np.asarray(nodes)
 
 
@@ -142,13 +153,22 @@ def _with_correlations_of(network: FoldedNetwork, other: FoldedNetwork) -> Folde
     """
     if not network.n_angle:
         return other
+    # The outputs for the correlations are the `angle_columns` of the last layer and of the skip connection.
     columns = network.angle_columns
     last = network.layers.last
-    return other.with_angles(Layer(last.weight[:, columns], last.bias[columns]), network.layers.skip[:, columns])
+    angle_layer = Layer(last.weight[:, columns], last.bias[columns])
+    angle_skip = network.layers.skip[:, columns]
+    return other.with_angles(angle_layer, angle_skip)
 
 
 def _arrays(network: FoldedNetwork) -> list[np.ndarray]:
-    """Return the weights of a network in the order of `Pretensions`."""
+    """Return the weights of a network as single-precision arrays, in the order of `Pretensions`.
+
+    The order is: weight and bias of each hidden layer, the skip connection, and bias and weight of the last layer.
+
+    Args:
+        network: The network.
+    """
     layers = network.layers
     arrays: list[Array] = []
     for layer in layers.hidden:
@@ -158,22 +178,29 @@ def _arrays(network: FoldedNetwork) -> list[np.ndarray]:
 
 
 def _constants(network: FoldedNetwork) -> list[str]:
-    """Return the names of the constants of the ONNX graph that contain the weights, in the order of `_arrays`."""
+    """Return the names of the constants of the ONNX graph that contain the weights, in the order of `_arrays`.
+
+    The constants are recognised by their values, because the names depend on how the graph is written.
+
+    Args:
+        network: The network.
+    """
     graph = onnx.load_from_string(write_graph(network, {})).graph
-    constants = [(constant.name, numpy_helper.to_array(constant)) for constant in graph.initializer]
+    constants = {str(constant.name): numpy_helper.to_array(constant) for constant in graph.initializer}
 
-    def name_of(array: Array) -> str:
-        """Return the name of the first constant that is equal to an array."""
-        return next(str(name) for name, values in constants if np.array_equal(values, array))
+    names = []
+    for array in _arrays(network):
+        equal_constants = (name for name, values in constants.items() if np.array_equal(values, array))
+        names.append(next(equal_constants))
+    return names
 
-    return [name_of(array) for array in _arrays(network)]
 
+def _lasting_std_MPa(result: CalibrationResult) -> float:
+    """Compute the standard deviation of the followed pretension that no number of touches reduces, MPa.
 
-def _floor(result: CalibrationResult) -> float:
-    """Compute the standard deviation that the estimated pretension still has after very many touches, MPa.
-
-    The service estimates the pretension that explains the touches best together with the other calibrated parameters.
-    Errors of these parameters cause an error of the estimated pretension even if the film has not changed.
+    The service estimates the pretension from the misfits of touches, by least squares. It takes all other parameters of
+    the film from the calibration. Their errors therefore cause an error of the pretension that remains after any number
+    of touches.
 
     Args:
         result: The calibration.
@@ -181,9 +208,13 @@ def _floor(result: CalibrationResult) -> float:
     prior = result.problem.prior
     pretension = prior.index("pretension")
     misfit_jacobian = result.sensitivity.misfit_jacobian
-    pretension_slope = misfit_jacobian[:, :, pretension]
-    # Derivative of the least-squares estimate of the pretension with respect to each unknown p: a sum over the misfits
-    # k of all touches n, divided by the sum for the pretension itself.
-    weights = np.einsum("nk,nkp->p", pretension_slope, misfit_jacobian) / (pretension_slope**2).sum()
-    relative_variance = weights @ result.posterior.joint @ weights
-    return float(np.sqrt(relative_variance) * prior.std[pretension])
+    pretension_jacobian = misfit_jacobian[:, :, pretension]  # shape (n_touch, n_misfit)
+
+    # Error of the least-squares estimate of the pretension for a unit error of each unknown p. The sums are over the
+    # touches n and the misfits k of a touch.
+    projection = np.einsum("nk,nkp->p", pretension_jacobian, misfit_jacobian)
+    error_per_unknown = projection / (pretension_jacobian**2).sum()
+
+    # The unknowns are in units of the standard deviations of the prior, and so is this variance.
+    scaled_variance = error_per_unknown @ result.posterior.joint @ error_per_unknown
+    return float(np.sqrt(scaled_variance) * prior.std[pretension])

@@ -2,13 +2,13 @@
 
 The film may have imperfections (modes), a discrepancy of some size, and traces that are missing in the sensor file. The
 session may have nuisances, and the stated forces may scatter. Each combination of these effects is a hypothesis. Traces
-are only combined with modes and a discrepancy. The presses determine the probability of each hypothesis by the evidence
-of a linear model with Gaussian noise (MacKay 1992). The estimate of the film is the mixture of the estimates of all
-hypotheses.
+are only combined with modes and a discrepancy. The probability of each hypothesis follows from the evidence of the
+presses for a linear model with Gaussian noise (MacKay 1992). The estimate of the film is the mixture of the estimates
+of all hypotheses.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
@@ -69,14 +69,17 @@ class Hypothesis:
         Returns:
             Shape (n_unknown, n_unknown). It is zero for the parameters of the film.
         """
-        electrode_count = len(layout.electrode_names)
-        # The coefficients of one term are correlated, because part of a discrepancy is common to all electrodes.
-        electrode_covariance = np.eye(electrode_count) + COMMON**2
+        # Modes, traces and nuisances are independent.
         variance = np.zeros(layout.count)
         variance[layout.modes] = self.modes**2
         variance[layout.traces] = self.traces**2
         variance[layout.nuisances] = np.square(self.nuisance_stds)
         covariance = np.diag(variance)
+
+        # The coefficients of one term of the discrepancy are correlated, because part of a discrepancy is common to all
+        # electrodes. Different terms are independent, so their covariance has one equal block for each term.
+        electrode_count = len(layout.electrode_names)
+        electrode_covariance = np.eye(electrode_count) + COMMON**2
         term_covariance = np.kron(np.eye(term_count()), electrode_covariance)
         covariance[layout.terms, layout.terms] = self.discrepancy**2 * term_covariance
         return covariance
@@ -88,12 +91,12 @@ class Hypothesis:
             effect: "modes", "discrepancy", "traces", "force_scatter", or the name of a nuisance.
         """
         nuisance_names = [nuisance.name for nuisance in NUISANCES]
-        sizes = dict(zip(nuisance_names, self.nuisance_stds, strict=True))
-        sizes["modes"] = self.modes
-        sizes["discrepancy"] = self.discrepancy
-        sizes["traces"] = self.traces
-        sizes["force_scatter"] = self.force_scatter
-        return sizes[effect] > 0.0
+        size_of_effect = dict(zip(nuisance_names, self.nuisance_stds, strict=True))
+        size_of_effect["modes"] = self.modes
+        size_of_effect["discrepancy"] = self.discrepancy
+        size_of_effect["traces"] = self.traces
+        size_of_effect["force_scatter"] = self.force_scatter
+        return size_of_effect[effect] > 0.0
 
 
 def hypotheses() -> Iterator[Hypothesis]:
@@ -103,6 +106,7 @@ def hypotheses() -> Iterator[Hypothesis]:
     modes always has a discrepancy as well, because the modes are computed to first order and never explain the charges
     completely. The last hypotheses have traces, together with modes and each size of the discrepancy.
     """
+    # Each effect has several possible sizes. A combination contains one pair (size, probability) of each effect.
     nuisance_stds_and_probabilities = [nuisance.probabilities for nuisance in NUISANCES]
     combinations = product(
         MODE_SIZES.items(), DISCREPANCY_SIZES.items(), *nuisance_stds_and_probabilities, FORCE_SCATTERS.items()
@@ -204,17 +208,23 @@ class LinearModel(NamedTuple):
             Change of the mean by the presses, shape (n_unknown,), and covariance after the presses, shape (n_unknown,
             n_unknown). The mean of unknowns without a variance before the presses does not change.
         """
+        # The solution is in units of the root L of the prior covariance L L': the change of the mean is -L s, and the
+        # covariance is L P^-1 L' with the precision P.
         solution = self._solve(prior_covariance)
         active = solution.active
-        mean = np.zeros(len(active))
-        mean[active] = -solution.prior_root @ solution.step
+        mean_change = np.zeros(len(active))
+        mean_change[active] = -solution.prior_root @ solution.step
         covariance = np.zeros_like(prior_covariance)
         whitened_covariance = cho_solve((solution.precision_factor, True), solution.prior_root.T)
         covariance[np.ix_(active, active)] = solution.prior_root @ whitened_covariance
-        return mean, covariance
+        return mean_change, covariance
 
     def _solve(self, prior_covariance: Array) -> "_Solution":
-        """Solve the normal equations of the unknowns that have a variance before the presses."""
+        """Solve the normal equations of the unknowns that have a variance before the presses.
+
+        Args:
+            prior_covariance: Covariance of the unknowns before the presses, shape (n_unknown, n_unknown).
+        """
         active = np.diag(prior_covariance) > 0.0
         active_block = np.ix_(active, active)
         prior_root = np.asarray(np.linalg.cholesky(prior_covariance[active_block]), np.float64)
@@ -272,16 +282,19 @@ def mix_hypotheses(
 ) -> Mixture:
     """Compute the probability of each hypothesis, and return the mixture of their estimates.
 
+    Hypotheses with a probability below `NEGLIGIBLE_PROBABILITY` are left out of the mixture.
+
     Args:
         models: Linear model of the residuals for each value of `Hypothesis.force_scatter`.
         prior_covariance: Function that returns the covariance of the unknowns before the presses for a hypothesis.
         considered: The hypotheses; by default all.
     """
     considered = list(considered or hypotheses())
-    log_weights = []
+    log_weights = []  # logarithms of evidence times prior probability
     for hypothesis in considered:
         model = models[hypothesis.force_scatter]
-        log_weights.append(model.log_evidence(prior_covariance(hypothesis)) + np.log(hypothesis.prior_probability))
+        log_hypothesis_evidence = model.log_evidence(prior_covariance(hypothesis))
+        log_weights.append(log_hypothesis_evidence + np.log(hypothesis.prior_probability))
     log_evidence = float(logsumexp(log_weights))
     probabilities = np.exp(np.array(log_weights) - log_evidence)
 
@@ -290,18 +303,29 @@ def mix_hypotheses(
     covariances = []
     for index in relevant:
         hypothesis = considered[index]
-        hypothesis_mean, hypothesis_covariance = models[hypothesis.force_scatter].posterior(
-            prior_covariance(hypothesis)
-        )
+        model = models[hypothesis.force_scatter]
+        hypothesis_mean, hypothesis_covariance = model.posterior(prior_covariance(hypothesis))
         means.append(hypothesis_mean)
         covariances.append(hypothesis_covariance)
 
-    # Law of total covariance: mean of the covariances of the hypotheses plus covariance of their means
-    mean = np.einsum("h,hu->u", probabilities[relevant], means)
+    mean, covariance = _mixture_moments(probabilities[relevant], means, covariances)
+    probability_of_hypothesis = dict(zip(considered, probabilities.tolist(), strict=True))
+    return Mixture(mean, covariance, probability_of_hypothesis, log_evidence)
+
+
+def _mixture_moments(probabilities: Array, means: Sequence[Array], covariances: Sequence[Array]) -> tuple[Array, Array]:
+    """Return the mean and the covariance of a mixture of normal distributions.
+
+    By the law of total covariance, the covariance is the mean of the covariances plus the covariance of the means.
+
+    Args:
+        probabilities: Probability of each distribution, shape (n,).
+        means: Mean of each distribution, shape (n_unknown,).
+        covariances: Covariance of each distribution, shape (n_unknown, n_unknown).
+    """
+    mean = np.einsum("h,hu->u", probabilities, means)  # sum over the distributions h
     covariance = np.zeros((len(mean), len(mean)))
-    for probability, hypothesis_mean, hypothesis_covariance in zip(
-        probabilities[relevant], means, covariances, strict=True
-    ):
-        difference = hypothesis_mean - mean
-        covariance += probability * (hypothesis_covariance + np.outer(difference, difference))
-    return Mixture(mean, covariance, dict(zip(considered, probabilities.tolist(), strict=True)), log_evidence)
+    for probability, component_mean, component_covariance in zip(probabilities, means, covariances, strict=True):
+        difference = component_mean - mean
+        covariance += probability * (component_covariance + np.outer(difference, difference))
+    return mean, covariance

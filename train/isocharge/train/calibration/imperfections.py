@@ -1,7 +1,7 @@
 """Effects of traces and of an uneven tension on the charges of a film.
 
 A trace that the sensor file does not describe collects charge beyond the pad of its electrode. Such a trace is modelled
-by several lines of unknown width, which lead from the edge of the pad to the rim of the film. To second order, an
+by several lines of unknown width. The lines lead from the edge of the pad to the rim of the film. To second order, an
 uneven tension acts like a smaller even tension.
 """
 
@@ -57,9 +57,11 @@ class ModeCharges(NamedTuple):
 
 
 def trace_lines(sensor: Sensor) -> Array:
-    """Return both ends of the lines along which traces may lie.
+    """Return both ends of the straight lines along which traces may lie.
 
-    A line begins at the edge of a pad, which is treated as a circle of the same area, and ends near the rim.
+    A line begins at the edge of a pad, which is treated as a circle of the same area. The line ends near the rim, on a
+    circle whose radius is `TRACE_END` times that of the film. The lines of a pad have the angles `TRACE_ANGLES` to the
+    direction from the centre of the film to the pad.
 
     Args:
         sensor: Sensor with the pads.
@@ -74,15 +76,17 @@ def trace_lines(sensor: Sensor) -> Array:
     pad_radius = np.sqrt(np.array(areas) / np.pi)[:, None]
     direction = np.exp(1j * (np.angle(centre) + np.deg2rad(TRACE_ANGLES)))
 
-    # Distance from the centre of the pad to the circle with `end_radius`, along the direction of the line
+    # Distance s from the centre c of the pad to the circle with `end_radius`, along the direction d of the line: the
+    # positive solution of |c + s d| = end_radius. The projection is the scalar product of c and d.
     projection = (centre.conj() * direction).real
     distance_to_end = np.sqrt(projection**2 + end_radius**2 - np.abs(centre) ** 2) - projection
+    # Start and end of each line, shape (n_electrode, n_line, 2)
     ends = centre[:, :, None] + np.stack([pad_radius * direction, distance_to_end * direction], axis=2)
     return np.stack([ends.real, ends.imag], axis=3)
 
 
 def trace_charges(forward_map: ForwardMap, lines: Array, contact: Array) -> Array:
-    """Compute the charge that a trace of the width `TRACE_STD_MM` collects along each line.
+    """Compute the charge that each line would collect if it were a metal trace of the width `TRACE_STD_MM`.
 
     Args:
         forward_map: Forward map of the film.
@@ -90,7 +94,7 @@ def trace_charges(forward_map: ForwardMap, lines: Array, contact: Array) -> Arra
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
     Returns:
-        Shape (n, n_electrode, n_electrode * n_line), pC. A line adds charge to its own electrode only.
+        Charges, shape (n, n_electrode, n_electrode * n_line), pC. A line adds charge to its own electrode only.
     """
     n_electrode = len(lines)
     points = ReadoutPoints.along(forward_map.sensor, lines)
@@ -135,16 +139,17 @@ def tension_unevenness(pretension: float, tension_stds: Array, coefficients: Arr
     relative_stds = tension_stds / max(pretension, MIN_TENSION)
     squared_ratio = float(((relative_stds * coefficients) ** 2).sum())  # (e / T)^2
     root = np.sqrt(1.0 - min(squared_ratio, LARGEST_SQUARED_RATIO))
-    if squared_ratio >= LARGEST_SQUARED_RATIO:
-        return 1.0 - root, np.zeros_like(coefficients)
-    return 1.0 - root, relative_stds**2 * coefficients / root
+    unevenness = 1.0 - root
+    if squared_ratio >= LARGEST_SQUARED_RATIO:  # the unevenness is limited here and no longer changes
+        return unevenness, np.zeros_like(coefficients)
+    return unevenness, relative_stds**2 * coefficients / root
 
 
 def log_unevenness(log_tension_derivative: Array) -> Array:
     """Compute the derivative of ln Q with respect to the unevenness of the tension.
 
-    The derivative is x (1 - (1 - x / 2)^SLACKENING) with x = -d ln Q / d ln T. The effect of the tension is smaller if
-    the press itself stretches the film.
+    The derivative is x (1 - (1 - x / 2)^SLACKENING), where x = -d ln Q / d ln T. The effect of the tension is smaller
+    if the press itself stretches the film.
 
     Args:
         log_tension_derivative: d ln Q / d ln T, shape (n, n_electrode).

@@ -185,6 +185,9 @@ def without_nuisances(data: PressData, values: Sequence[float] | Array) -> Press
 def nuisance_derivatives(data: PressData, pretension_derivative: Array) -> Array:
     """Compute the derivatives of the residuals with respect to the nuisances.
 
+    A nuisance adds charge, or changes the pretension, in proportion to its value. The effects of a value of 1 are
+    therefore the derivatives.
+
     Args:
         data: The presses as they were measured.
         pretension_derivative: Derivatives of the residuals with respect to the pretension, shape (n, n_electrode + 3),
@@ -193,10 +196,11 @@ def nuisance_derivatives(data: PressData, pretension_derivative: Array) -> Array
     Returns:
         Shape (n, n_electrode + 3, n_nuisance).
     """
-    rig_rows = np.zeros((len(data), 3))
-    columns = []
+    rig_derivative = np.zeros((len(data), 3))  # nuisances do not change the contact that the rig measured
+    derivatives = []
     for nuisance in NUISANCES:
-        charge_rows = data.weight * nuisance.charge_error(data, 1.0)
-        tension_rows = pretension_derivative * nuisance.tension_change(data, 1.0)[:, None]
-        columns.append(np.column_stack([charge_rows, rig_rows]) + tension_rows)
-    return np.stack(columns, axis=2)
+        charge_derivative = data.weight * nuisance.charge_error(data, 1.0)
+        by_charge = np.column_stack([charge_derivative, rig_derivative])
+        by_tension = pretension_derivative * nuisance.tension_change(data, 1.0)[:, None]
+        derivatives.append(by_charge + by_tension)
+    return np.stack(derivatives, axis=2)

@@ -24,9 +24,19 @@ FITTED = "#3a7ca5"
 NEIGHBOURS = 12
 """Number of contacts over which the map of the error is smoothed, since neighbours have different forces."""
 
+MAX_DRAWN_RESIDUAL = 10.0
+"""Height of the largest bar of a residual, relative to the expected size of the residual."""
+
+MAX_TICKS = 20
+"""Approximate number of labelled presses on the axis of the residuals."""
+
 
 def calibration_picture(result: CalibrationResult) -> Figure:
-    """Draw maps of the remaining error, the quantities in units of their prior, and the residuals of the presses."""
+    """Draw maps of the remaining error, the quantities in units of their prior, and the residuals of the presses.
+
+    Args:
+        result: The calibration.
+    """
     figure = new_figure(11.0, 8.8)
     (before_axes, after_axes), (quantity_axes, residual_axes) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
     if result.moved:
@@ -37,21 +47,33 @@ def calibration_picture(result: CalibrationResult) -> Figure:
         after_title = f"after {len(result.presses)} presses"
     _draw_error(before_axes, result, result.error_left_before, before_title)
     shades = _draw_error(after_axes, result, result.error_left, after_title)
-    contact = result.posterior.contact
-    bad = result.posterior.bad
-    after_axes.plot(*contact[~bad, :2].T, "o", color="white", mec=INK, ms=6, label="presses")
-    if bad.any():
-        after_axes.plot(*contact[bad, :2].T, "X", color=FELT, mec=INK, ms=9, label="left out")
-    if len(contact):
-        after_axes.legend(loc="upper right", fontsize=8)
+    _draw_presses(after_axes, result)
     label = "position error by the film (rms), mm"
     figure.colorbar(
         shades, ax=[before_axes, after_axes], label=label, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g"
     )
+
     _draw_quantities(quantity_axes, result)
     _draw_residuals(residual_axes, result)
-    figure.suptitle(f"calibration of {result.film[0].name}", fontsize=13)
+    sensor, _ = result.film
+    figure.suptitle(f"calibration of {sensor.name}", fontsize=13)
     return figure
+
+
+def _draw_presses(axes: Any, result: CalibrationResult) -> None:
+    """Draw the positions of the presses, and mark those that were left out as bad.
+
+    Args:
+        axes: Axes of matplotlib.
+        result: The calibration.
+    """
+    x, y, _ = result.posterior.contact.T
+    is_bad = result.posterior.bad
+    axes.plot(x[~is_bad], y[~is_bad], "o", color="white", mec=INK, ms=6, label="presses")
+    if is_bad.any():
+        axes.plot(x[is_bad], y[is_bad], "X", color=FELT, mec=INK, ms=9, label="left out")
+    if x.size:
+        axes.legend(loc="upper right", fontsize=8)
 
 
 def _draw_error(axes: Any, result: CalibrationResult, error: ContactError, title: str) -> Any:
@@ -68,9 +90,10 @@ def _draw_error(axes: Any, result: CalibrationResult, error: ContactError, title
     """
     # Neighbouring contacts have different forces, so that the map shows the rms error of several neighbours.
     x, y, _ = result.sensitivity.contact.T
-    distance = np.hypot(x[:, None] - x, y[:, None] - y)
+    distance = np.hypot(x[:, None] - x, y[:, None] - y)  # between all pairs of contacts, shape (n, n)
     nearest = np.argsort(distance, axis=1)[:, :NEIGHBOURS]
     rms_error = np.sqrt((error.each_mm[nearest] ** 2).mean(axis=1))
+
     levels = np.geomspace(*LEVELS_MM, 25)
     shades = axes.tricontourf(
         Triangulation(x, y), np.clip(rms_error, *LEVELS_MM), levels, norm=LogNorm(), cmap="viridis"
@@ -90,19 +113,27 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
         axes: Axes of matplotlib.
         result: The calibration.
     """
-    quantities = list(result.quantities.values())[::-1]
+    quantities = list(result.quantities.values())[::-1]  # rows are numbered from the bottom to the top
     scaled_change = (result.posterior.parameters - result.problem.before.parameters) / result.problem.prior.std
     centre = np.array([quantity.weights @ scaled_change / quantity.before_std for quantity in quantities])
     half_width = np.array([NORMAL_95 * quantity.std / quantity.before_std for quantity in quantities])
     row = np.arange(len(quantities))
     is_identified = np.array([quantity.identified for quantity in quantities])
+
+    # The interval before the presses is from -2 to 2 standard deviations.
     axes.barh(row, 4.0, left=-2.0, color=ASSUMED, height=0.72, label="before the presses")
-    for chosen, colour, label in (
+    for is_drawn, colour, label in (
         (is_identified, FITTED, "identified"),
         (~is_identified, INK, "not identified"),
     ):
         axes.errorbar(
-            centre[chosen], row[chosen], xerr=half_width[chosen], fmt="w|", ecolor=colour, elinewidth=5, label=label
+            centre[is_drawn],
+            row[is_drawn],
+            xerr=half_width[is_drawn],
+            fmt="w|",
+            ecolor=colour,
+            elinewidth=5,
+            label=label,
         )
     for index, quantity in enumerate(quantities):
         value_text = f"{quantity.value:.3g} ± {quantity.std:.2g}"
@@ -119,7 +150,9 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
 
 
 def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
-    """Draw the residual of each press as a bar, relative to its expected size. Excluded presses are red.
+    """Draw the residual of each press as a bar, relative to its expected size.
+
+    Residuals above `MAX_DRAWN_RESIDUAL` are drawn with this height. Presses that were left out are red.
 
     Args:
         axes: Axes of matplotlib.
@@ -127,11 +160,12 @@ def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
     """
     posterior = result.posterior
     lines = result.presses.lines
-    residual = np.sqrt(posterior.chi2 / np.maximum(posterior.degrees_of_freedom, 1.0))
+    relative_residual = np.sqrt(posterior.chi2 / np.maximum(posterior.degrees_of_freedom, 1.0))
     colours = [FELT if bad else FITTED for bad in posterior.bad]
-    axes.bar(np.arange(len(lines)), np.minimum(residual, 10.0), color=colours)
-    axes.axhline(1.0, color=INK, lw=0.8, ls="--")
-    ticks = np.arange(0, len(lines), max(1, len(lines) // 20))
+    axes.bar(np.arange(len(lines)), np.minimum(relative_residual, MAX_DRAWN_RESIDUAL), color=colours)
+    axes.axhline(1.0, color=INK, lw=0.8, ls="--")  # the expected size
+    tick_distance = max(1, len(lines) // MAX_TICKS)
+    ticks = np.arange(0, len(lines), tick_distance)
     axes.set(
         title="residuals of the presses",
         xlabel=f"{result.presses.row_noun} of the press",

@@ -53,6 +53,9 @@ class PressData:
     def of(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
         """Return the data of measured presses.
 
+        A missing charge has the weight 0. A missing coordinate of a contact is replaced by the centre of the domain,
+        with a standard deviation as large as the domain.
+
         Args:
             presses: The presses.
             noise: Noise of the charges.
@@ -65,13 +68,15 @@ class PressData:
         rig_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
         unknown_std = [domain.radius, domain.radius, UNKNOWN_FORCE_STD]
         temperature_C = temperatures(presses)
+        # Time from the first to the last press, from -0.5 to 0.5; a single press has the time 0.
+        session_time = np.linspace(-0.5, 0.5, len(presses)) if len(presses) > 1 else np.zeros(1)
         return cls(
             charge=charge,
             weight=np.where(has_charge, 1.0 / noise.sigma(charge), 0.0),
             contact=np.where(has_coordinate, log_contact, domain.centre),
             contact_weight=1.0 / np.where(has_coordinate, rig_std, unknown_std),
             measured=np.column_stack([has_charge, has_coordinate]),
-            session_time=np.linspace(-0.5, 0.5, len(presses)) if len(presses) > 1 else np.zeros(1),
+            session_time=session_time,
             warming_K=temperature_C - temperature_C.mean(),
             film_excess_K=_film_excess(presses),
             tension_change=np.zeros(len(presses)),
@@ -121,6 +126,9 @@ class PressData:
 
     def pretension_nodes(self, pretension: float, bounds: tuple[float, float]) -> tuple[Array, Array]:
         """Return the pretensions at which charges are computed, and the weights for the interpolation between them.
+
+        The pretensions are Chebyshev nodes in the range that the presses cover, with weights for Lagrange's
+        interpolation. If all presses have the same pretension, this pretension is the only node.
 
         Args:
             pretension: Pretension of the film, MPa.
@@ -172,7 +180,7 @@ def temperatures(presses: MeasuredPresses) -> Array:
 
 
 def _film_excess(presses: MeasuredPresses) -> Array:
-    """Return the temperature difference between film and ring minus its mean over the presses, shape (n,), K."""
+    """Return the temperature differences between film and ring, minus their mean over the presses, shape (n,), K."""
     if presses.film_temperature_C is None or not presses.knows_film_temperature:
         return np.zeros(len(presses))
     excess = _without_gaps(presses.film_temperature_C) - temperatures(presses)

@@ -3,9 +3,9 @@
 The file `presses.csv` contains the measured presses, and is replaced as a whole after each press. The file is therefore
 complete at any time, so that an interrupted session can be continued.
 
-The file `.presses.csv.session.json` contains the sensor and the probe of the session. It prevents a session from being
-continued with another sensor or probe. The process that takes presses locks this file, so that no other process writes
-to the file of presses.
+The file `.presses.csv.session.json` contains the sensor and the probe of the session. The content of this file prevents
+a session from being continued with another sensor or probe. The process that takes presses locks this file, so that no
+other process writes to the file of presses.
 """
 
 import json
@@ -59,6 +59,9 @@ class PressFile:
     def write(self, presses: MeasuredPresses) -> None:
         """Replace the file by one with these presses, or delete it if there are none.
 
+        Args:
+            presses: All presses of the session.
+
         Raises:
             OutputError: If the file cannot be written. The previous file then remains.
         """
@@ -71,7 +74,10 @@ class PressFile:
 
 @contextmanager
 def open_press_file(path: Path, sensor: Sensor, probe: Probe, *, fresh: bool = False) -> Iterator[PressFile]:
-    """Open a file of presses for one session.
+    """Open a file of presses for one session, and lock it until the `with` block ends.
+
+    A hidden file beside the presses states the sensor and the probe, and carries the lock. The hidden file is removed
+    if no presses were written.
 
     Args:
         path: The file, in the format CSV, or Parquet if its name ends in `.parquet`. It may contain the presses of an
@@ -88,14 +94,16 @@ def open_press_file(path: Path, sensor: Sensor, probe: Probe, *, fresh: bool = F
     path = Path(path)
     if path.exists() and not path.is_file():
         raise OutputError(f"{path}: expected a file for the presses, got a folder or a device; choose another output")
-    subject = json.loads(json.dumps({"sensor": sensor_to_dict(sensor), "probe": probe.notation}))
-    content = json.dumps(subject).encode()
+    content = json.dumps({"sensor": sensor_to_dict(sensor), "probe": probe.notation}).encode()
+    subject = json.loads(content)  # with the types of JSON, for the comparison with the file of an earlier session
     session_path = path.with_name(f".{path.name}.session.json")
+
     with as_output_errors(path):
         if not session_path.exists():
             write_whole(session_path, content)
         with locked(session_path):
             try:
+                # The presses of an earlier session are kept if they were made on the same sensor with the same probe.
                 if fresh:
                     path.unlink(missing_ok=True)
                 if path.exists():

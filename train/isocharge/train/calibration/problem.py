@@ -119,7 +119,9 @@ class FilmEstimate:
         return self.joint if self.coefficients.size else self.covariance
 
     def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> "FilmEstimate":
-        """Return the estimate for a later time. The covariance includes the drift that the film may have had.
+        """Return the estimate for a later time, with the drift that the film may have had in its covariance.
+
+        The drift of each parameter is independent. If both temperatures are known, only creep changes the pretension.
 
         Args:
             prior: Distribution of the films.
@@ -151,6 +153,7 @@ class FilmEstimate:
         """
         if self.warming is None:
             return self
+
         pretension = prior.index("pretension")
         change_K = at_C - self.warming.at_C
         parameters = self.parameters.copy()
@@ -161,6 +164,7 @@ class FilmEstimate:
                 f"at {at_C:g} C the pretension would be {parameters[pretension]:.2f} MPa; expected {lower:g} to "
                 f"{upper:g} MPa: a temperature nearer to that of the presses"
             )
+
         # The new pretension is the sum of the old pretension and the change. The covariances of this sum replace first
         # the row and then the column of the pretension.
         scaled_change = change_K / prior.std[pretension]
@@ -169,6 +173,7 @@ class FilmEstimate:
         covariance[pretension] += scaled_change * warming_covariance
         warming_covariance[pretension] += scaled_change * self.warming.std**2
         covariance[:, pretension] += scaled_change * warming_covariance
+
         n_parameter = len(parameters)
         return FilmEstimate(
             parameters=parameters,
@@ -210,7 +215,7 @@ class CalibrationProblem:
 
     @classmethod
     def of(cls, sensor: Sensor, probe: Probe, models: Path | None = None) -> "CalibrationProblem":
-        """Create the problem of a sensor and a probe with the installed network that fits them.
+        """Create the problem of a sensor and a probe, and find the installed network that fits them.
 
         Args:
             sensor: The sensor; see `films_for`.
@@ -251,10 +256,10 @@ class CalibrationProblem:
         *,
         release: bool = True,
     ) -> Fitted:
-        """Return the network of a film.
+        """Return the network of a film, adapted to the charges of this film and sensor.
 
-        The network is adapted to the factor on the charges, and to the difference between the electrodes of the sensor
-        and those of the network for all films.
+        The charges of the film are those of its parameters times a given factor. If the electrodes of the sensor differ
+        from those of the network for all films, the ratio of their charges is a further factor.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -269,8 +274,13 @@ class CalibrationProblem:
         network_map = self.films.forward_map(parameters)
 
         def charge_factor(contact: Array) -> Array:
-            """Return the ratio of the film's charges to those of the training, shape (n, n_electrode)."""
-            if self.prior is self.films.prior:
+            """Return the ratio of the film's charges to those of the training, shape (n, n_electrode).
+
+            Args:
+                contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            """
+            has_same_electrodes = self.prior is self.films.prior
+            if has_same_electrodes:
                 return factor(contact)
             electrode_factor = sensor_map.charges(contact) / network_map.charges(contact)
             return np.asarray(factor(contact) * electrode_factor)
@@ -301,14 +311,16 @@ class CalibrationProblem:
 
     @cached_property
     def before(self) -> FilmEstimate:
-        """Estimate of the film before the presses."""
+        """Estimate of the film before the presses: the earlier calibration, or the film of the sensor file."""
         if self.earlier:
             return self.earlier
         parameters = self.prior.parameters_of(self.sensor, self.probe)
         pretension = self.prior.index("pretension")
-        if parameters[pretension] <= 0.0:  # the sensor file gives no pretension, which does not mean a slack film
+        # A sensor file without a pretension does not mean a slack film.
+        if parameters[pretension] <= 0.0:
             parameters[pretension] = self.prior.mean[pretension]
-        return FilmEstimate(parameters, np.eye(parameters.size))
+        prior_covariance = np.eye(parameters.size)  # in units of the prior standard deviations
+        return FilmEstimate(parameters, prior_covariance)
 
     @cached_property
     def expected(self) -> FilmEstimate:
@@ -327,7 +339,7 @@ class CalibrationProblem:
 def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> FilmsModel:
     """Find the network that was trained for all films with the electrodes of a sensor.
 
-    The name of the sensor does not matter.
+    The networks are tried in order until one fits. The name of the sensor does not matter.
 
     Args:
         sensor: The sensor. Its pads, the radius of its film and its readout must be those for which the network was
@@ -350,6 +362,7 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
         except SensorError as error:
             reasons.append(f"{folder.parent.name}: {error}")
             continue
+
         lower, upper = films.prior.bounds
         is_outside = (parameters < lower) | (parameters > upper)
         if not is_outside.any():

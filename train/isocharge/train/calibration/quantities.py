@@ -83,7 +83,9 @@ class _Definition(NamedTuple):
 
 
 def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
-    """Return the quantities of a film by name.
+    """Return the quantities of a film by name, each with its standard deviations before and after the presses.
+
+    A quantity is a weighted sum of the parameters.
 
     Args:
         prior: The films; their standard deviations are those before the presses.
@@ -91,6 +93,7 @@ def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
     """
     table = {}
     for name, definition in _definitions(prior).items():
+        # Weights of the parameters in units of their prior standard deviations, as the covariances are.
         scaled_weights = definition.weights * prior.std
         table[name] = Quantity(
             name,
@@ -106,16 +109,22 @@ def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
 def _definitions(prior: FilmPrior) -> dict[str, _Definition]:
     """Return the definitions of all quantities by name.
 
-    Young's modulus, thickness, piezoelectric coefficients and gains are logarithms among the parameters. The logarithm
-    of a product is the sum of theirs.
+    The parameters contain the logarithms of Young's modulus, of the thickness, of the piezoelectric coefficients and of
+    the gains. The logarithm of a product is the sum of these logarithms.
+
+    Args:
+        prior: The films, with the names of their parameters and electrodes.
     """
+    # A quantity is defined by the weights of the parameters. The weights of a parameter alone are a unit vector.
     unit = dict(zip(prior.names, np.eye(len(prior.names)), strict=True))
     gains = {name: unit[f"gain {name}"] for name in prior.sensor.electrode_names}
     mean_gain = sum(gains.values(), np.zeros(len(unit))) / len(gains)
     piezo_times_gain = 0.5 * (unit["d31"] + unit["d32"]) + mean_gain
     # Without pretension, the charge of a press is proportional to E^(1/3) h^(-2/3) sqrt(d31 d32).
     slack_response = (unit["young"] - 2.0 * unit["thickness"]) / 3.0 + piezo_times_gain
-    described = prior.sensor.calibration
+    # The parameters of shift and rotation are differences from those in the sensor file.
+    file_calibration = prior.sensor.calibration
+    x_shift_mm, y_shift_mm = file_calibration.shift
     degrees_per_rad = float(np.rad2deg(1.0))
     definitions = {
         "pretension_MPa": _Definition("pretension", unit["pretension"]),
@@ -127,12 +136,12 @@ def _definitions(prior: FilmPrior) -> dict[str, _Definition]:
         ),
         "stiffness_percent": _relative("Young's modulus times thickness", unit["young"] + unit["thickness"]),
         "anisotropy_percent": _relative("ratio of d31 to d32", unit["d31"] - unit["d32"]),
-        "shift_x_mm": _Definition("shift of the electrodes along x", unit["shift_x"], described.shift[0]),
-        "shift_y_mm": _Definition("shift of the electrodes along y", unit["shift_y"], described.shift[1]),
+        "shift_x_mm": _Definition("shift of the electrodes along x", unit["shift_x"], x_shift_mm),
+        "shift_y_mm": _Definition("shift of the electrodes along y", unit["shift_y"], y_shift_mm),
         "rotation_deg": _Definition(
             "rotation of the electrodes",
             degrees_per_rad * unit["rotation"],
-            degrees_per_rad * described.rotation,
+            degrees_per_rad * file_calibration.rotation,
         ),
         "probe_radius_mm": _Definition("radius of the probe", unit["probe_radius"], prior.probe.radius),
     }
@@ -148,7 +157,7 @@ def _definitions(prior: FilmPrior) -> dict[str, _Definition]:
 
 
 def _relative(meaning: str, log_weights: Array) -> _Definition:
-    """Return the definition of a quantity whose unit is percent of the value in the description.
+    """Return the definition of a quantity whose unit is percent of the value in the sensor file.
 
     Args:
         meaning: Description in words.
@@ -160,6 +169,8 @@ def _relative(meaning: str, log_weights: Array) -> _Definition:
 def summarise(table: Mapping[str, Quantity]) -> tuple[str, ...]:
     """Return sentences about the quantities that the presses identify, and about those that they do not identify.
 
+    If single parameters are not identified, a further sentence states how well their combination is known.
+
     Args:
         table: The quantities by name, as `quantities` returns them.
     """
@@ -168,21 +179,23 @@ def summarise(table: Mapping[str, Quantity]) -> tuple[str, ...]:
     sentences = []
     if identified:
         shown = identified[:SHOWN_IN_SENTENCE]
-        listed = ", ".join(f"{quantity.name} {quantity.value:.3g} +- {quantity.std:.2g}" for quantity in shown)
+        values_text = ", ".join(f"{quantity.name} {quantity.value:.3g} +- {quantity.std:.2g}" for quantity in shown)
         remaining_count = len(identified) - len(shown)
         if remaining_count:
-            listed += f" and {remaining_count} more, on the card"
-        sentences.append(f"The presses determine {listed}.")
+            values_text += f" and {remaining_count} more, on the card"
+        sentences.append(f"The presses determine {values_text}.")
     if unidentified:
         meanings = [quantity.meaning.removesuffix(", %").removesuffix(RELATIVE) for quantity in unidentified]
         sentences.append(
             f"These presses do not determine {', '.join(meanings)}; their values are hardly more certain than in the "
             "sensor file."
         )
-    single_parameters = [quantity.name for quantity in unidentified if quantity.name in SINGLE_PARAMETERS]
+
+    # The charge of a press can be known although the single parameters in it are not.
+    unidentified_parameters = [quantity.name for quantity in unidentified if quantity.name in SINGLE_PARAMETERS]
     response = table["response_percent"]
-    if len(single_parameters) > 1 and response.identified:
-        names = ", ".join(name.removesuffix("_percent") for name in single_parameters)
+    if len(unidentified_parameters) > 1 and response.identified:
+        names = ", ".join(name.removesuffix("_percent") for name in unidentified_parameters)
         sentences.append(
             f"{names}: only their combination, the charge of a press, is known to {response.std:.2g} %, which is what "
             "contacts need."

@@ -74,13 +74,16 @@ class CalibrationResult:
     def error_left_before(self) -> ContactError:
         """Errors of contacts before the presses, or before the estimate was moved to another temperature."""
         before = self.problem.before
-        count = len(self.posterior.joint)
+        unknown_count = len(self.posterior.joint)
+        # The estimate before the presses has the first of the unknowns, or all of them. The others are zero.
         estimated = slice(0, len(before.unknowns))
-        covariance = np.zeros((count, count))
+        covariance = np.zeros((unknown_count, unknown_count))
         covariance[estimated, estimated] = before.unknown_covariance
         if not self.moved:
             return self.sensitivity.contact_error(covariance)
-        unknowns = np.zeros(count)
+
+        # The contacts of a moved film depend on the unknowns differently, so the sensitivity is computed again.
+        unknowns = np.zeros(unknown_count)
         unknowns[estimated] = before.unknowns
         return ContactSensitivity.at(self.problem, unknowns).contact_error(covariance)
 
@@ -88,8 +91,8 @@ class CalibrationResult:
     def fitted(self) -> Fitted:
         """The network of this film, for `evaluate` and `release`.
 
-        Its standard deviations include the uncertainty of the film. If there are enough presses, its errors are
-        measured by cross-validation; see `held_out`.
+        The standard deviations of the network include the uncertainty of the film. If there are enough presses, the
+        errors of the network are measured by cross-validation; see `held_out`.
         """
         fitted = self.fitted_film(self.posterior.parameters, release=True)
         if self.held_out is None:
@@ -98,7 +101,7 @@ class CalibrationResult:
 
     @cached_property
     def held_out(self) -> HeldOutAnswers | None:
-        """Contacts estimated by cross-validation; None if there are too few presses.
+        """Contacts estimated by cross-validation; None if there are too few presses, or if the film was moved.
 
         See `cross_validate`. The contacts are computed when they are first used, which takes about as long as the
         calibration.
@@ -109,12 +112,13 @@ class CalibrationResult:
         at_C = None if warming is None else warming.at_C
 
         def network_of(film: FilmPosterior) -> Fitted:
+            """Return the network of a film that was fitted to some of the presses."""
             return self._network_of(film.unknowns, film.joint)
 
         data = PressData.of(self.presses, self.problem.noise, self.problem.charges.domain)
         if self.side_force_map is not None and self.problem.friction > 0.0:
-            coefficient = self.posterior.nuisances[FRICTION.name].value
-            data = with_friction(data, self.problem.charges, self.side_force_map, self.posterior.contact, coefficient)
+            friction = self.posterior.nuisances[FRICTION.name].value
+            data = with_friction(data, self.problem.charges, self.side_force_map, self.posterior.contact, friction)
         return cross_validate(self.problem, self.presses, data, self.posterior, network_of, at_C)
 
     @cached_property
@@ -155,14 +159,20 @@ class CalibrationResult:
         return self._network_of(unknowns, self.posterior.joint, release=release)
 
     def _network_of(self, unknowns: Array, covariance: Array, *, release: bool = False) -> Fitted:
-        """Return the network of a film, with the variances of contacts that a covariance of the film's unknowns causes.
+        """Return the network of a film, whose stated variances include the uncertainty of the film and the side forces.
 
-        The variances are linearised at the calibrated film.
+        The effects of the uncertainty are linearised at the calibrated film.
+
+        Args:
+            unknowns: Unknowns of the film, shape (n_unknown,).
+            covariance: Covariance of the unknowns, shape (n_unknown, n_unknown).
+            release: Whether the network will be released; see `CalibrationProblem.fitted`.
         """
         contact_covariance = self.sensitivity.contact_covariance(covariance)
         if self.side_forces is not None:
             contact_covariance = contact_covariance + self.side_forces.contact_covariance(self.sensitivity)
-        added_variance = AddedVariance(self.sensitivity.contact, np.einsum("nii->ni", contact_covariance))
+        contact_variance = np.einsum("nii->ni", contact_covariance)  # the diagonals, shape (n, 3)
+        added_variance = AddedVariance(self.sensitivity.contact, contact_variance)
         parameters = unknowns[self.problem.charges.layout.parameters]
         factor = partial(self.charge_factor, unknowns)
         return self.problem.fitted(parameters, added_variance, factor, release=release)
@@ -270,19 +280,23 @@ class CalibrationResult:
         factor = self.problem.charges.factor(self.posterior.unknowns, self.sensitivity.contact)
         percent = 100.0 * rms(np.log(factor))
         plan = next_presses(self.problem, PLANNED_PRESSES, self.posterior)
+        error_after_plan_mm = plan[-1].position_mm
         places = ", ".join(f"{press.force_N:.2f} N at ({press.x_mm:g}, {press.y_mm:g}) mm" for press in plan[:3])
         yield (
             f"The charges of this film differ from those of its parameters by {percent:.2g} % (root mean square), "
             f"smoothly over the film. The remaining error is {self.error_left.position_mm:.2g} mm. {PLANNED_PRESSES} "
-            f"more presses would reduce it to {plan[-1].position_mm:.2g} mm. The first of them are {places}; --next "
+            f"more presses would reduce it to {error_after_plan_mm:.2g} mm. The first of them are {places}; --next "
             "lists more."
         )
         if self.posterior.probability("traces") > PROBABLE:
             widths = self.problem.charges.trace_widths(self.posterior.unknowns, self.posterior.joint)
-            visible = [f"{name} {width:.2g} mm" for name, (width, std) in widths.items() if width > VISIBLE_TRACE * std]
+            visible_widths = [
+                f"{name} {width:.2g} mm" for name, (width, std) in widths.items() if width > VISIBLE_TRACE * std
+            ]
             yield (
                 "Most of this difference is charge that electrodes collect outside their pads, like traces to the rim "
-                f"of this width: {', '.join(visible)}. If the sensor file describes the traces, the error is smaller."
+                f"of this width: {', '.join(visible_widths)}. If the sensor file describes the traces, the error is "
+                "smaller."
             )
 
 
@@ -295,6 +309,7 @@ def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved:
         moved: Words that describe how an earlier calibration was moved to another temperature.
     """
     layout = problem.charges.layout
+    # Unknowns that the estimate does not have are zero, with a variance of zero.
     joint = np.zeros((layout.film_count, layout.film_count))
     estimated = slice(0, len(film.unknowns))
     joint[estimated, estimated] = film.unknown_covariance

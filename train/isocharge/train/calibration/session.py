@@ -1,7 +1,7 @@
 """Session in which a person or a machine makes presses one after the other, at proposed contacts.
 
 After each press, the film is fitted again, and the next press is proposed. A session has no port, no screen and no
-clock: the caller shows the proposed press, measures the charges, and passes on the answer of the person.
+clock. The caller shows the proposed press, measures the charges, and passes on the answer of the person.
 """
 
 import math
@@ -73,17 +73,18 @@ def read_answer(text: str) -> Answer:
     word = text.strip().lower()
     if word in REPLIES:
         return Answer(REPLIES[word])
-    undo = UNDO.fullmatch(word)
-    if undo is not None:
-        return Answer("undo", number=int(undo[1]) if undo[1] else "last")
-    if word == "?":
+    undo_match = UNDO.fullmatch(word)
+    if undo_match is not None:
+        digits = undo_match[1]
+        return Answer("undo", number=int(digits) if digits else "last")
+    if word == "?":  # a press with an unknown place and an unknown force
         return Answer("take", np.full(len(CONTACT), np.nan))
 
     cells = word.split(",") if "," in word else word.split()
     try:
         contact = np.array([_cell_value(cell.strip()) for cell in cells])
     except ValueError:
-        contact = np.empty(0)
+        contact = np.empty(0)  # refused below, as a wrong number of values is
     if contact.shape != (len(CONTACT),):
         raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")
     return Answer("take", contact)
@@ -98,6 +99,9 @@ def _with_unknown(temperatures_C: Array | None) -> Array | None:
 
 def _cell_value(cell: str) -> float:
     """Return the number in a cell; NaN if the value is unknown.
+
+    Args:
+        cell: Text of the cell without blanks.
 
     Raises:
         ValueError: If the cell is not a finite number.
@@ -165,21 +169,24 @@ class PressSession:
             PressError: If every place was skipped.
         """
         if self._proposed is None:
-            skipped_mm = np.reshape(self._skipped_places, (-1, 2))
+            skipped_mm = np.reshape(self._skipped_places, (-1, 2))  # a list of places may be empty
             film: FilmEstimate
             if self.result is not None:
                 film = self.result.posterior
                 count = 1
-            else:  # no film explains the presses: continue the plan of the described film
+            else:
+                # No film explains the presses. The plan for the film of the sensor file is continued, in which each
+                # press so far counts as one of the plan.
                 film = self.problem.expected
                 count = len(self) + 1
-            self._proposed = next_presses(self.problem, count, film, avoid_mm=skipped_mm, **self._stds)[-1]
+            plan = next_presses(self.problem, count, film, avoid_mm=skipped_mm, **self._stds)
+            self._proposed = plan[-1]
         return self._proposed
 
     @property
     def enough(self) -> bool:
-        """Whether the position error that the uncertainty of the film causes is small enough compared with that of
-        noise."""
+        """Whether the position error that the uncertainty of the film causes is small compared with the error that
+        noise causes."""
         if self.result is None or len(self) < FEW:
             return False
         noise_mm = self.result.sensitivity.noise_error.position_mm
@@ -217,18 +224,22 @@ class PressSession:
             contact: Contact (x, y, F), shape (3,), mm and N, NaN where unknown.
         """
         x, y, _ = contact.tolist()
-        if math.isnan(x) != math.isnan(y):
+        has_one_coordinate = math.isnan(x) != math.isnan(y)
+        if has_one_coordinate:
             raise PressError("expected both x and y, or ? for both, got one of them")
         domain = self.problem.charges.domain
         if domain.is_outside(contact[None]).any():
-            low, high = domain.force_range
+            min_force, max_force = domain.force_range
             raise PressError(
-                f"expected a press within {domain.radius:.3g} mm of the centre and of {low:.2g} to {high:.2g} N, "
-                f"got {describe_press(contact)}; press there, or give the real values in mm and N"
+                f"expected a press within {domain.radius:.3g} mm of the centre and of {min_force:.2g} to "
+                f"{max_force:.2g} N, got {describe_press(contact)}; press there, or give the real values in mm and N"
             )
 
     def undo(self, number: int | Literal["last"] = "last") -> int:
-        """Remove a press, and return its number.
+        """Remove a press, fit the film again, and return the number of the press.
+
+        Args:
+            number: Number of the press, counted from 1; "last" for the last press.
 
         Raises:
             PressError: If there is no such press.
@@ -240,8 +251,8 @@ class PressSession:
         if not 1 <= removed_number <= count:
             taken = "1 is taken" if count == 1 else f"{count} are taken"
             raise PressError(f"there is no press {removed_number} to undo: {taken}")
-        is_kept = np.arange(count) != removed_number - 1
-        self._change(self.presses[is_kept])
+        numbers = np.arange(1, count + 1)
+        self._change(self.presses[numbers != removed_number])
         return removed_number
 
     def skip(self) -> None:
@@ -255,7 +266,14 @@ class PressSession:
         self._fit(presses)
 
     def _fit(self, presses: MeasuredPresses) -> None:
-        """Number the presses from 1, and fit the film to them."""
+        """Number the presses from 1, and fit the film to them.
+
+        If no film explains the presses, `result` is None and `refusal` is the reason. Without presses, `result` is None
+        and `refusal` is empty.
+
+        Args:
+            presses: All presses of the session.
+        """
         self.presses = replace(presses, lines=tuple(range(1, len(presses) + 1)), row_noun="press")
         self.result = None
         self.refusal = ""

@@ -1,18 +1,15 @@
 """Side forces of the presses of a calibration, and of the contacts that its model estimates.
 
 A tip on a vertical stage pulls the film inwards by friction while it presses beside the centre
-(`simulate.solver.friction`). The coefficient of friction is a nuisance of the session. It changes the charges of the
-presses by about
-
-    dQ = coefficient * friction_charge,
-
-where `friction_charge` is computed on the film that the presses determine (`simulate.forward.side_force`). The fit is
-repeated, because this film and the coefficient depend on each other.
+(`simulate.solver.friction`). The coefficient of friction is a nuisance of the session. Friction changes the charges of
+the presses by about dQ = coefficient * friction_charge. Here `friction_charge` is computed for the film that the
+presses determine (`simulate.forward.side_force`). The fit is repeated, because this film and the coefficient depend on
+each other.
 
 The contacts on the calibrated film may have the same friction as the presses, for example if a robot moves vertically.
-They may also have no friction, for example if a probe moves freely. The model assumes half of the friction of the
-presses. Its standard deviations include the differences from both cases. They also include the side forces of any
-direction that the user declares.
+The contacts may also have no friction, for example if a probe moves freely. The model assumes half of the friction of
+the presses. The standard deviations of the model include the differences from both cases. The standard deviations also
+include the side forces of any direction that the user declares.
 """
 
 from dataclasses import dataclass, replace
@@ -59,7 +56,7 @@ def check_side_force(share: float) -> None:
 
 
 def solve_side_forces(charges: FilmCharges, parameters: Array) -> SideForceMap:
-    """Solve the effect of side forces on one film, which takes about ten seconds.
+    """Compute the effect of side forces on one film, which takes about ten seconds.
 
     Args:
         charges: The films.
@@ -133,8 +130,8 @@ class SideForces:
     def contact_covariance(self, sensitivity: ContactSensitivity) -> Array:
         """Compute the covariances of (x, y, ln F), shape (n, 3, 3), that the side forces of contacts cause.
 
-        Contacts with the friction of the presses and contacts without friction are equally probable. A declared side
-        force has the declared size and an unknown direction.
+        Contacts with the friction of the presses and contacts without friction are equally probable. A side force that
+        the user declares has the declared size and an unknown direction.
 
         Args:
             sensitivity: The contacts, and their dependence on charges.
@@ -143,16 +140,17 @@ class SideForces:
         covariance = np.zeros((len(contact), 3, 3))
         if self._coefficient > 0.0:
             friction_charge = self.side_force_map.friction_charges(contact, self._coefficient)
-            # Contacts have the friction of the presses or none, and the model assumes half of it. The root-mean-square
-            # difference contains half of the friction and the uncertainty of the coefficient.
+            # Contacts have the friction charge f (1 + e) with the relative error e of the coefficient, or none. Each
+            # case has the probability 0.5, and the model assumes f / 2. The mean squared difference is
+            # 0.5 ((1/2)^2 + e^2) f^2 + 0.5 (1/2)^2 f^2 = (0.25 + 0.5 e^2) f^2.
             relative_std = float(np.sqrt(0.25 + 0.5 * (self.friction.std / self._coefficient) ** 2))
             covariance += _outer(sensitivity.charge_gain, relative_std * friction_charge)
         if self.share > 0.0:
             # A force in an unknown direction has half of its variance along each of the two axes.
-            side_force_std = self.share * contact[:, 2, None] / np.sqrt(2.0)
-            jacobian = self.side_force_map.jacobian(contact)
-            for component in range(2):
-                covariance += _outer(sensitivity.charge_gain, side_force_std * jacobian[:, :, component])
+            side_force_std = self.share * contact[:, 2, None] / np.sqrt(2.0)  # shape (n, 1), N
+            charge_per_newton = self.side_force_map.jacobian(contact)  # last axis: along x and along y
+            for axis in range(2):
+                covariance += _outer(sensitivity.charge_gain, side_force_std * charge_per_newton[:, :, axis])
         return covariance
 
 

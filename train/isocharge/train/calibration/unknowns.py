@@ -38,7 +38,8 @@ class UnknownLayout:
 
     @cached_property
     def traces(self) -> slice:
-        """Coefficients of traces that are not described: one for each electrode and each of `TRACE_ANGLES`."""
+        """Coefficients of traces that the sensor file does not describe: one for each electrode and each of
+        `TRACE_ANGLES`."""
         return _after(self.modes, len(TRACE_ANGLES) * len(self.electrode_names))
 
     @cached_property

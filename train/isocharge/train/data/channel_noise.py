@@ -1,8 +1,8 @@
 """Estimation of the noise of measured presses from the presses themselves.
 
 For each press, a plane is fitted to the charges of the presses with the most similar positions and forces. The plane
-predicts the charges of the press. The residuals are the noise of the channels. They include the effect of the rig's
-errors in position and force. The variance of each channel is modelled as s^2 = white^2 + (gain * Q)^2.
+predicts the charges of the press. The residuals are the noise of the channels. The residuals include the effect of the
+rig's errors in position and force. The variance of each channel is modelled as s^2 = white^2 + (gain * Q)^2.
 """
 
 from dataclasses import dataclass
@@ -19,6 +19,9 @@ NEIGHBOURS = 16
 
 ROUNDS = 10
 """Number of weighted least-squares fits. The weights of each fit follow from the variances of the previous fit."""
+
+TINY = 1e-30
+"""Smallest divisor, so that no division by zero occurs."""
 
 OUTLIER = 3.0
 """Number of standard deviations to which residuals are clipped, because larger residuals have other causes."""
@@ -69,6 +72,9 @@ class ChannelNoise:
     def of(cls, charge: Array, unit: Array) -> "ChannelNoise":
         """Estimate the noise from measured presses.
 
+        A plane through the neighbours of each press gives the charge without noise and the residual. The residuals of
+        each channel give its white noise and the noise of its gain, both of which are limited from below.
+
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.
             unit: Contacts in unit coordinates, shape (n, 3).
@@ -77,10 +83,10 @@ class ChannelNoise:
             White noise and noise of the gain of each channel.
         """
         planes = LocalPlanes.through(unit, charge)
-        variances = [
+        channel_variances = [
             _variance(value, residual) for value, residual in zip(planes.value.T, planes.residual.T, strict=True)
         ]
-        white_std, gain_std = np.sqrt(np.array(variances)).T
+        white_std, gain_std = np.sqrt(np.array(channel_variances)).T
         gain = np.maximum(gain_std, LEAST_GAIN)
         white = np.maximum(white_std, LEAST_SHARE * gain * usual_size(charge))
         return cls(white, gain)
@@ -107,7 +113,7 @@ class ChannelNoise:
     def level(self, charge: Array) -> Array:
         """Return the levels of charges Q of shape (n, n_electrode), pC: asinh(gain Q / white) / gain.
 
-        All levels have a noise with a standard deviation of about 1.
+        The noise of every level has a standard deviation of about 1.
         """
         return np.asarray(np.arcsinh(charge * self.gain / self.white) / self.gain)
 
@@ -157,7 +163,7 @@ class LocalPlanes:
 
     @classmethod
     def through(cls, unit: Array, values: Array) -> "LocalPlanes":
-        """Fit a plane to the neighbours of each press.
+        """Fit a plane to the neighbours of each press by least squares, without the press itself.
 
         Args:
             unit: Contacts in unit coordinates, shape (n, 3).
@@ -166,23 +172,27 @@ class LocalPlanes:
         Returns:
             The planes, one for each press.
         """
-        distance, neighbours = cKDTree(unit).query(unit, NEIGHBOURS + 1)
-        neighbours = neighbours[:, 1:]  # the nearest point is the press itself
+        distance, nearest = cKDTree(unit).query(unit, NEIGHBOURS + 1)
+        neighbours = nearest[:, 1:]  # the nearest point is the press itself
         offsets = unit[neighbours] - unit[:, None]
         # The constant and the offsets of the neighbours, shape (n, NEIGHBOURS, 1 + number of coordinates)
         columns = np.concatenate([np.ones((*neighbours.shape, 1)), offsets], axis=2)
         solver = np.linalg.pinv(columns)
-        coefficients = solver @ values[neighbours]
+        coefficients = solver @ values[neighbours]  # the value at the press, and then the slopes
         value = coefficients[:, 0]
         slope = coefficients[:, 1:].swapaxes(1, 2)
+
         # The plane is itself uncertain, by the sum of the squared weights of its neighbours.
         residual_std = np.sqrt(1.0 + (solver[:, :1] ** 2).sum(axis=2))
-        return cls(value, slope, (values - value) / residual_std, distance[:, -1])
+        residual = (values - value) / residual_std
+        reach = distance[:, -1]
+        return cls(value, slope, residual, reach)
 
     def residuals(self, values: Array) -> Array:
         """Compute the differences of values from the nearest point of any plane.
 
-        A plane ends at the distance of its farthest neighbour.
+        Only the `CANDIDATES` planes whose centres are nearest are examined for each value. A plane ends at the distance
+        of its farthest neighbour.
 
         Args:
             values: The values, shape (m, k).
@@ -193,12 +203,12 @@ class LocalPlanes:
         _, candidate_planes = cKDTree(self.value).query(values, CANDIDATES)
         inverse_slope = np.linalg.pinv(self.slope)
         smallest_residual = np.full(values.shape, np.inf)
-        for planes in candidate_planes.T:
+        for planes in candidate_planes.T:  # one plane for each value
             # Project each value onto a plane, and limit the distance of the projection from the centre of the plane.
             difference = values - self.value[planes]
             step = (inverse_slope[planes] @ difference[..., None])[..., 0]
             length = np.linalg.norm(step, axis=1)
-            step *= np.minimum(1.0, self.reach[planes] / np.maximum(length, 1e-30))[:, None]
+            step *= np.minimum(1.0, self.reach[planes] / np.maximum(length, TINY))[:, None]
             residual = difference - (self.slope[planes] @ step[..., None])[..., 0]
             is_nearer = (residual**2).sum(axis=1) < (smallest_residual**2).sum(axis=1)
             smallest_residual[is_nearer] = residual[is_nearer]
@@ -217,27 +227,30 @@ def usual_size(charge: Array) -> Array:
 def _variance(value: Array, residual: Array) -> tuple[float, float]:
     """Estimate the variances white^2 and gain^2 of one channel, for which white^2 + gain^2 Q^2 fits the residuals.
 
-    The fit is a weighted least-squares problem with variances that are not negative. Its weights follow from the
-    previous round, because the standard deviation of a squared residual is proportional to its expectation.
+    The fit is a weighted least-squares problem with variances that are not negative. The weights of each round follow
+    from the previous round, because the standard deviation of a squared residual is proportional to its expectation.
 
     Args:
-        value: Charges, shape (n,), pC.
+        value: Charges Q, shape (n,), pC.
         residual: Residuals, shape (n,), pC.
 
     Returns:
         white^2, pC^2, and gain^2, dimensionless.
     """
+    # The expected squares are columns @ (white^2, gain^2).
     columns = np.stack([np.ones_like(value), value**2], axis=1)
     mean_square = np.mean(residual**2)
-    smallest_variance = 1e-12 * mean_square + 1e-30
+    smallest_variance = 1e-12 * mean_square + TINY  # avoids a division by zero
     # Both columns are scaled to the root mean square 1, because the squared charges may be very large or small.
-    column_scale = np.sqrt(np.maximum((columns**2).sum(axis=0), 1e-30)) / np.sqrt(len(value))
+    column_scale = np.sqrt(np.maximum((columns**2).sum(axis=0), TINY)) / np.sqrt(len(value))
+
     variances = np.array([mean_square, 0.0])
     for _ in range(ROUNDS):
-        expected = np.maximum(columns @ variances, smallest_variance)
-        squares = np.minimum(residual**2, OUTLIER**2 * expected)  # limits the influence of outliers
-        weighted_columns = columns / column_scale / expected[:, None]
-        variances = nnls(weighted_columns, squares / expected)[0] / column_scale
+        expected_square = np.maximum(columns @ variances, smallest_variance)
+        limited_square = np.minimum(residual**2, OUTLIER**2 * expected_square)  # limits the influence of outliers
+        weighted_columns = columns / column_scale / expected_square[:, None]
+        scaled_variances, _ = nnls(weighted_columns, limited_square / expected_square)
+        variances = scaled_variances / column_scale
     white_variance, gain_variance = variances.tolist()
     return white_variance, gain_variance
 

@@ -6,8 +6,8 @@ therefore expanded in Chebyshev polynomials:
     ln Q_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree.
 
 Here r is the radius of the working area, and l is the logarithm of the force scaled to [-1, 1]. Taut uniaxial films
-have charges of both signs. For such charges, Q_e / S(l) is expanded instead of the logarithm, where S is the typical
-size of the charges under this force. The coefficients follow from linear least squares.
+have charges of both signs. For such charges, the quotient Q_e / S(l) is expanded instead of the logarithm. Here S(l) is
+the typical size of the charges under this force. The coefficients follow from linear least squares.
 
 The training uses the series to find the contact that is nearest to given charges, to find folds of the map, and to find
 distant contacts with the same charges. The model itself does not use the series. For a dataset of several probes, the
@@ -27,7 +27,7 @@ from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.common.statistics import rms
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate import NoiseModel, working_area
-from isocharge.simulate.forward.charge_map import Domain, within
+from isocharge.simulate.forward.charge_map import ChargeMap, Domain, within
 from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 
@@ -132,15 +132,22 @@ class ChargeField:
         error_unit = np.hypot(validation.charge, smallest_unit)
 
         def fit_degrees(degree: int, force_degree: int) -> ChargeField | None:
-            """Fit a series of these degrees; return None if there are too few presses for it."""
+            """Fit a series of these degrees, and measure its error on the validation presses.
+
+            Not all presses are used if there are many for each term. If there are too few presses, return None.
+
+            Args:
+                degree: Largest total degree in x and y.
+                force_degree: Largest degree in the logarithm of the force.
+            """
             n_term = series_term_count(degree, force_degree)
             if FEWEST_PER_TERM * n_term > len(unit):
                 return None
-            rows = slice(0, ROWS_PER_TERM * n_term)
-            series = fit_series(unit[rows], target[rows], degree, force_degree)
-            field = cls(domain, electrodes, series, np.inf, log_size)
-            error = rms((field.charges(validation.contact) - validation.charge) / error_unit)
-            return replace(field, error=error)
+            used_rows = slice(0, ROWS_PER_TERM * n_term)
+            series = fit_series(unit[used_rows], target[used_rows], degree, force_degree)
+            field = cls(domain, electrodes, series, np.inf, log_size)  # its error is not known yet
+            charge_error = field.charges(validation.contact) - validation.charge
+            return replace(field, error=rms(charge_error / error_unit))
 
         best = fit_degrees(*first_degrees)
         if best is None:
@@ -171,9 +178,13 @@ class ChargeField:
         return self.linearised(contact)[1]
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Return charges and derivatives together, which takes half the time; see `ChargeMap`."""
+        """Return charges and derivatives together, which takes half the time; see `ChargeMap`.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        """
         unit = self.domain.to_unit(contact)
-        # The first row has the values of the series, the others its derivatives with respect to x, y and l.
+        # The second axis has the value of the series, and then its derivatives with respect to x, y and l.
         values_and_slopes = self._series.values(unit)  # shape (n, 4, n_electrode)
         value = values_and_slopes[:, 0]
         slopes = values_and_slopes[:, 1:]
@@ -248,14 +259,17 @@ def fit_series(unit: Array, target: Array, degree: int, force_degree: int) -> Ar
     n_term = series_term_count(degree, force_degree)
     normal = RIDGE * len(unit) * np.eye(n_term)
     moment = np.zeros((n_term, target.shape[1]))
-    for rows in np.array_split(np.arange(len(unit)), len(unit) // CHUNK_SIZE + 1):
+    n_chunk = len(unit) // CHUNK_SIZE + 1  # chunks limit the memory
+    for rows in np.array_split(np.arange(len(unit)), n_chunk):
         position_terms, force_terms = chebyshev_terms(unit[rows], degree, force_degree)
         # Each column is the product of a polynomial in the position and a polynomial in the force.
         columns = (position_terms[:, :, None] * force_terms[:, None, :]).reshape(len(rows), -1)
         normal += columns.T @ columns
         moment += columns.T @ target[rows]
-    series = np.zeros((degree + 1, degree + 1, force_degree + 1, target.shape[1]))
+
+    # The coefficients of terms above the total degree remain zero.
     solution = cho_solve(cho_factor(normal), moment)
+    series = np.zeros((degree + 1, degree + 1, force_degree + 1, target.shape[1]))
     series[position_degrees(degree)] = solution.reshape(-1, force_degree + 1, target.shape[1])
     return series
 
@@ -313,6 +327,7 @@ def invertible_domain(
         if fold_radius < credible_ratio * requested.radius:
             return requested, (_uncertain_fold_caution(fold_radius, requested.radius),)
         fold_radius = np.inf
+
     if fold_radius < SMALLEST_SHARE * requested.radius:
         raise DatasetError(
             f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of {requested.radius:g} mm "
@@ -324,14 +339,24 @@ def invertible_domain(
         domain = requested.within(fold_radius)
         cautions.append(_fold_caution(field, presses, fold_radius))
     if has_little_noise:
-        searched = within(field, SEARCHED_RADIUS_RATIO * domain.radius)
-        smallest_force, _ = requested.force_range
-        pairs = find_ambiguous_pairs(searched, noise, smallest_force, N_PAIR_CONTACTS)
-        if pairs.summary:
-            # The sentence is continued, so it begins in lower case and has no full stop.
-            sentence = pairs.summary[0].lower() + pairs.summary[1:].removesuffix(".")
-            cautions.append(f"{sentence}; no model tells which of them it is; see 'isocharge simulate identify'")
+        cautions += _pair_cautions(within(field, SEARCHED_RADIUS_RATIO * domain.radius), noise)
     return domain, tuple(cautions)
+
+
+def _pair_cautions(searched: ChargeMap, noise: NoiseModel) -> list[str]:
+    """Return a sentence about ambiguous pairs of contacts with the smallest force, if there are any.
+
+    Args:
+        searched: Map from contacts to charges; its domain is searched.
+        noise: Noise of good presses. Charges that differ by less than the noise count as equal.
+    """
+    smallest_force, _ = searched.domain.force_range
+    pairs = find_ambiguous_pairs(searched, noise, smallest_force, N_PAIR_CONTACTS)
+    if not pairs.summary:
+        return []
+    # The sentence is continued, so it begins in lower case and has no full stop.
+    sentence = pairs.summary[0].lower() + pairs.summary[1:].removesuffix(".")
+    return [f"{sentence}; no model tells which of them it is; see 'isocharge simulate identify'"]
 
 
 def _uncertain_fold_caution(fold_radius: float, requested_radius: float) -> str:
@@ -351,6 +376,8 @@ def _uncertain_fold_caution(fold_radius: float, requested_radius: float) -> str:
 
 def _fold_caution(field: ChargeField, presses: LabelledPresses, fold_radius: float) -> str:
     """Return a sentence about a fold that is certain, because of which the domain is reduced.
+
+    For positive charges, the sentence also names the command that follows contacts beyond the fold.
 
     Args:
         field: Charge field with the domain before the reduction.

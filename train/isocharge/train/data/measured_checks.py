@@ -43,6 +43,9 @@ LEAST_PARTICIPATION = 1e-2
 def check_measured_presses(presses: MeasuredPresses) -> None:
     """Check that a network can be trained on measured presses without unknown values.
 
+    Args:
+        presses: The presses, of which all positions, forces and charges are known.
+
     Raises:
         PressError: If the charges of a channel hardly vary or are too small or too large, if a value is far from all
             others, if channels depend linearly on each other, or if the positions enclose no area. The message names
@@ -55,14 +58,19 @@ def check_measured_presses(presses: MeasuredPresses) -> None:
         _check_size(name, charge)
     for name, values in {**contact_columns, **channels}.items():
         _check_far_value(presses, name, values, values)
+
+    # A force that is far too small is not far from the others, but its inverse is.
     force = contact_columns["force_N"]
     _check_far_value(presses, "force_N", force, 1.0 / force)
     _check_independence(channels)
-    PressedArea.of(presses.contact)
+    PressedArea.of(presses.contact)  # raises if the positions enclose no area
 
 
 def check_measured_dataset(dataset: Dataset) -> None:
     """Check that a network can be trained on a dataset of measured presses, whose samples are numbered from 0.
+
+    Args:
+        dataset: The dataset.
 
     Raises:
         DatasetError: If `check_measured_presses` finds a fault, or if a number is too large for a file of presses.
@@ -94,15 +102,16 @@ def _check_variation(name: str, charge: Array) -> None:
     Raises:
         PressError: If the charges hardly vary, or vary in only a few presses.
     """
-    values, counts = np.unique(charge, return_counts=True)
     if np.ptp(charge) <= LEAST_VARIATION * np.abs(charge).max():
         raise PressError(
             f"channel {shown(name)}: expected charges that vary, got {charge[0]:g} everywhere; leave the channel out"
         )
+    values, counts = np.unique(charge, return_counts=True)
+    most_frequent_value = values[counts.argmax()]
     varying_count = len(charge) - int(counts.max())
     if varying_count < LEAST_VARYING_SHARE * len(charge):
         raise PressError(
-            f"channel {shown(name)}: expected charges that vary, got {values[counts.argmax()]:g} in all but "
+            f"channel {shown(name)}: expected charges that vary, got {most_frequent_value:g} in all but "
             f"{varying_count} of {len(charge)} presses; leave the channel out"
         )
 
@@ -129,18 +138,23 @@ def _check_size(name: str, charge: Array) -> None:
 def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compared: Array) -> None:
     """Raise an error if a value is far from all others.
 
+    The largest distance from the median is compared with a quantile of the distances.
+
     Args:
         presses: The presses, for the number of the line.
         name: The column, for the message.
         values: Values of the column, shape (n,).
         compared: Numbers that are compared, shape (n,): the values, or a function of them.
+
+    Raises:
+        PressError: If the largest distance exceeds `FARTHEST` times the usual distance.
     """
     distance = np.abs(compared - np.median(compared))
     if not distance.any():
         return
-    usual_range = float(np.quantile(distance[distance > 0.0], USUAL_SHARE))
+    usual_distance = float(np.quantile(distance[distance > 0.0], USUAL_SHARE))
     row = int(distance.argmax())
-    if distance[row] > FARTHEST * usual_range:
+    if distance[row] > FARTHEST * usual_distance:
         raise PressError(
             f"{presses.row_noun} {presses.lines[row]}, column {shown(name)}: expected a value of the size of the "
             f"others, whose median is {np.median(values):.3g}, got {values[row]:.6g}; correct it, or remove the "
@@ -162,13 +176,14 @@ def _check_independence(channels: Mapping[str, Array]) -> None:
     scaled_charge = charge / usual_size(charge)
     standardised = (scaled_charge - scaled_charge.mean(axis=0)) / scaled_charge.std(axis=0)
     _, singular_values, directions = np.linalg.svd(standardised, full_matrices=False)
-    if singular_values[-1] > LEAST_INDEPENDENCE * singular_values[0]:
+    largest, *_, smallest = singular_values
+    if smallest > LEAST_INDEPENDENCE * largest:
         return
     # The last singular vector contains the coefficients of a combination of the channels that is nearly zero.
     coefficients = np.abs(directions[-1])
-    contributes = coefficients > LEAST_PARTICIPATION * coefficients.max()
-    dependent = [shown(name) for name, is_dependent in zip(channels, contributes, strict=True) if is_dependent]
+    is_dependent = coefficients > LEAST_PARTICIPATION * coefficients.max()
+    dependent_names = [shown(name) for name, dependent in zip(channels, is_dependent, strict=True) if dependent]
     raise PressError(
-        f"channels {', '.join(dependent)}: expected charges that are linearly independent, got channels of which each "
-        "follows from the others; leave out a channel that is a copy or a sum of others"
+        f"channels {', '.join(dependent_names)}: expected charges that are linearly independent, got channels of which "
+        "each follows from the others; leave out a channel that is a copy or a sum of others"
     )

@@ -1,4 +1,4 @@
-"""Sensor without a sensor file, described by the names of its channels and the area that was pressed."""
+"""Sensor without a sensor file. It is described by the names of its channels and by the area that was pressed."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -66,10 +66,12 @@ class PressedArea(Domain):
             PressError: If the places lie on a line.
         """
         places = np.unique(contact[:, :2], axis=0)
-        corners = np.round(outline(places), 4)
-        min_force = float(contact[:, 2].min())
-        max_force = float(contact[:, 2].max())
+        corners = np.round(outline(places), 4)  # to 0.1 um
+        force = contact[:, 2]
+        min_force = float(force.min())
+        max_force = float(force.max())
         if max_force < LEAST_RANGE * min_force:
+            # Both ends are moved by the same factor, so that their geometric mean remains.
             min_force /= LEAST_RANGE**0.5
             max_force *= LEAST_RANGE**0.5
         return cls.of_corners(corners, (min_force, max_force))
@@ -130,9 +132,9 @@ def _middle(corners: Array) -> Array:
 def outline(places: Array) -> Array:
     """Compute the outline of the area that places cover, enlarged by half the distance between neighbours.
 
-    The area consists of the triangles between places whose circumscribed circle is small enough (alpha shape,
-    Edelsbrunner et al. 1983). The limit of the radius is the smallest one for which the triangles contain all places
-    and have a single boundary. Holes are filled.
+    The area consists of triangles between places (alpha shape, Edelsbrunner et al., 1983). Only triangles whose
+    circumscribed circle is small enough are used. The limit of the radius is the smallest one for which the triangles
+    contain all places and have a single boundary. Holes are filled.
 
     Args:
         places: Positions (x, y), all different, shape (m, 2), mm.
@@ -143,6 +145,7 @@ def outline(places: Array) -> Array:
     Raises:
         PressError: If the places lie on a line, or almost.
     """
+    # The singular values are proportional to the extents of the places along their principal axes.
     on_a_line = f"expected presses over an area, got {len(places)} places on one line; press beside it, too"
     length, width = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
     if width <= LEAST_WIDTH * length:
@@ -152,8 +155,9 @@ def outline(places: Array) -> Array:
     except QhullError as error:
         raise PressError(on_a_line) from error
 
-    neighbour_distance = cKDTree(places).query(places, 2)[0][:, 1]
-    spacing = float(np.median(neighbour_distance))
+    # The nearest place is the place itself, and the second nearest is its nearest neighbour.
+    distances, _ = cKDTree(places).query(places, 2)
+    spacing = float(np.median(distances[:, 1]))
     circumradii = _circumradii(places[triangles])
     radius_limits = [*LEAST_HOLE * spacing * 2.0 ** np.arange(0.0, 20.0, 0.5), np.inf]
     for radius_limit in radius_limits:
@@ -177,8 +181,10 @@ def _circumradii(corners: Array) -> Array:
     first_side = corners[:, 1] - corners[:, 0]
     second_side = corners[:, 2] - corners[:, 0]
     third_side = second_side - first_side
-    lengths = [np.hypot(*side.T) for side in (first_side, second_side, third_side)]
-    twice_area = np.abs(first_side[:, 0] * second_side[:, 1] - first_side[:, 1] * second_side[:, 0])
+    lengths = [np.hypot(side[:, 0], side[:, 1]) for side in (first_side, second_side, third_side)]
+    cross_product = first_side[:, 0] * second_side[:, 1] - first_side[:, 1] * second_side[:, 0]
+    twice_area = np.abs(cross_product)
+    # The lower limit avoids a division by zero for corners on a line.
     return np.asarray(np.prod(lengths, axis=0) / np.maximum(2.0 * twice_area, 1e-30))
 
 
@@ -198,14 +204,9 @@ def _single_boundary(triangles: Integers, n_place: int) -> list[int] | None:
     if len(np.unique(triangles)) < n_place:
         return None
 
-    # An edge on the boundary belongs to one triangle only.
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    neighbours: dict[int, list[int]] = {}
-    for (start, end), n_triangle in Counter(map(tuple, edges.tolist())).items():
-        if n_triangle == 1:
-            neighbours.setdefault(start, []).append(end)
-            neighbours.setdefault(end, []).append(start)
-    if any(len(places) != 2 for places in neighbours.values()):
+    # On closed lines that do not touch each other, every place has two neighbours.
+    neighbours = _boundary_neighbours(triangles)
+    if any(len(place_neighbours) != 2 for place_neighbours in neighbours.values()):
         return None
 
     # Walk along the boundary until it returns to its first place.
@@ -217,11 +218,37 @@ def _single_boundary(triangles: Integers, n_place: int) -> list[int] | None:
         previous_place = boundary[-1]
         boundary.append(place)
         place = second_neighbour if first_neighbour == previous_place else first_neighbour
+
+    # If places of the boundary were not reached, there are further closed lines.
     return boundary if len(boundary) == len(neighbours) else None
+
+
+def _boundary_neighbours(triangles: Integers) -> dict[int, list[int]]:
+    """Return the neighbours along the boundary for each place on the boundary of an area of triangles.
+
+    Args:
+        triangles: Indices of the places at the corners of each triangle, shape (n, 3).
+
+    Returns:
+        Indices of the neighbours by the index of the place.
+    """
+    # The ends of each edge are sorted, so that equal edges of two triangles are recognised.
+    corner_pairs = [[0, 1], [1, 2], [2, 0]]
+    edges = np.sort(triangles[:, corner_pairs].reshape(-1, 2), axis=1)
+    triangles_per_edge = Counter(map(tuple, edges.tolist()))
+    neighbours: dict[int, list[int]] = {}
+    for (start, end), n_triangle in triangles_per_edge.items():
+        is_on_boundary = n_triangle == 1  # an edge inside the area belongs to two triangles
+        if is_on_boundary:
+            neighbours.setdefault(start, []).append(end)
+            neighbours.setdefault(end, []).append(start)
+    return neighbours
 
 
 def _enlarged(corners: Array, distance: float) -> Array:
     """Return a polygon whose sides are moved outwards.
+
+    Points and directions in the plane are complex numbers x + i y.
 
     Args:
         corners: Corners (x, y) of the polygon in either direction, shape (n, 2), mm.
@@ -231,16 +258,17 @@ def _enlarged(corners: Array, distance: float) -> Array:
     Returns:
         Corners, anticlockwise, without those between two sides in the same direction, shape (m, 2), mm.
     """
-    points = to_complex(corners if area_of(corners) > 0.0 else corners[::-1])
-    sides = np.roll(points, -1) - points
-    turn = np.angle(sides / np.roll(sides, 1))
-    points = points[np.abs(turn) > 1e-6]
+    is_anticlockwise = area_of(corners) > 0.0
+    all_points = to_complex(corners if is_anticlockwise else corners[::-1])
+    all_sides = np.roll(all_points, -1) - all_points  # from each point to the next one
+    turning_angle = np.angle(all_sides / np.roll(all_sides, 1))
+    points = all_points[np.abs(turning_angle) > 1e-6]
 
-    # A corner moves along the bisector of the normals of both sides.
+    # A corner moves along the bisector of the normals of both sides. The normal of a side points to the right.
     sides = np.roll(points, -1) - points
     next_normal = -1j * sides / np.abs(sides)
     previous_normal = np.roll(next_normal, 1)
     cosine = (previous_normal * np.conj(next_normal)).real
-    mitre = (previous_normal + next_normal) / np.maximum(1.0 + cosine, 1e-9)
+    mitre = (previous_normal + next_normal) / np.maximum(1.0 + cosine, 1e-9)  # displacement for a distance of 1
     limited_mitre = mitre * np.minimum(1.0, LONGEST_MITRE / np.abs(mitre))
     return to_corners(points + distance * limited_mitre)

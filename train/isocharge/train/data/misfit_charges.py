@@ -3,11 +3,11 @@
 The misfit network has to answer any charges, so it is trained on all kinds of charges: presses with noise; charges at
 any distance from the charges that contacts can have; wrong gains; failing electrodes; forces far outside of the range;
 two presses at the same time; presses outside the working area; and charges from a box that contains all of these. The
-charges of two presses at the same time are approximated from those of the single presses.
+charges of two simultaneous presses are approximated from the charges of the single presses.
 """
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,24 @@ MIN_CHANGE = 1e-4
 The misfits of 99 % of the examples then differ by less than 0.001 from those of a converged search.
 """
 
+MOVED_LOG_STDS = (-3.0, 0.3)
+"""Decimal logarithms of the smallest and the largest standard deviation by which ln Q of moved charges varies."""
+
+SMALLEST_MOVE = -1.0
+"""Decimal logarithm of the smallest distance of moved charges of any sign, in standard deviations of their noise."""
+
+WRONG_GAIN_STD = 0.15
+"""Standard deviation of the logarithm of a wrong gain."""
+
+COMMON_FACTOR_SCATTER = 0.05
+"""Standard deviation of the logarithm of a charge about a factor that is common to all electrodes."""
+
+BOX_LOG_LIMIT = 4.0
+"""Decimal logarithm of the largest positive charge of the box, pC, except for `LARGE_BOX_FRACTION` of the presses."""
+
+LARGE_BOX_FRACTION = 0.3
+"""Fraction of the presses for which the box reaches up to the largest charge of the network."""
+
 OUTSIDE_SCATTER = 0.02
 """Standard deviation of the logarithm of a factor of all charges of a press outside the working area, dimensionless.
 
@@ -54,9 +72,41 @@ FAR = 6.0
 def misfit_noise(noise: NoiseModel) -> NoiseModel:
     """Return the noise that is the unit of the misfit.
 
-    It is the noise of the training, or `reference` if the noise of the training is zero.
+    This unit is the noise of the training, or the noise `reference` if the training has no noise.
     """
     return noise if noise.white > 0.0 else noise_model("reference")
+
+
+@dataclass(frozen=True)
+class ExampleOptions:
+    """Limits of the charges of examples, and settings of the search for the nearest contact.
+
+    Attributes:
+        candidates: Number of contacts among which the starts of a search are chosen.
+        starts: Number of starts of a search.
+        limits: Smallest and largest charge, pC. Charges are clipped to these limits, as in the network.
+    """
+
+    candidates: int = CANDIDATES
+    starts: int = 2
+    limits: tuple[Array | float, Array | float] = (LOWEST_CHARGE, HIGHEST_CHARGE)
+
+    def find_nearest(self, charge_map: ChargeMap, charge: Array, sigma: Array) -> tuple[Array, Array]:
+        """Search for the contact whose charges are nearest to each set of charges.
+
+        Args:
+            charge_map: Map from contacts to charges.
+            charge: Charges, shape (n, n_electrode), pC.
+            sigma: Standard deviations of the charges, shape (n, n_electrode), pC.
+
+        Returns:
+            The contacts, shape (n, 3), and the residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
+        """
+        return search(charge_map, charge, sigma, starts=self.starts, candidates=self.candidates, min_change=MIN_CHANGE)
+
+
+DEFAULT_OPTIONS = ExampleOptions()
+"""Options for positive charges and few electrodes."""
 
 
 def draw_misfit_examples(
@@ -66,11 +116,9 @@ def draw_misfit_examples(
     count: int,
     seed: int,
     *,
-    candidates: int = CANDIDATES,
-    starts: int = 2,
-    limits: tuple[Array | float, Array | float] = (LOWEST_CHARGE, HIGHEST_CHARGE),
+    options: ExampleOptions = DEFAULT_OPTIONS,
 ) -> Array:
-    """Draw charges of every kind, and compute their distance from the charges of the nearest contact.
+    """Draw charges of every kind, and compute their residuals at the nearest contact.
 
     Args:
         presses: Presses from whose charges the examples are made.
@@ -78,9 +126,7 @@ def draw_misfit_examples(
         noise: Noise of good presses, which is also the unit of the distance; a `ChannelNoise` for charges of any sign.
         count: Number of examples.
         seed: Seed of the random numbers.
-        candidates: Number of contacts among which the starts of a search are chosen.
-        starts: Number of starts of a search.
-        limits: Smallest and largest charge, pC. Charges are clipped to these limits, as in the network.
+        options: Limits of the charges, and settings of the search for the nearest contact.
 
     Returns:
         The charges Q, pC, and their residuals (Q - Q(c)) / sigma at the nearest contact c, shape (2, count,
@@ -88,11 +134,11 @@ def draw_misfit_examples(
     """
     rng = np.random.default_rng(seed)
     chosen = presses[rng.integers(len(presses), size=count)]
-    kinds, charge = draw_charges(rng, chosen.charge, presses.charge, noise)
-    near = np.isin(kinds, ("noisy", "moved"))
-    charge = np.clip(charge, *limits)
-    find_nearest = partial(search, starts=starts, candidates=candidates, min_change=MIN_CHANGE)
-    return np.stack([charge, _residuals(charge_map, charge, noise.sigma(charge), chosen, near, find_nearest)])
+    kinds, drawn_charge = draw_charges(rng, chosen.charge, presses.charge, noise)
+    charge = np.clip(drawn_charge, *options.limits)
+    is_near = np.isin(kinds, ("noisy", "moved"))  # charges of these kinds are similar to those of their press
+    residual = _residuals(charge_map, charge, noise.sigma(charge), chosen, is_near, options.find_nearest)
+    return np.stack([charge, residual])
 
 
 def draw_outside_examples(
@@ -102,11 +148,11 @@ def draw_outside_examples(
     count: int,
     seed: int,
     *,
-    candidates: int = CANDIDATES,
-    starts: int = 2,
-    limits: tuple[Array | float, Array | float] = (LOWEST_CHARGE, HIGHEST_CHARGE),
+    options: ExampleOptions = DEFAULT_OPTIONS,
 ) -> Array:
-    """Draw noisy charges of presses outside the working area, and compute their distance from the nearest contact.
+    """Draw noisy charges of presses outside the working area, and compute their residuals at the nearest contact.
+
+    Before the noise is added, all charges of a press are multiplied by a random factor near 1.
 
     Args:
         outside: Charges of presses outside the working area, shape (m, n_electrode), pC.
@@ -114,19 +160,17 @@ def draw_outside_examples(
         noise: Noise of good presses, which is also the unit of the distance.
         count: Number of examples.
         seed: Seed of the random numbers.
-        candidates: Number of contacts among which the starts of a search are chosen.
-        starts: Number of starts of a search.
-        limits: Smallest and largest charge, pC, to which charges are clipped.
+        options: Limits of the charges, and settings of the search for the nearest contact.
 
     Returns:
         Charges and residuals, as of `draw_misfit_examples`.
     """
     rng = np.random.default_rng(seed)
-    chosen = outside[rng.integers(len(outside), size=count)]
+    chosen_charge = outside[rng.integers(len(outside), size=count)]
     factor = np.exp(OUTSIDE_SCATTER * rng.standard_normal((count, 1)))
-    charge = np.clip(noise.add(chosen * factor, rng), *limits)
-    sigma = noise.sigma(charge)
-    _, residual = search(charge_map, charge, sigma, starts=starts, candidates=candidates, min_change=MIN_CHANGE)
+    noisy_charge = noise.add(chosen_charge * factor, rng)
+    charge = np.clip(noisy_charge, *options.limits)
+    _, residual = options.find_nearest(charge_map, charge, noise.sigma(charge))
     return np.stack([charge, residual])
 
 
@@ -135,21 +179,21 @@ def _residuals(
     charge: Array,
     sigma: Array,
     chosen: LabelledPresses,
-    near: Booleans,
+    is_near: Booleans,
     find_nearest: Callable[[ChargeMap, Array, Array], tuple[Array, Array]],
 ) -> Array:
     """Compute the residuals of charges at the nearest contact.
 
-    Some charges are similar to those of the press from which they were made. They are compared with contacts near this
-    press. The charge map is scaled so that it is exact at this press. For all other charges, the nearest contact is
-    searched for among many candidates.
+    Some charges are similar to those of the press from which they were made. For these charges, the search begins at
+    this press, with a charge map that is scaled so that it is exact there. For all other charges, the nearest contact
+    is searched for among many candidates.
 
     Args:
         charge_map: Map from contacts to charges.
         charge: Charges, shape (n, n_electrode), pC.
         sigma: Standard deviations of the noise of these charges, same shape, pC.
         chosen: Presses from which the charges were made.
-        near: Whether each of the charges is similar to those of its press, shape (n,).
+        is_near: Whether the charges of each row are similar to those of their press, shape (n,).
         find_nearest: Function from a charge map, charges and their standard deviations to the nearest contacts and the
             residuals; see `search`.
 
@@ -157,25 +201,32 @@ def _residuals(
         Residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
     residual = np.zeros_like(charge)
-    near_rows = np.flatnonzero(near)
+    near_rows = np.flatnonzero(is_near)
     start = chosen.contact[near_rows]
-    map_factor = np.clip(chosen.charge[near_rows] / charge_map.charges(start), 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
+    map_error = chosen.charge[near_rows] / charge_map.charges(start)
+    map_factor = np.clip(map_error, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
+    # Instead of the map, the charges and their noise are scaled, which gives the same residuals.
     _, residual[near_rows] = explain(
         charge_map, charge[near_rows] / map_factor, sigma[near_rows] / map_factor, start, min_change=MIN_CHANGE
     )
 
     # A large residual near the press may be a local minimum, so a search is made for these charges, too.
-    searched_rows = np.flatnonzero(~near | (np.linalg.norm(residual, axis=1) > FAR))
+    is_far = np.linalg.norm(residual, axis=1) > FAR
+    searched_rows = np.flatnonzero(~is_near | is_far)
     _, searched_residual = find_nearest(charge_map, charge[searched_rows], sigma[searched_rows])
+
+    # Of both residuals, the smaller one is kept.
     near_residual = residual[searched_rows]
     is_near_smaller = (near_residual**2).sum(axis=1) < (searched_residual**2).sum(axis=1)
-    use_near = near[searched_rows] & is_near_smaller
-    residual[searched_rows] = np.where(use_near[:, None], near_residual, searched_residual)
+    keeps_near_residual = is_near[searched_rows] & is_near_smaller
+    residual[searched_rows] = np.where(keeps_near_residual[:, None], near_residual, searched_residual)
     return residual
 
 
 def draw_charges(rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> tuple[NDArray[Any], Array]:
     """Draw a kind of charges for each press, and create charges of this kind.
+
+    `KINDS` contains the probability of each kind.
 
     Args:
         rng: Random number generator.
@@ -186,7 +237,9 @@ def draw_charges(rng: np.random.Generator, charge: Array, others: Array, noise: 
     Returns:
         The kinds, shape (n,), and the charges, shape (n, n_electrode), pC.
     """
-    kinds = np.array(list(KINDS))[rng.choice(len(KINDS), size=len(charge), p=list(KINDS.values()))]
+    kind_names = np.array(list(KINDS))
+    kind_index = rng.choice(len(KINDS), size=len(charge), p=list(KINDS.values()))
+    kinds = kind_names[kind_index]
     drawn = np.empty_like(charge)
     for kind in KINDS:
         rows = kinds == kind
@@ -219,8 +272,9 @@ def _draw(kind: str, rng: np.random.Generator, charge: Array, others: Array, noi
         case "scaled":
             return charge * _common_factors(rng, charge.shape)
         case "two":
-            second = others[rng.integers(len(others), size=len(charge))]
-            return combined_charge(charge, second, rng.uniform(*PAIR_EXPONENTS, (len(charge), 1)))
+            second_charge = others[rng.integers(len(others), size=len(charge))]
+            exponent = rng.uniform(*PAIR_EXPONENTS, (len(charge), 1))
+            return combined_charge(charge, second_charge, exponent)
         case _:
             return _any_charges(rng, charge.shape, others, noise)
 
@@ -242,20 +296,24 @@ def _moved_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Arr
     """
     one_per_press = (len(charge), 1)
     if isinstance(noise, ChannelNoise):
-        distance = 10.0 ** rng.uniform(-1.0, FARTHEST, one_per_press)
-        return noise.charge(noise.level(charge) + distance * rng.standard_normal(charge.shape))
-    distance = 10.0 ** rng.uniform(-3.0, 0.3, one_per_press)
-    return np.asarray(charge * np.exp(distance * rng.standard_normal(charge.shape)))
+        distance = 10.0 ** rng.uniform(SMALLEST_MOVE, FARTHEST, one_per_press)
+        moved_level = noise.level(charge) + distance * rng.standard_normal(charge.shape)
+        return noise.charge(moved_level)
+    log_std = 10.0 ** rng.uniform(*MOVED_LOG_STDS, one_per_press)
+    return np.asarray(charge * np.exp(log_std * rng.standard_normal(charge.shape)))
 
 
 def _wrong_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Draw gains, shape (n, n_electrode), about half of which are wrong with a standard deviation of 15 %."""
+    """Draw gains, shape (n, n_electrode). About half of them are wrong, with a standard deviation of 15 %."""
     is_wrong = rng.random(shape) < 0.5
-    return np.exp(0.15 * is_wrong * rng.standard_normal(shape))
+    return np.exp(WRONG_GAIN_STD * is_wrong * rng.standard_normal(shape))
 
 
 def _failing_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Draw gains that are 1 for all electrodes but one, whose gain is between 0.001 and 1, shape (n, n_electrode)."""
+    """Draw gains, shape (n, n_electrode).
+
+    One electrode has a gain between 0.001 and 1, and all others have the gain 1.
+    """
     n_press, n_electrode = shape
     is_failing = rng.integers(n_electrode, size=(n_press, 1)) == np.arange(n_electrode)
     failing_gain = 10.0 ** rng.uniform(-3.0, 0.0, (n_press, 1))
@@ -263,10 +321,10 @@ def _failing_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
 
 
 def _common_factors(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Draw factors from 0.01 to 100 that are nearly equal for all electrodes of a press, shape (n, n_electrode)."""
+    """Draw factors from 0.01 to 100, shape (n, n_electrode), which are nearly equal for all electrodes of a press."""
     n_press, _ = shape
     common_factor = 10.0 ** rng.uniform(-2.0, 2.0, (n_press, 1))
-    return np.asarray(common_factor * np.exp(0.05 * rng.standard_normal(shape)))
+    return np.asarray(common_factor * np.exp(COMMON_FACTOR_SCATTER * rng.standard_normal(shape)))
 
 
 def _any_charges(rng: np.random.Generator, shape: tuple[int, ...], others: Array, noise: Noise) -> Array:
@@ -288,15 +346,20 @@ def _any_charges(rng: np.random.Generator, shape: tuple[int, ...], others: Array
         level = noise.level(others)
         lowest = level.min(axis=0)
         highest = level.max(axis=0)
-        margin = 0.5 * (highest - lowest)
+        margin = 0.5 * (highest - lowest)  # on both sides, so the box is twice as wide as the range of the charges
         return noise.charge(rng.uniform(lowest - margin, highest + margin, shape))
+
     n_press, _ = shape
-    largest_decade = np.where(rng.random((n_press, 1)) < 0.3, np.log10(HIGHEST_CHARGE), 4.0)
-    return 10.0 ** (largest_decade * rng.random(shape))
+    has_large_box = rng.random((n_press, 1)) < LARGE_BOX_FRACTION
+    log_limit = np.where(has_large_box, np.log10(HIGHEST_CHARGE), BOX_LOG_LIMIT)
+    return 10.0 ** (log_limit * rng.random(shape))  # from 10^0 = 1 pC
 
 
 def combined_charge(first: Array, second: Array, exponent: Array | float) -> Array:
-    """Approximate the charges of two presses at the same time, (Q1^p + Q2^p)^(1/p).
+    """Approximate the charges of two simultaneous presses by (Q1^p + Q2^p)^(1/p).
+
+    Q1 and Q2 are the charges that each press alone would cause. A power of a negative charge keeps the sign of the
+    charge: it is sign(Q) |Q|^p.
 
     Args:
         first: Charges of the first press alone, shape (n, n_electrode), pC.
@@ -304,11 +367,12 @@ def combined_charge(first: Array, second: Array, exponent: Array | float) -> Arr
         exponent: The exponent p, a number or shape (n, 1).
 
     Returns:
-        Charges of both presses, shape (n, n_electrode), pC. Powers of negative charges keep the sign.
+        Charges of both presses, shape (n, n_electrode), pC.
     """
+    sum_of_powers = _signed_power(first, exponent) + _signed_power(second, exponent)
+    return _signed_power(sum_of_powers, 1.0 / exponent)
 
-    def signed_power(charge: Array, power: Array | float) -> Array:
-        return np.asarray(np.sign(charge) * np.abs(charge) ** power)
 
-    total = signed_power(first, exponent) + signed_power(second, exponent)
-    return signed_power(total, 1.0 / exponent)
+def _signed_power(charge: Array, power: Array | float) -> Array:
+    """Raise the magnitude of each charge to a power, and keep the sign of the charge."""
+    return np.asarray(np.sign(charge) * np.abs(charge) ** power)

@@ -1,8 +1,8 @@
 """Presses outside the working area, for training the misfit network and for measuring its detection rate.
 
 The charges come from the coarse map of the whole film. The error of this map is a few percent near the clamp and does
-not matter. The misfit network is trained with the exact misfit of these charges, and the measured fractions of presses
-hardly depend on the error.
+not matter. The misfit network is trained with the exact misfit of these charges. The fractions of presses that are
+measured hardly depend on the error.
 """
 
 import logging
@@ -49,7 +49,7 @@ class OutsidePresses:
 
     @classmethod
     def of(cls, sensor: Sensor, probes: tuple[str, ...], force_range: tuple[float, float]) -> "OutsidePresses | None":
-        """Solve the coarse map of the whole film for the widest probe.
+        """Solve a coarse forward map of the whole film for the probe with the largest reach.
 
         Args:
             sensor: The sensor.
@@ -87,6 +87,8 @@ class OutsidePresses:
     def draw(self, count: int, seed: int) -> LabelledPresses:
         """Draw presses whose positions are uniformly distributed over the ring, with log-uniform forces.
 
+        The squared distances from the centre are uniformly distributed, because the area grows with the square.
+
         Args:
             count: Number of presses.
             seed: Seed of the random numbers.
@@ -94,16 +96,18 @@ class OutsidePresses:
         rng = np.random.default_rng(seed)
         distance = np.sqrt(rng.uniform(self.inner**2, self.outer**2, count))
         angle = rng.uniform(0.0, 2.0 * np.pi, count)
-        low, high = np.log(self.charge_map.domain.force_range)
-        return self._presses(distance, angle, np.exp(rng.uniform(low, high, count)))
+        min_log_force, max_log_force = np.log(self.charge_map.domain.force_range)
+        force = np.exp(rng.uniform(min_log_force, max_log_force, count))
+        return self._presses(distance, angle, force)
 
     def grid(self) -> LabelledPresses:
         """Return presses at the middle of every ring and sector, with `N_FORCES` forces each."""
         edges = np.linspace(self.inner, self.outer, N_RINGS + 1)
         distance = 0.5 * (edges[1:] + edges[:-1])
         angle = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
-        grids = np.meshgrid(distance, angle, self._measured_forces(), indexing="ij")
-        return self._presses(*(grid.ravel() for grid in grids))
+        # All combinations of distance, angle and force
+        distances, angles, forces = np.meshgrid(distance, angle, self._measured_forces(), indexing="ij")
+        return self._presses(distances.ravel(), angles.ravel(), forces.ravel())
 
     def unnoticed(self, is_unnoticed: Booleans) -> UnnoticedPresses:
         """Return the measured shares, by place.

@@ -71,7 +71,7 @@ class LabelledPresses:
         return self[np.hypot(self.contact[:, 0], self.contact[:, 1]) <= radius]
 
     def repeated(self, min_count: int) -> "LabelledPresses":
-        """Return the presses in their order, from the first one again after the last one, until there are enough.
+        """Return the presses in their order, repeated from the first one until there are enough.
 
         Args:
             min_count: Number of presses to return. If there are more presses, each of them is returned once.
@@ -112,6 +112,9 @@ def domain_of(dataset: Dataset) -> Domain:
 
     The manifest states them. If the manifest does not state them, they are computed from the samples.
 
+    Args:
+        dataset: The dataset.
+
     Raises:
         DatasetError: If the ranges of the manifest are not numbers or do not contain the samples.
     """
@@ -121,18 +124,19 @@ def domain_of(dataset: Dataset) -> Domain:
     sample_forces = (samples.force_N.min(), samples.force_N.max())
     try:
         radius = float(ranges.get("radius_mm", sample_radius))
-        low, high = (float(force) for force in ranges.get("force_N", sample_forces))
+        min_force, max_force = (float(force) for force in ranges.get("force_N", sample_forces))
     except (AttributeError, TypeError, ValueError) as error:
         raise DatasetError(f"manifest ranges: expected radius_mm and force_N [MIN, MAX], got {ranges!r}") from error
+
     smallest, largest = sample_forces
-    holds_places = sample_radius <= radius * ROUNDING
-    holds_forces = 0.0 < low <= smallest * ROUNDING and largest <= high * ROUNDING
-    if not (holds_places and holds_forces):
+    contains_places = sample_radius <= radius * ROUNDING
+    contains_forces = 0.0 < min_force <= smallest * ROUNDING and largest <= max_force * ROUNDING
+    if not (contains_places and contains_forces):
         raise DatasetError(
-            f"manifest ranges: radius_mm {radius:g} and force_N [{low:g}, {high:g}] do not hold the samples, which "
-            f"reach {sample_radius:g} mm and {smallest:g} to {largest:g} N"
+            f"manifest ranges: radius_mm {radius:g} and force_N [{min_force:g}, {max_force:g}] do not hold the "
+            f"samples, which reach {sample_radius:g} mm and {smallest:g} to {largest:g} N"
         )
-    return Domain(radius, (low, high))
+    return Domain(radius, (min_force, max_force))
 
 
 def split_by_position(presses: LabelledPresses, share: float, seed: int) -> tuple[LabelledPresses, LabelledPresses]:
@@ -148,11 +152,12 @@ def split_by_position(presses: LabelledPresses, share: float, seed: int) -> tupl
     """
     # Positions are rounded to 1e-6 mm, so that numerical errors do not separate the presses at one position.
     rounded_positions = np.round(presses.contact[:, :2], 6)
-    _, position_of_press = np.unique(rounded_positions, axis=0, return_inverse=True)
-    position_order = np.random.default_rng(seed).permutation(position_of_press.max() + 1)
-    second_count = max(1, round(share * position_order.size))
+    unique_positions, position_of_press = np.unique(rounded_positions, axis=0, return_inverse=True)
+    shuffled_positions = np.random.default_rng(seed).permutation(len(unique_positions))
+    second_count = max(1, round(share * len(unique_positions)))
+    second_positions = shuffled_positions[:second_count]
     # Some versions of NumPy return `position_of_press` with two axes.
-    is_in_second = np.isin(position_of_press.ravel(), position_order[:second_count])
+    is_in_second = np.isin(position_of_press.ravel(), second_positions)
     return presses[~is_in_second], presses[is_in_second]
 
 
@@ -171,6 +176,34 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
             never varies, or numbers that are not finite or forces that are not positive.
     """
     presses = LabelledPresses.of(dataset)
+    _check_finite(presses)
+
+    rounded_positions_mm = np.round(presses.contact[:, :2], 3)  # positions within a micrometre count as the same
+    n_position = len(np.unique(rounded_positions_mm, axis=0))
+    fewest_positions = min(fewest, FEWEST_POSITIONS)
+    if len(presses) < fewest or n_position < fewest_positions:
+        raise DatasetError(
+            f"expected at least {fewest} presses at {fewest_positions} positions, got {len(presses)} at "
+            f"{n_position}; sweep or measure more (from 50 measured presses on, train on a CSV file with --sensor)"
+        )
+
+    n_electrode = presses.charge.shape[1]
+    if n_electrode < 3:
+        raise DatasetError(f"expected at least three electrodes to find x, y and force, got {n_electrode}")
+    for name, charge in zip(dataset.sensor.electrode_names, presses.charge.T, strict=True):
+        if np.ptp(charge) == 0.0:
+            raise DatasetError(f"electrode {name!r}: expected charges that vary, got {charge[0]:g} pC everywhere")
+
+    force = presses.contact[:, 2]
+    rows_without_force = np.flatnonzero(force <= 0.0)
+    if rows_without_force.size:
+        row = int(rows_without_force[0])
+        raise DatasetError(f"sample {row}: expected a positive force, got {force[row]:g} N")
+    return presses
+
+
+def _check_finite(presses: LabelledPresses) -> None:
+    """Raise a DatasetError for the first press with a contact or a charge that is not finite."""
     is_finite = np.isfinite(presses.charge).all(axis=1) & np.isfinite(presses.contact).all(axis=1)
     if not is_finite.all():
         row = int(np.argmin(is_finite))
@@ -178,24 +211,6 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
             f"sample {row}: expected finite numbers, got the contact {presses.contact[row].tolist()} (mm, mm, N) and "
             f"{presses.charge[row].tolist()} pC"
         )
-    n_position = len(np.unique(np.round(presses.contact[:, :2], 3), axis=0))
-    fewest_positions = min(fewest, FEWEST_POSITIONS)
-    if len(presses) < fewest or n_position < fewest_positions:
-        raise DatasetError(
-            f"expected at least {fewest} presses at {fewest_positions} positions, got {len(presses)} at "
-            f"{n_position}; sweep or measure more (from 50 measured presses on, train on a CSV file with --sensor)"
-        )
-    if presses.charge.shape[1] < 3:
-        raise DatasetError(f"expected at least three electrodes to find x, y and force, got {presses.charge.shape[1]}")
-    for name, charge in zip(dataset.sensor.electrode_names, presses.charge.T, strict=True):
-        if np.ptp(charge) == 0.0:
-            raise DatasetError(f"electrode {name!r}: expected charges that vary, got {charge[0]:g} pC everywhere")
-    force = presses.contact[:, 2]
-    not_positive = np.flatnonzero(force <= 0.0)
-    if not_positive.size:
-        row = int(not_positive[0])
-        raise DatasetError(f"sample {row}: expected a positive force, got {force[row]:g} N")
-    return presses
 
 
 HELD_SHARE = 0.2
@@ -254,8 +269,9 @@ def _count_before(contact: Array) -> Integers:
         rounded_position, axis=0, return_inverse=True, return_counts=True
     )
     order = np.argsort([sha256_of(position.tobytes()) for position in positions])
+    ordered_counts = presses_at_position[order]
     presses_before = np.empty_like(presses_at_position)
-    presses_before[order] = np.cumsum(presses_at_position[order]) - presses_at_position[order]
+    presses_before[order] = np.cumsum(ordered_counts) - ordered_counts  # the sum without the position itself
     return np.asarray(presses_before[position_of_press.ravel()])
 
 
@@ -270,12 +286,14 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
     Raises:
         PressError: If fewer than `FEWEST_MEASURED` remain.
     """
-    whole = presses[complete(presses)]
-    check_enough(len(whole), len(presses), sensor.name)
-    x_mm, y_mm, force_N = whole.contact.T
-    count = len(whole)
-    samples = Samples(x_mm, y_mm, force_N, np.full(count, probe.notation), np.zeros(count), whole.charge_pC)
-    return Dataset(sensor, samples, {}, presses_sha256(whole))
+    complete_presses = presses[complete(presses)]
+    count = len(complete_presses)
+    check_enough(count, len(presses), sensor.name)
+    x_mm, y_mm, force_N = complete_presses.contact.T
+    probe_column = np.full(count, probe.notation)
+    orientation_deg = np.zeros(count)
+    samples = Samples(x_mm, y_mm, force_N, probe_column, orientation_deg, complete_presses.charge_pC)
+    return Dataset(sensor, samples, {}, presses_sha256(complete_presses))
 
 
 def complete(presses: MeasuredPresses) -> Booleans:

@@ -48,15 +48,23 @@ def c_array(name: str, values: NDArray[Any]) -> str:
     """
     is_int8 = values.dtype == np.int8
     number_type = "signed char" if is_int8 else "float"
-    words = ", ".join(map(str if is_int8 else c_float, values.ravel()))
-    numbers = "\n    ".join(wrap(f"{words},", LINE_WIDTH, break_on_hyphens=False)).rstrip(",")
+    as_text = str if is_int8 else c_float
+    literals = ", ".join(as_text(value) for value in values.ravel())
+    # The comma after the last number keeps it together with its line; it is removed after the lines are broken.
+    lines = wrap(f"{literals},", LINE_WIDTH, break_on_hyphens=False)
+    numbers = "\n    ".join(lines).rstrip(",")
     return f"static const {number_type} {name}[{values.size}] = {{\n    {numbers}\n}};\n"
 
 
 def c_string(text: str) -> str:
-    """Return a C string literal. All characters except ASCII letters, digits and blanks are written as octal codes."""
+    """Return a C string literal. All characters except ASCII letters, digits and blanks are written as octal codes.
+
+    Args:
+        text: The text.
+    """
 
     def escape(byte: int) -> str:
+        """Return one byte of the text as a character or as an octal code."""
         character = chr(byte)
         is_plain = character == " " or (character.isascii() and character.isalnum())
         return character if is_plain else f"\\{byte:03o}"
@@ -65,5 +73,8 @@ def c_string(text: str) -> str:
 
 
 def c_comment(text: str) -> str:
-    """Return a text for a C comment. Characters that could end the comment or begin another are replaced by `_`."""
+    """Return a text for a C comment.
+
+    Characters that could end the comment, or begin another comment, are replaced by `_`.
+    """
     return "".join(sign if sign.isascii() and (sign.isalnum() or sign in " ._-,:()=/") else "_" for sign in text)

@@ -12,6 +12,7 @@ from msgspec.structs import asdict
 from isocharge.common.errors import DeviceError
 from isocharge.common.files import new_folder, refuse_existing, write_whole
 from isocharge.serve.live.device import ANY_BOARD, Device
+from isocharge.serve.live.reading_stream import check_channels
 from isocharge.serve.model.model_folder import load_model
 from isocharge.serve.signal_chain.chain import Chain
 from isocharge.serve.signal_chain.hum import MIN_SQUARED_STEP
@@ -51,21 +52,43 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
     }
     if chain.limit_pC is not None:
         numbers["LIMIT_PC"] = c_double(chain.limit_pC)
-    leak = None if chain.tau_s is None else chain.leak
-    rules = {"HUM": chain.hum, "TARE": chain.tare, "LEAK": leak, "TOUCH": chain.touch, "THERMAL": chain.thermal}
-    for prefix, rule in rules.items():
-        settings: dict[str, Any] = {} if rule is None else asdict(rule)
+    for prefix, settings in _stage_settings(chain).items():
         is_on = settings.pop("on", False)
         numbers[SWITCHES[prefix]] = str(int(is_on))
-        settings.pop("pC_per_K", None)  # a chain in C has no pyroelectric charges
-        if prefix == "LEAK" and leak is not None:
-            del settings["tau_s"]
-            settings = {"tau_s": chain.tau_s, **settings}  # a time constant for each electrode, not only one
         for name, value in settings.items():
             c_name = C_NAMES.get(name, name.upper())
             numbers[f"{prefix}_{c_name}"] = _number(value)
     lines = "\n".join(f"#define ISOCHARGE_{name} {text}" for name, text in numbers.items())
-    return source_text("isocharge_device.h", board=c_comment(device.name), lines=lines)
+    return source_text("isocharge_device.h", origin=settings_origin(device), lines=lines)
+
+
+def settings_origin(device: Device) -> str:
+    """Return the words that state where the settings of the signal chain come from, for comments and the README."""
+    if device is ANY_BOARD:
+        return "the defaults, because no device file was given"
+    return f'from the device file "{c_comment(device.name)}"'
+
+
+def _stage_settings(chain: Chain) -> dict[str, dict[str, Any]]:
+    """Return the settings of each stage of a signal chain, by the prefix of its macros in C.
+
+    A stage that is missing in the chain has no settings. The switch `on` of a stage is one of its settings.
+
+    Args:
+        chain: The signal chain.
+    """
+    leak = None if chain.tau_s is None else chain.leak
+    stages = {"HUM": chain.hum, "TARE": chain.tare, "LEAK": leak, "TOUCH": chain.touch, "THERMAL": chain.thermal}
+    settings_by_prefix: dict[str, dict[str, Any]] = {}
+    for prefix, stage in stages.items():
+        settings = {} if stage is None else asdict(stage)
+        settings.pop("pC_per_K", None)  # a chain in C has no pyroelectric charges
+        settings_by_prefix[prefix] = settings
+    if leak is not None:
+        del settings_by_prefix["LEAK"]["tau_s"]
+        # The chain has a time constant for each electrode, and the stage only one for all.
+        settings_by_prefix["LEAK"] = {"tau_s": chain.tau_s, **settings_by_prefix["LEAK"]}
+    return settings_by_prefix
 
 
 def _check_exists_in_c(where: str, chain: Chain) -> None:
@@ -94,10 +117,14 @@ def _check_exists_in_c(where: str, chain: Chain) -> None:
 
 
 def _number(value: Any) -> str:
-    """Return a number, a truth value or an array as a C literal."""
+    """Return a number, a truth value or an array as a C literal. A truth value becomes 0 or 1.
+
+    Args:
+        value: The number, truth value or array.
+    """
     if isinstance(value, np.ndarray):
         return c_doubles(value)
-    if isinstance(value, int):
+    if isinstance(value, int):  # truth values are integers as well
         return str(int(value))
     return c_double(value)
 
@@ -127,6 +154,7 @@ def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: 
     Raises:
         ModelError: If the model is missing or damaged, or its graph was not written by isocharge.
         DeviceError: If the device file is for other electrodes.
+        ChargeError: If the device file has no channel for an electrode.
         OutputExists: If the folder exists.
         OutputError: If the file system refuses to write. No files remain then.
     """
@@ -150,11 +178,14 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
     Raises:
         ModelError: If the model is missing or damaged, or its graph was not written by isocharge.
         DeviceError: If the device file is for other electrodes.
+        ChargeError: If the device file has no channel for an electrode.
     """
     loaded = load_model(model)
     path = loaded.folder / "model.onnx"
     metadata = loaded.metadata
+    check_channels(device, metadata.electrodes, f"model {metadata.label}")
     network = read_graph(path.read_bytes(), str(path))
+    command_in_one_line = " ".join(command.replace("`", "'").split())
     files = {
         "isocharge_model.h": model_header(metadata, network),
         "isocharge_model.c": model_source(metadata, network),
@@ -164,12 +195,14 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
         "README.md": source_text(
             "README.md",
             label=metadata.label,
-            command=" ".join(command.replace("`", "'").split()) or "isocharge train export-c",
+            command=command_in_one_line or "isocharge train export-c",
             charges=", ".join(["800.0f"] * len(metadata.electrodes)),
             electrodes=c_comment(", ".join(metadata.electrodes)),
-            board=c_comment(device.name),
+            origin=settings_origin(device),
         ),
     }
+
+    # The sketch for Arduino has a folder of its own, with copies of the sources.
     sketch = {name: files[name] for name in ("isocharge_model.h", "isocharge_model.c", *BOARD_SOURCES)}
     sketch["isocharge_device.h"] = SINGLE_PRECISION + files["isocharge_device.h"]
     pins = ", ".join(f"A{pin_index}" for pin_index in range(len(metadata.electrodes)))

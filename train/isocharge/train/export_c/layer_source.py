@@ -1,10 +1,10 @@
 """C source of a layer of a network: a function with constant arrays.
 
-A layer computes y = f(x W + c). The weights W have the shape (inputs, outputs). The products with a few rows of W at a
-time are added to all outputs. The inner loop runs over neighbouring outputs, and its number of iterations is constant.
-Compilers therefore vectorise the loop from -O2 on without changing the order of any sum. If two perceptrons run side by
-side, the weights are two blocks, and the zeros beside the blocks are left out. Weights that training rounded to 8 bits
-take one byte each.
+A layer computes y = f(x W + c). The weights W have the shape (inputs, outputs). The products with a few rows of W are
+added to all outputs at a time. The inner loop runs over neighbouring outputs, and its number of iterations is constant.
+With -O2 or a higher level of optimisation, compilers therefore vectorise the loop without changing the order of any
+sum. If two perceptrons run side by side, the weights are two blocks, and the zeros beside the blocks are left out.
+Weights that training rounded to 8 bits take one byte each.
 """
 
 from collections.abc import Sequence
@@ -55,7 +55,7 @@ class LayerSource:
     activation: Activation | None = None
 
     def text(self) -> str:
-        """Return the constant arrays and the function.
+        """Return the C text of the constant arrays, and of the function that computes y = activation(x @ weight + c).
 
         The function adds c last, because intermediate sums would otherwise be rounded to the digits of a large c.
         """
@@ -68,18 +68,20 @@ class LayerSource:
             arrays.append(c_array(f"{self.name}_scale", scale))
         if self.bias is not None:
             arrays.append(c_array(f"{self.name}_bias", self.bias))
-        answer = "y[j] + c[j]" if scale is None else f"y[j] * {self.name}_scale[j] + c[j]"
+
+        result = "y[j] + c[j]" if scale is None else f"y[j] * {self.name}_scale[j] + c[j]"
         if self.activation is not None:
-            answer = f"{self.activation.c_function}({answer})"
+            result = f"{self.activation.c_function}({result})"
+        products = [_add_product(name, block, values[block]) for name, block in named_blocks]
         lines = [
             f"/* {n_input} numbers x to {n_output} numbers y */",
             f"static void {self.name}(const float *restrict x, const float *restrict c, float *restrict y)",
             "{",
             f"    for (int j = 0; j < {n_output}; ++j)",
             "        y[j] = 0.0f;",
-            *chain.from_iterable(_add_product(name, block, values[block]) for name, block in named_blocks),
+            *chain.from_iterable(products),
             f"    for (int j = 0; j < {n_output}; ++j)",
-            f"        y[j] = {answer};",
+            f"        y[j] = {result};",
             "}",
             "",
         ]
@@ -88,6 +90,9 @@ class LayerSource:
 
 def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Block, ...]]:
     """Find the blocks of consecutive layers: two where two perceptrons run side by side, otherwise one.
+
+    The layers are examined from the last to the first one, because the outputs of the last layer are known to belong to
+    one or the other perceptron. The rows of a layer then tell which of its inputs belong to which perceptron.
 
     Args:
         weights: Weights of each layer except the first one, whose inputs both perceptrons share.
@@ -125,14 +130,18 @@ def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
         Integers and the scale, shape (outputs,); or the unchanged weights and None, if some weights are no multiples.
     """
     scale = np.abs(values).max(axis=0) / np.float32(LARGEST_INT8)
-    multiples = np.round(values / np.where(scale > 0.0, scale, 1.0))
-    if np.allclose(multiples * scale, values, rtol=INT8_TOLERANCE, atol=0.0):
+    divisor = np.where(scale > 0.0, scale, 1.0)  # a column of zeros has the scale 0
+    multiples = np.round(values / divisor)
+    are_multiples = np.allclose(multiples * scale, values, rtol=INT8_TOLERANCE, atol=0.0)
+    if are_multiples:
         return multiples.astype(np.int8), scale
     return values, None
 
 
 def _add_product(name: str, block: Block, values: NDArray[Any]) -> list[str]:
-    """Return the lines that add the product of x and one block to y.
+    """Return the lines of C that add the product of the inputs x and one block of the weights to the outputs y.
+
+    One pass over the outputs adds the products of up to `N_ROWS` inputs, so that y is read and written less often.
 
     Args:
         name: Name of the array with the weights of the block.
@@ -144,7 +153,9 @@ def _add_product(name: str, block: Block, values: NDArray[Any]) -> list[str]:
     is_int8 = values.dtype == np.int8
     number_type = "signed char" if is_int8 else "float"
     cast = "(float)" if is_int8 else ""
-    n_grouped = n_row - n_row % N_ROWS  # these rows are added in groups of N_ROWS, the remaining rows in one group
+
+    # Full groups of N_ROWS rows come first. The remaining rows form one smaller group.
+    n_grouped = n_row - n_row % N_ROWS
     lines = []
     for begin, end in ((0, n_grouped), (n_grouped, n_row)):
         group_size = min(N_ROWS, end - begin)

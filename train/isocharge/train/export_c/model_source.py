@@ -90,20 +90,33 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
 
 
 def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSource, LayerSource]:
-    """Return the hidden layers, the skip layer and the output layer of a network."""
+    """Return the hidden layers, the skip layer and the output layer of a network.
+
+    The weights are single-precision numbers. If the features are logarithms, the layers that read the features are
+    changed by `_weights_on_differences`.
+
+    Args:
+        network: The network.
+    """
     perceptron = network.layers
     is_logarithmic = network.features.mean is None
-    from_inputs = _weights_on_differences if is_logarithmic else _singles
+    weights_on_inputs = _weights_on_differences if is_logarithmic else _singles
     first, *others = perceptron.hidden
     other_weights = [_singles(layer.weight) for layer in others]
     last_weight = _singles(perceptron.last.weight)
-    *other_blocks, last_blocks = find_blocks([*other_weights, last_weight], network.angle_columns.stop)
+    # The outputs before the misfit vector belong to the contact perceptron.
+    n_contact_output = network.angle_columns.stop
+    *other_blocks, last_blocks = find_blocks([*other_weights, last_weight], n_contact_output)
 
-    hidden = [LayerSource("layer_0", from_inputs(first.weight), _singles(first.bias), activation=perceptron.activation)]
-    for number, (layer, weight, blocks) in enumerate(zip(others, other_weights, other_blocks, strict=True), start=1):
+    first_weight = weights_on_inputs(first.weight)
+    hidden = [LayerSource("layer_0", first_weight, _singles(first.bias), activation=perceptron.activation)]
+    for layer_index, (layer, weight, blocks) in enumerate(
+        zip(others, other_weights, other_blocks, strict=True), start=1
+    ):
         bias = _singles(layer.bias)
-        hidden.append(LayerSource(f"layer_{number}", weight, bias, blocks, perceptron.activation))
-    skip = LayerSource("skip", from_inputs(perceptron.skip), _singles(perceptron.last.bias))
+        hidden.append(LayerSource(f"layer_{layer_index}", weight, bias, blocks, perceptron.activation))
+    # The bias of the output layer is added with the skip layer.
+    skip = LayerSource("skip", weights_on_inputs(perceptron.skip), _singles(perceptron.last.bias))
     last = LayerSource("last", last_weight, blocks=last_blocks)
     return hidden, skip, last
 
@@ -143,7 +156,14 @@ def self_test(golden: Golden) -> str:
 
 
 def _features_source(features: ChargeFeatures) -> str:
-    """Return the C function `features`, which computes the inputs of the first layer from the charges."""
+    """Return the C function `features`, which computes the inputs of the first layer from the charges.
+
+    Logarithmic features have the same limits for all electrodes. Features of charges of both signs have limits and a
+    mean for each electrode.
+
+    Args:
+        features: Typical charges, limits and means of the features.
+    """
     factor = _singles(1.0 / features.typical_pC)
     if features.mean is None:
         return source_text(

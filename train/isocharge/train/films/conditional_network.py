@@ -1,13 +1,10 @@
 """The network for all films during training: a perceptron whose weights depend on the film.
 
-The inputs are logarithms of the charges, from which the exact scales of the film are subtracted (`film_scaling`). A
-small context network turns the context of the film, a few numbers that describe it, into a vector psi. The weights of
-layer l are then
-
-    W_l = W_l0 + sum over k of phi_lk W_lk,    phi linear in psi,
-
-and the bias is linear in psi. The skip layer has weights of the same form. For one film, the result is an ordinary
-perceptron (`films_model.ConditionalWeights`).
+The inputs are logarithms of the charges, from which the exact scales of the film are subtracted (`film_scaling`). The
+context of a film consists of a few numbers that describe the film. A small context network converts the context into a
+vector psi. The weights of layer l are then W_l = W_l0 + sum over k of phi_lk W_lk. The factors phi and the biases are
+linear functions of psi. The skip layer has weights of the same form. For one film, the result is an ordinary perceptron
+(`films_model.ConditionalWeights`).
 """
 
 from dataclasses import dataclass
@@ -99,7 +96,9 @@ class FilmInputs:
 
 
 class ConditionalPerceptron(nn.Module):
-    """A perceptron with a skip layer, in which all weights depend on the film. It is evaluated for many films at once.
+    """A perceptron with a skip layer, in which all weights depend on the film.
+
+    The perceptron is evaluated for many films at once.
 
     Args:
         n_input: Number of electrodes.
@@ -117,7 +116,11 @@ class ConditionalPerceptron(nn.Module):
         n_context: int,
         activation: Activation = TANH,
     ) -> None:
-        """Create the layers with random weights. At the beginning, the biases do not depend on the film.
+        """Create the layers with random weights.
+
+        The weights of each layer are a constant matrix plus `N_BASES` matrices, whose factors phi depend on the film. A
+        small network computes these factors and the biases from the context. At the beginning, the biases do not depend
+        on the film.
 
         Args:
             n_input: Number of inputs.
@@ -128,7 +131,7 @@ class ConditionalPerceptron(nn.Module):
         """
         super().__init__()
         self.activation = activation
-        sizes = list(pairwise((n_input, *hidden, n_output)))
+        sizes = list(pairwise((n_input, *hidden, n_output)))  # numbers of inputs and outputs of each layer
         context_sizes = [(n_context, CONTEXT_WIDTH), (CONTEXT_WIDTH, CONTEXT_WIDTH)]
         self.context = nn.ModuleDict(
             {name: nn.Linear(*size) for name, size in zip(CONTEXT_LAYERS, context_sizes, strict=True)}
@@ -138,7 +141,9 @@ class ConditionalPerceptron(nn.Module):
         self.bias = nn.ModuleList([nn.Linear(CONTEXT_WIDTH, width) for _, width in sizes])
         self.skip = nn.Parameter(torch.zeros(n_input, n_output))
         self.skip_bases = nn.Parameter(torch.zeros(N_BASES, n_input, n_output))
-        self.phi = nn.Linear(CONTEXT_WIDTH, N_BASES * (len(sizes) + 1))
+        n_mixed_matrix = len(sizes) + 1  # the layers and the skip layer
+        self.phi = nn.Linear(CONTEXT_WIDTH, N_BASES * n_mixed_matrix)
+
         for linear in self.bias:
             nn.init.zeros_(linear.weight)  # type: ignore[arg-type]
         nn.init.normal_(self.phi.weight, std=INITIAL_PHI_STD / np.sqrt(CONTEXT_WIDTH))
@@ -157,14 +162,21 @@ class ConditionalPerceptron(nn.Module):
         return evaluate(self.definition(context), inputs)
 
     def definition(self, context: Tensor) -> Perceptron[Tensor]:
-        """Return the perceptrons of films with contexts of shape (n_film, n_context)."""
+        """Return the perceptrons of films, as one perceptron whose weights have a first axis for the film.
+
+        Args:
+            context: Contexts of the films, shape (n_film, n_context).
+        """
+        n_layer = len(self.constant)
         context_layers = [Layer(linear.weight.T, linear.bias) for linear in self._context_linears()]
         psi = evaluate_hidden_layers(context_layers, self.activation, context)
-        phi = self.phi(psi).view(len(context), len(self.constant) + 1, N_BASES)
+        phi = self.phi(psi).view(len(context), n_layer + 1, N_BASES)  # one row for each layer and for the skip layer
+
         layers = []
         for layer_index, (constant, bases, bias) in enumerate(zip(self.constant, self.bases, self.bias, strict=True)):
-            layers.append(Layer(_mix(constant, bases, phi[:, layer_index]), bias(psi)[:, None]))
-        skip = _mix(self.skip, self.skip_bases, phi[:, len(layers)])
+            weight = _mix(constant, bases, phi[:, layer_index])
+            layers.append(Layer(weight, bias(psi)[:, None]))
+        skip = _mix(self.skip, self.skip_bases, phi[:, n_layer])
         *hidden, last = layers
         return Perceptron(tuple(hidden), last, skip, self.activation)
 

@@ -1,4 +1,4 @@
-"""Exact scales of the charges of films, and the context, which describes the other properties of a film.
+"""Scaling of the charges of films, and the context: the properties of a film on which the scaled charges depend.
 
 With the stretching stiffness E h, the geometric mean d of d31 and d32, and the gain g of an electrode,
 
@@ -6,8 +6,8 @@ With the stretching stiffness E h, the geometric mean d of d31 and d32, and the 
 
 The context contains the softened pretension over E, ln(d31 / d32), h, the position of the film's centre in the frame of
 the electrodes, the rotation of the film, and the radius of the probe. The noise and the limits of the domain do not
-scale with the film. The context therefore also contains the scales by which charges and forces are divided. These are
-the scale of all charges, the scale of the force, and the gain of each electrode relative to the mean gain.
+scale with the film. The context therefore also contains the scales by which charges and forces are divided. The scales
+are the scale of all charges, the scale of the force, and the gain of each electrode relative to the mean gain.
 """
 
 from dataclasses import dataclass
@@ -72,7 +72,10 @@ class FilmScaling:
         return rotation
 
     def offset(self, parameters: Array) -> Array:
-        """Compute the vector o of `to_film`.
+        """Compute the vector o of `to_film` in unit coordinates.
+
+        The first two components of o are the displacement of the electrodes without their rotation about the origin.
+        The third component is the logarithm of the stiffness.
 
         Args:
             parameters: Shape (..., n_parameter).
@@ -80,11 +83,15 @@ class FilmScaling:
         Returns:
             Shape (..., 3).
         """
+        # A point p moves with the electrodes to R (p - s) + s + ds, where s is the shift in the sensor file and ds the
+        # additional shift of the film. The part that does not depend on p is s + ds - R s.
         described_shift = np.array(self.prior.sensor.calibration.shift)
         rotated_shift = _rotation(_shared(parameters, "rotation")) @ described_shift
-        shift = described_shift + _shift(parameters) - rotated_shift
+        position_offset = described_shift + _shift(parameters) - rotated_shift
+
         log_stiffness = _shared(parameters, "young") + _shared(parameters, "thickness")
-        return np.asarray(np.concatenate([shift, log_stiffness[..., None]], axis=-1) / self.domain.scale)
+        offset = np.concatenate([position_offset, log_stiffness[..., None]], axis=-1)  # x, y and ln F
+        return np.asarray(offset / self.domain.scale)
 
     def to_film(self, parameters: Array, unit: Array) -> Array:
         """Transform unit coordinates on the described film to those on another film: T u + o.
@@ -132,10 +139,13 @@ class FilmScaling:
         young = film.young * np.exp(_shared(parameters, "young"))
         strain = _shared(parameters, "pretension") / young
         shift = described_shift + _shift(parameters)
+
+        # Centre of the film in the axes of the electrodes, relative to its described position. The shifts get a last
+        # axis for the product of matrix and vector.
         rotation_to_electrodes = _rotation(-_shared(parameters, "rotation"))
-        # Centre of the film in the axes of the electrodes, relative to its described position
-        centre = described_shift - (rotation_to_electrodes @ shift[..., None])[..., 0]
-        gains = _gains(parameters)
+        rotated_shift = (rotation_to_electrodes @ shift[..., None])[..., 0]
+        centre = described_shift - rotated_shift
+
         shared_columns = [
             np.log(strain + SOFTENING),
             _shared(parameters, "d31") - _shared(parameters, "d32"),
@@ -147,6 +157,7 @@ class FilmScaling:
             self.log_charge_scale(parameters).mean(axis=-1),
             _shared(parameters, "young") + _shared(parameters, "thickness"),
         ]
+        gains = _gains(parameters)
         relative_gains = gains - gains.mean(axis=-1, keepdims=True)
         return np.concatenate([np.stack(shared_columns, axis=-1), relative_gains], axis=-1)
 

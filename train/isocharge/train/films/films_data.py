@@ -21,7 +21,7 @@ from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import Domain, FunctionMap, linearised
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
-from isocharge.train.data.misfit_charges import draw_misfit_examples
+from isocharge.train.data.misfit_charges import ExampleOptions, draw_misfit_examples
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses, draw_contacts
 
 CHUNK = 16
@@ -70,12 +70,15 @@ class FilmPresses:
     def charge(self) -> Array:
         """Compute the charges of the films without noise.
 
+        The parts of the charges for d31, d32 and d33 are multiplied by the factors of the film and added. The sums are
+        multiplied by the gains of the electrodes.
+
         Returns:
             Charges, shape (n_film, n_press, n_electrode), pC.
         """
         d31_factor = np.exp(self.parameters[:, D31])
         d32_factor = np.exp(self.parameters[:, D32])
-        d33_factor = np.ones(len(self))
+        d33_factor = np.ones(len(self))  # d33 is the same for all films
         part_factors = np.stack([d31_factor, d32_factor, d33_factor], axis=1)
         gain_factors = np.exp(self.parameters[:, GAINS])
         # Sum over the parts c, for each film f, press p and electrode e.
@@ -111,12 +114,14 @@ def draw_film_presses(
         DatasetError: If too many charges are not positive.
     """
     parameters = prior.draw(np.random.default_rng([seed, 0]), films)
-    jobs = [(start, parameters[start : start + CHUNK]) for start in range(0, films, CHUNK)]
-    work = partial(_press_films, prior, family, domain, presses, seed)
-    chunks = list(track(in_order(executor, work, jobs), "pressing films", len(jobs)))
+    jobs = [(first_film, parameters[first_film : first_film + CHUNK]) for first_film in range(0, films, CHUNK)]
+    press_films = partial(_press_films, prior, family, domain, presses, seed)
+    chunks = list(track(in_order(executor, press_films, jobs), "pressing films", len(jobs)))
+
+    # The third axis contains the contact and then the response of each electrode.
     contact, response = np.split(np.concatenate(chunks), [1], axis=2)
     drawn = FilmPresses(parameters, contact[:, :, 0], response)
-    _check_positive(drawn)
+    _check_charges_are_positive(drawn)
     return drawn
 
 
@@ -124,6 +129,8 @@ def _press_films(
     prior: FilmPrior, family: FilmFamily, domain: Domain, presses: int, seed: int, job: tuple[int, Array]
 ) -> Singles:
     """Compute presses on some films.
+
+    A job returns a single array to the executor, so the contacts and the responses are joined in one array.
 
     Args:
         prior: Distribution of the films.
@@ -140,12 +147,20 @@ def _press_films(
     # The numbers after the seed make this sequence independent of those of the films and of other jobs.
     rng = np.random.default_rng([seed, 1, first_film])
     contacts = np.stack([draw_contacts(rng, domain, presses) for _ in parameters])
-    responses = [_response(prior, family, *film) for film in zip(parameters, contacts, strict=True)]
-    return np.concatenate([contacts[:, :, None], np.stack(responses)], axis=2).astype(np.float32)
+    responses = np.stack(
+        [
+            _response(prior, family, film_parameters, film_contacts)
+            for film_parameters, film_contacts in zip(parameters, contacts, strict=True)
+        ]
+    )
+    return np.concatenate([contacts[:, :, None], responses], axis=2).astype(np.float32)
 
 
 def _response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: Array) -> Array:
-    """Compute the parts of the charges of one film for the described coefficients and gains.
+    """Compute the parts of the charges of one film that are due to d31, to d32 and to d33.
+
+    The piezoelectric coefficients and the gains are those of the sensor file. The coefficients and gains of the film
+    are factors of the parts, which `FilmPresses.charge` applies.
 
     Args:
         prior: Distribution of the films.
@@ -156,10 +171,12 @@ def _response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: 
     Returns:
         Parts for d31, d32 and d33, shape (n_press, n_electrode, 3), pC.
     """
-    described = parameters.copy()
-    described[[D31, D32]] = 0.0
-    described[GAINS] = 0.0
-    forward_map = family.forward_map(*prior.film(described))
+    # The coefficients and the gains are logarithms of factors, so zero stands for the values in the sensor file.
+    without_factors = parameters.copy()
+    without_factors[[D31, D32]] = 0.0
+    without_factors[GAINS] = 0.0
+    sensor, probe = prior.film(without_factors)
+    forward_map = family.forward_map(sensor, probe)
     piezo = prior.sensor.piezo
     no_charge = np.zeros((len(contact), len(prior.sensor.electrodes)))
 
@@ -167,29 +184,44 @@ def _response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: 
         """Return the charges of the film with other piezoelectric coefficients, shape (n_press, n_electrode), pC."""
         if d31 == 0.0 and d32 == 0.0:
             return no_charge
-        sensor = replace(forward_map.sensor, piezo=Piezo(d31, d32, d33))
-        return replace(forward_map, sensor=sensor).charges(contact)
+        other_sensor = replace(forward_map.sensor, piezo=Piezo(d31, d32, d33))
+        return replace(forward_map, sensor=other_sensor).charges(contact)
 
     d31_part = charges(piezo.d31, 0.0)
     d32_part = charges(0.0, piezo.d32)
     d33_part = no_charge
     if piezo.d33 != 0.0:
-        d33_part = charges(piezo.d31, piezo.d32, piezo.d33) - d31_part - d32_part
+        # The charge is a sum of three parts. No charge is computed for d33 alone, so its part is what remains.
+        all_parts = charges(piezo.d31, piezo.d32, piezo.d33)
+        d33_part = all_parts - d31_part - d32_part
     return np.stack([d31_part, d32_part, d33_part], axis=-1)
 
 
-def _check_positive(drawn: FilmPresses) -> None:
-    """Raise a DatasetError if too many presses have a charge that is not positive."""
+def _check_charges_are_positive(drawn: FilmPresses) -> None:
+    """Check that at most the fraction `MAX_NEGATIVE_FRACTION` of the presses has a charge that is zero or negative.
+
+    The network learns from the logarithms of the charges, so it needs positive charges.
+
+    Args:
+        drawn: The drawn presses.
+
+    Raises:
+        DatasetError: If there are more such presses. The message describes the first one.
+    """
     charge = drawn.charge()
-    has_negative = (charge <= 0.0).any(axis=-1)
-    if has_negative.mean() > MAX_NEGATIVE_FRACTION:
-        film, row = (int(index) for index in np.argwhere(has_negative)[0])
-        raise DatasetError(
-            f"{has_negative.mean():.0%} of the presses give an electrode no positive charge, expected at most "
-            f"{MAX_NEGATIVE_FRACTION:.0%} (the features are logarithms); the first: film {film}, "
-            f"{drawn.contact[film, row].tolist()} (mm, mm, N), {charge[film, row].tolist()} pC; check d31 "
-            "and d32, or ask for a smaller radius"
-        )
+    is_unusable = (charge <= 0.0).any(axis=-1)  # shape (n_film, n_press)
+    unusable_fraction = is_unusable.mean()
+    if unusable_fraction <= MAX_NEGATIVE_FRACTION:
+        return
+    film_index, press_index = np.argwhere(is_unusable)[0]
+    first_contact = drawn.contact[film_index, press_index].tolist()
+    first_charge = charge[film_index, press_index].tolist()
+    raise DatasetError(
+        f"{unusable_fraction:.0%} of the presses have an electrode whose charge is zero or negative, expected at most "
+        f"{MAX_NEGATIVE_FRACTION:.0%}, because the network learns from logarithms; the first such press is on film "
+        f"{film_index}, at {first_contact} (mm, mm, N), with {first_charge} pC; check d31 and d32, or give a smaller "
+        "radius"
+    )
 
 
 @dataclass(frozen=True)
@@ -209,7 +241,10 @@ class FilmsSource:
     noise: NoiseModel
 
     def charge_map(self, parameters: Array) -> FunctionMap:
-        """Return the map of one film from contacts to charges, clipped as the input features clip them."""
+        """Return the map of one film from contacts to charges.
+
+        The charges are clipped to the limits of the input features.
+        """
         forward_map = self.family.forward_map(*self.prior.film(parameters))
 
         def charges(contact: Array) -> Array:
@@ -269,16 +304,21 @@ def _charges_of_every_kind(source: FilmsSource, charges: int, seed: int, job: tu
     """
     film_number, parameters = job
     charge_map = source.charge_map(parameters)
+    # The numbers after the seed make this sequence independent of those of other films and other purposes.
     rng = np.random.default_rng([seed, 3, film_number])
     contact = draw_contacts(rng, source.domain, charges)
     presses = LabelledPresses(contact, charge_map.charges(contact))
-    return draw_misfit_examples(presses, charge_map, source.noise, charges, seed + film_number, candidates=N_CANDIDATES)
+    options = ExampleOptions(candidates=N_CANDIDATES)
+    return draw_misfit_examples(presses, charge_map, source.noise, charges, seed + film_number, options=options)
 
 
 def draw_near_films(
     source: FilmsSource, films: int, presses: int, seed: int, executor: Executor | None = None
 ) -> DrawnFilms:
-    """Draw films and good presses on each film. The nearest contact of a good press is found without a search.
+    """Draw films and good presses on each film, with matrices that compute the residuals of the presses.
+
+    The nearest contact of a good press is found without a search, because the charges are linearised about the true
+    contact.
 
     Args:
         source: Films and contacts.
@@ -295,6 +335,7 @@ def draw_near_films(
     parameters = source.prior.draw(np.random.default_rng([seed, 4]), films)
     jobs = in_order(executor, partial(_good_presses, source, presses, seed), enumerate(parameters))
     drawn = np.stack(list(track(jobs, "drawing good presses", films)))
+    # The last axis contains the charge and then the row of the projection matrix of each electrode.
     charge, projection = np.split(drawn, [1], axis=-1)
     return DrawnFilms(parameters, charge[..., 0], projection)
 
@@ -316,7 +357,8 @@ def _good_presses(source: FilmsSource, presses: int, seed: int, job: tuple[int, 
     contact = draw_contacts(rng, source.domain, presses)
     charge, slopes = linearised(source.charge_map(parameters), contact)
     scaled_slopes = slopes / source.noise.sigma(charge)[:, :, None]
-    # The projection removes the changes of the charges that a change of the contact explains.
+    # The projection removes the changes of the charges that a change of the contact explains. These changes are
+    # combinations of the columns of `scaled_slopes`, for which QR gives an orthonormal basis.
     basis, _ = np.linalg.qr(scaled_slopes)
     projection = np.eye(charge.shape[1]) - basis @ basis.transpose(0, 2, 1)
     return np.concatenate([charge[:, :, None], projection], axis=2)

@@ -109,7 +109,11 @@ def films_from_bytes(data: bytes, where: str) -> FilmsModel:
 
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return an npz file with LZMA compression, which reduces its size by a tenth compared with deflate."""
+    """Return an npz file with LZMA compression, which reduces its size by a tenth compared with deflate.
+
+    Args:
+        arrays: The arrays by name.
+    """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_LZMA) as file:
         for name, array in arrays.items():
@@ -119,7 +123,14 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def _arrays(data: bytes) -> dict[str, np.ndarray]:
-    """Check the checksum and the numbers, and return all arrays except the checksum."""
+    """Read the arrays of a file, check the checksum and the numbers, and return all arrays except the checksum.
+
+    Args:
+        data: Content of the file.
+
+    Raises:
+        ValueError: If the checksum does not fit, or an array is neither a text nor finite real numbers.
+    """
     arrays = npz_arrays(data)
     expected = str(arrays.pop("sha256"))
     actual = _checksum(arrays)
@@ -127,31 +138,43 @@ def _arrays(data: bytes) -> dict[str, np.ndarray]:
         raise ValueError(f"expected the checksum {expected:.12}..., got {actual:.12}...")
     for name, array in arrays.items():
         is_text = array.dtype.kind == "U" and array.ndim == 0
-        is_finite = array.dtype.kind in "fiu" and bool(np.isfinite(array).all())
+        is_real = array.dtype.kind in "fiu"  # floating-point numbers, integers and unsigned integers
+        is_finite = is_real and bool(np.isfinite(array).all())
         if not (is_text or is_finite):
             raise ValueError(f"{name}: expected a text or finite real numbers, got {array.dtype}")
     return arrays
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
-    """Return the SHA-256 checksum of names, types, shapes and numbers of arrays."""
-    total = hashlib.sha256()
+    """Return the SHA-256 checksum of names, types, shapes and numbers of arrays.
+
+    Args:
+        arrays: The arrays by name.
+    """
+    checksum = hashlib.sha256()
     for name in sorted(arrays):
         array = arrays[name]
-        total.update(f"{name} {array.dtype.str} {array.shape} ".encode())
-        total.update(array.tobytes())
-    return total.hexdigest()
+        checksum.update(f"{name} {array.dtype.str} {array.shape} ".encode())
+        checksum.update(array.tobytes())
+    return checksum.hexdigest()
 
 
 def _about(films: FilmsModel) -> dict[str, Any]:
-    """Return the JSON object of a model. If the activation is tanh, the object has no entry for it."""
+    """Return the JSON object of a model, which describes its films, domain and noise.
+
+    The numbers are converted into the units of the file. If the activation is tanh, the object has no entry for it.
+
+    Args:
+        films: The model.
+    """
     prior = films.prior
     activation = films.contact.activation
+    spread = {name: _converted(value, FILE_UNITS.get(name, 1.0)) for name, value in asdict(prior.spread).items()}
     about = {
         "format": FORMAT,
         "sensor": sensor_to_dict(prior.sensor),
         "probe_radius": _converted(prior.probe.radius, FILE_UNITS["probe_radius"]),
-        "spread": {name: _converted(value, FILE_UNITS.get(name, 1.0)) for name, value in asdict(prior.spread).items()},
+        "spread": spread,
         "radius_mm": films.domain.radius,
         "force_range_N": list(films.domain.force_range),
         "noise": {**asdict(films.noise), "white": _converted(films.noise.white, FILE_PC)},
@@ -162,7 +185,7 @@ def _about(films: FilmsModel) -> dict[str, Any]:
 
 
 def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str) -> FilmsModel:
-    """Return the model of a file.
+    """Return the model of a file. This is the inverse of `_about` and of the functions that write the arrays.
 
     Args:
         about: The JSON object of the file.
@@ -177,10 +200,11 @@ def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str)
     prior = FilmPrior(sensor_from_dict(about["sensor"]), probe, FilmSpread(**spread))
     noise = about["noise"]
     min_force, max_force = about["force_range_N"]
+    domain = Domain(float(about["radius_mm"]), (float(min_force), float(max_force)))
     activation = ACTIVATIONS[about.get("activation", TANH.name)]
     model = FilmsModel(
         family=FilmFamily.from_arrays(_within(arrays, "family")),
-        scaling=FilmScaling(prior, Domain(float(about["radius_mm"]), (float(min_force), float(max_force)))),
+        scaling=FilmScaling(prior, domain),
         mean=arrays["mean"],
         whitening=arrays["whitening"],
         contact=_unpacked(_within(arrays, "contact"), activation),
@@ -188,6 +212,7 @@ def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str)
         noise=NoiseModel(**{**noise, "white": _converted(noise["white"], 1.0 / FILE_PC)}),
         sha256=sha256,
     )
+
     n_electrode = len(prior.sensor.electrodes)
     if model.mean.shape != (n_electrode,) or model.whitening.shape != (n_electrode, n_electrode):
         raise InputError(f"inputs of {model.mean.size} electrodes, a sensor with {n_electrode}")
@@ -207,7 +232,10 @@ def _within(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np.ndarray
 
 
 def _packed(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarray]:
-    """Round weights to integers with a scale for each row.
+    """Round weights to integers with a scale for each row of their last axis.
+
+    A weight is approximately its integer times the scale of its row. The largest magnitude in a row becomes the largest
+    integer of `BITS` bits.
 
     Args:
         part: Name of the part of the file.
@@ -219,8 +247,9 @@ def _packed(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarray]:
     largest_integer = 2 ** (BITS - 1) - 1
     packed: dict[str, np.ndarray] = {}
     for name, values in weights.items():
-        largest = np.maximum(np.abs(values).max(axis=-1, keepdims=True), MIN_LARGEST_WEIGHT)
-        scale = (largest / largest_integer).astype(np.float32)
+        # The lower limit avoids a division by zero for a row of zeros.
+        row_largest = np.maximum(np.abs(values).max(axis=-1, keepdims=True), MIN_LARGEST_WEIGHT)
+        scale = (row_largest / largest_integer).astype(np.float32)
         packed[f"{part}.{name}"] = np.round(values / scale).astype(np.int16)
         packed[f"{part}.{name}.scale"] = scale
     return packed
@@ -232,6 +261,9 @@ def _unpacked(packed: Mapping[str, np.ndarray], activation: Activation) -> Condi
     Args:
         packed: Integers and scales by their names in the part of the file.
         activation: Activation of the hidden layers.
+
+    Raises:
+        ValueError: If a layer is wider than `MAX_LAYER_WIDTH`.
     """
     names = [name for name in packed if not name.endswith(".scale")]
     for name in names:

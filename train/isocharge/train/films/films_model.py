@@ -55,6 +55,9 @@ class ConditionalWeights:
     def perceptron(self, context: Array) -> Perceptron[Array]:
         """Compute the perceptron of one film.
 
+        Two context layers compute features psi of the film. The factors phi, by which the matrices of each layer are
+        mixed, and the biases are linear functions of psi.
+
         Args:
             context: Numbers that describe the film, shape (n_context,).
 
@@ -64,7 +67,7 @@ class ConditionalWeights:
         context_layers = [self._linear(f"context.{name}") for name in CONTEXT_LAYERS]
         psi = evaluate_hidden_layers(context_layers, self.activation, context)
         n_layer = sum(name.startswith("constant.") for name in self.arrays)
-        phi = self._apply_linear("phi", psi).reshape(n_layer + 1, -1)
+        phi = self._apply_linear("phi", psi).reshape(n_layer + 1, -1)  # one row for each layer and for the skip layer
         layers = []
         for index in range(n_layer):
             weight = self._mix(f"constant.{index}", f"bases.{index}", phi[index])
@@ -75,7 +78,7 @@ class ConditionalWeights:
         return Perceptron(tuple(hidden), output_layer, skip_weight, self.activation)
 
     def _linear(self, name: str) -> Layer[Array]:
-        """Return a linear layer; the file holds its weight with shape (n_output, n_input)."""
+        """Return a linear layer, whose weight has the shape (n_output, n_input) in the file."""
         return Layer(self.arrays[f"{name}.weight"].T, self.arrays[f"{name}.bias"])
 
     def _apply_linear(self, name: str, value: Array) -> Array:
@@ -159,6 +162,10 @@ class FilmsModel:
     ) -> Fitted:
         """Compute the network of one film in the form that a release needs.
 
+        The network is first computed from the parameters and adapted to the factors of the charges. After that, the
+        correlations of the network are fitted, and the added variances are included. Each correction is fitted to
+        presses on the simulated film.
+
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
             provenance: Additional information for the release.
@@ -180,35 +187,39 @@ class FilmsModel:
         network = self.fold(parameters)
         sensor, probe = self.prior.film(parameters)
         rng = np.random.default_rng(SEED)
+
+        # Contacts for the test, for the corrections, and for the added variances. The number of drawn contacts is
+        # fixed, so that the contacts for the corrections do not depend on `n_test`.
         n_train = N_CORRELATION_PRESSES if correlation else N_REGRESSION_PRESSES
-        # The number of drawn contacts is fixed, so that the contacts for training do not depend on `n_test`.
         drawn_contact = draw_contacts(rng, self.domain, N_TEST_PRESSES + N_CORRELATION_PRESSES)
         test_contact = drawn_contact[N_TEST_PRESSES - n_test : N_TEST_PRESSES]
         train_contact = drawn_contact[N_TEST_PRESSES : N_TEST_PRESSES + n_train]
         uncertain_contact = np.empty((0, 3)) if added_variance is None else added_variance.contact
         contact = np.concatenate([test_contact, train_contact, uncertain_contact])
-        test, train, uncertain = np.split(np.arange(len(contact)), [n_test, n_test + n_train])
+        test_rows, train_rows, uncertain_rows = np.split(np.arange(len(contact)), [n_test, n_test + n_train])
 
         simulated_charge = self.forward_map(parameters).charges(contact)
         factors = np.ones(simulated_charge.shape) if charge_factor is None else charge_factor(contact)
         presses = LabelledPresses(contact, simulated_charge * factors)
         if charge_factor is not None:
-            copies = train[:N_REGRESSION_PRESSES].repeat(N_COPIES)
-            noisy = self.noise.add(presses.charge[copies], rng)
-            network = adapt_to_charges(network, noisy, noisy / factors[copies], contact[copies])
+            copied_rows = train_rows[:N_REGRESSION_PRESSES].repeat(N_COPIES)  # each copy gets its own noise
+            noisy_charge = self.noise.add(presses.charge[copied_rows], rng)
+            equivalent_charge = noisy_charge / factors[copied_rows]
+            network = adapt_to_charges(network, noisy_charge, equivalent_charge, contact[copied_rows])
         if correlation:
-            network = with_correlation(network, presses[train], self.noise, SEED)
+            network = with_correlation(network, presses[train_rows], self.noise, SEED)
         if added_variance is not None:
-            noisy = self.noise.add(presses.charge[uncertain.repeat(N_COPIES)], rng)
-            network = add_variance(network, noisy, added_variance.variance.repeat(N_COPIES, axis=0))
+            noisy_charge = self.noise.add(presses.charge[uncertain_rows.repeat(N_COPIES)], rng)
+            network = add_variance(network, noisy_charge, added_variance.variance.repeat(N_COPIES, axis=0))
+        test = presses[test_rows]
         return Fitted(
             network=network,
             sensor=sensor,
             probes=(probe.notation,),
             domain=self.domain,
             noise=self.noise,
-            test=presses[test],
-            good=presses[test],
+            test=test,
+            good=test,
             sha256=self.sha256,
             provenance=provenance or Provenance(),
             requested_domain=self.domain,
@@ -216,6 +227,9 @@ class FilmsModel:
 
     def fold(self, parameters: Array) -> FoldedNetwork:
         """Compute the network of one film without corrections, which takes a few milliseconds.
+
+        The perceptrons of contact and misfit are folded into one perceptron. The first layer includes the scaling of
+        the charges of this film. The last layer includes the rotation and the shift of its electrodes.
 
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
@@ -232,12 +246,15 @@ class FilmsModel:
                 f"film: expected {len(self.prior.names)} finite parameters ({', '.join(self.prior.names)}), got "
                 f"{parameters.tolist()}"
             )
+
         context = self.scaling.context(parameters)
         perceptrons = [weights.perceptron(context) for weights in (self.contact, self.misfit)]
-        logarithms_mean = self.mean + self.scaling.log_charge_scale(parameters)
-        features = logarithmic_features(logarithms_mean)
-        features_mean = logarithms_mean - np.log(features.typical_pC)
-        units = answer_units(
-            self.domain, self.scaling.rotation(parameters), self.scaling.offset(parameters), features.n_electrode
-        )
+
+        log_charge_mean = self.mean + self.scaling.log_charge_scale(parameters)
+        features = logarithmic_features(log_charge_mean)
+        features_mean = log_charge_mean - np.log(features.typical_pC)  # the features are ln(Q / typical charge)
+
+        rotation = self.scaling.rotation(parameters)
+        offset = self.scaling.offset(parameters)
+        units = answer_units(self.domain, rotation, offset, features.n_electrode)
         return FoldedNetwork(features, fold(perceptrons, features_mean, self.whitening, units))

@@ -32,6 +32,7 @@ from isocharge.train.films.films_data import (
     draw_near_films,
 )
 from isocharge.train.films.films_model import ConditionalWeights, FilmsModel
+from isocharge.train.films.muon import muon_and_adam
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fit import WARM_UP_FRACTION, threads_and_seed
 from isocharge.train.training.folded_network import LOG_STD, MEAN, N_CONTACT_ANSWERS
@@ -42,7 +43,7 @@ from isocharge.train.training.losses import (
     warm_up_loss,
     with_fresh_noise,
 )
-from isocharge.train.training.network import TrainablePerceptron, as_tensor, compress_length
+from isocharge.train.training.network import as_tensor, compress_length
 
 RADIUS_MARGIN = 1.5
 """Distance by which the forward maps reach beyond the domain, mm.
@@ -55,12 +56,6 @@ FORCE_MARGINS = (0.8, 1.2)
 
 LARGEST_GRADIENT = 5.0
 """Norm to which larger gradients are clipped. Films whose map nearly folds have large gradients."""
-
-MUON_RATE_FACTOR = 6.0
-"""Learning rate of Muon, relative to that of Adam. The size of a step of Muon does not depend on the gradient."""
-
-ADAM_BETAS = (0.9, 0.98)
-"""Decay rates of Adam's moving averages of the gradient and of its square."""
 
 MAX_NOISE_FACTOR = 8.0
 """Largest factor on the noise of good presses in the training of the misfit network."""
@@ -137,6 +132,9 @@ def fit_films(
 ) -> FilmsModel:
     """Train a network for films drawn from a prior.
 
+    The forward maps of the films are simulated first. The contact perceptron is then trained on presses on drawn films,
+    and the misfit perceptron on charges of every kind and on good presses.
+
     Args:
         prior: Distribution of the films: the described sensor, the probe and the standard deviations of the parameters.
         config: Radius, sizes, steps and seed.
@@ -166,30 +164,32 @@ def fit_films(
         )
         inputs = FilmInputs.fit(FilmScaling(prior, domain), presses)
         activation = ACTIVATIONS[config.activation]
-        contact = _new_perceptron(inputs, config.hidden, N_CONTACT_ANSWERS, activation)
-        _train(contact_stage(contact, inputs, presses, noise, config), config, run)
+
+        contact_perceptron = _new_perceptron(inputs, config.hidden, N_CONTACT_ANSWERS, activation)
+        _train(contact_stage(contact_perceptron, inputs, presses, noise, config), config, run)
 
         source = FilmsSource(prior, family, domain, misfit_noise(noise))
         examples = draw_misfit_films(
             source, config.misfit_films, config.misfit_charges, config.seed, saving_executor("nearest-contacts")
         )
         good = draw_near_films(source, config.near_films, config.presses, config.seed, saving_executor("good-presses"))
-        misfit = _new_perceptron(inputs, config.misfit_hidden, inputs.mean.size, activation)
-        _train(misfit_stage(misfit, inputs, examples, good, source.noise, config), config, run)
+        n_electrode = inputs.mean.size
+        misfit_perceptron = _new_perceptron(inputs, config.misfit_hidden, n_electrode, activation)
+        _train(misfit_stage(misfit_perceptron, inputs, examples, good, source.noise, config), config, run)
     return FilmsModel(
         family=family,
         scaling=inputs.scaling,
         mean=inputs.mean,
         whitening=inputs.whitening,
-        contact=ConditionalWeights(contact.to_arrays(), activation),
-        misfit=ConditionalWeights(misfit.to_arrays(), activation),
+        contact=ConditionalWeights(contact_perceptron.to_arrays(), activation),
+        misfit=ConditionalWeights(misfit_perceptron.to_arrays(), activation),
         noise=noise,
         made_with={"config": config.to_dict(), "torch": torch.__version__},
     )
 
 
 def films_identity(prior: FilmPrior, config: FilmsConfig) -> dict[str, Any]:
-    """Return all settings that determine the weights. They identify a run that can be resumed."""
+    """Return all settings that determine the weights. These settings identify a run that can be resumed."""
     return {
         "sensor": sensor_to_dict(prior.sensor),
         "probe": prior.probe.notation,
@@ -234,22 +234,6 @@ def _train(stage: TrainingStage, config: FilmsConfig, run: ResumableRun | None) 
     """Train without early stopping, because the last steps of the schedule have the smallest loss."""
     stage = replace(stage, optimisers=muon_and_adam)
     Descent(stage, config.learning_rate, stage.steps, config.seed).run(run)
-
-
-def muon_and_adam(stage: TrainingStage) -> list[torch.optim.Optimizer]:
-    """Return Muon (Jordan et al. 2024) for the constant weights between hidden layers, and Adam for all other weights.
-
-    Args:
-        stage: The training of a `ConditionalPerceptron` or a `TrainablePerceptron`.
-    """
-    network = stage.network
-    assert isinstance(network, ConditionalPerceptron | TrainablePerceptron)
-    hidden_matrices = network.hidden_matrices()
-    hidden_ids = {id(matrix) for matrix in hidden_matrices}
-    other_parameters = [parameter for parameter in network.parameters() if id(parameter) not in hidden_ids]
-    muon = torch.optim.Muon([{"params": hidden_matrices, "rate_factor": MUON_RATE_FACTOR}], weight_decay=0.0)
-    adam = torch.optim.Adam([{"params": other_parameters, "rate_factor": 1.0}], betas=ADAM_BETAS)
-    return [muon, adam]
 
 
 class _Batch(NamedTuple):
@@ -301,6 +285,8 @@ class _ContactTraining:
     def loss(self, step: int, random: torch.Generator) -> Tensor:
         """Return the loss of a random batch, in which d31, d32 and the gains of the films are drawn again.
 
+        The first steps use the warm-up loss.
+
         Args:
             step: Number of the step.
             random: Random number generator.
@@ -311,8 +297,9 @@ class _ContactTraining:
         press_rows = torch.randint(n_press, (config.batch_films, config.batch_presses), generator=random).numpy()
         prior = self.inputs.scaling.prior
         parameters = _with_fresh_factors(prior, self.presses.parameters[films], random)
+        batch = self.evaluate_batch(films, press_rows, parameters, random)
         loss_function = warm_up_loss if step < self.warm_up_steps else likelihood_loss
-        return loss_function(*self.evaluate_batch(films, press_rows, parameters, random))
+        return loss_function(*batch)
 
     def score(self) -> tuple[float, str]:
         """Return the loss on the films for validation, and a text with the errors."""
@@ -337,6 +324,7 @@ class _ContactTraining:
         Returns:
             Estimated and true contacts of all presses of the batch.
         """
+        # The index arrays have the shapes (n_film, 1) and (n_film, n_row), and select n_row presses of each film.
         film_column = films[:, None]
         contact = self.presses.contact[film_column, press_rows]
         response = self.presses.response[film_column, press_rows]
@@ -436,22 +424,24 @@ class _MisfitTraining:
         self.good_charge = as_tensor(good.charge)
         self.good_projection = as_tensor(good.target)
         n_example_film = len(self.example_inputs)
-        self.n_train = n_example_film - max(1, round(MISFIT_VALIDATION_FRACTION * n_example_film))
+        n_validation = max(1, round(MISFIT_VALIDATION_FRACTION * n_example_film))
+        self.n_train = n_example_film - n_validation
 
     def loss(self, _: int, random: torch.Generator) -> Tensor:
-        """Return the weighted sum of both losses for a random batch.
+        """Return the weighted sum of the losses of random examples and of random good presses.
 
         Args:
             _: Number of the step, which has no influence.
             random: Random number generator.
         """
-        n_film = self.config.batch_films // 2
+        n_film = self.config.batch_films // 2  # the other half of the batch are good presses
         n_press = self.config.batch_presses
         n_charge = self.example_inputs.shape[1]
         films = torch.randint(self.n_train, (n_film,), generator=random)
+        film_column = films[:, None]
         rows = torch.randint(n_charge, (n_film, n_press), generator=random)
-        misfit_vector = self.network(self.example_inputs[films[:, None], rows], self.example_context[films])
-        example_loss = mean_squared_distance(misfit_vector, self.example_targets[films[:, None], rows])
+        misfit_vector = self.network(self.example_inputs[film_column, rows], self.example_context[films])
+        example_loss = mean_squared_distance(misfit_vector, self.example_targets[film_column, rows])
         return GOOD_PRESS_WEIGHT * self.good_press_loss(n_film, n_press, random) + example_loss
 
     def score(self) -> tuple[float, str]:
@@ -467,6 +457,9 @@ class _MisfitTraining:
     def good_press_loss(self, n_film: int, n_press: int, random: torch.Generator) -> Tensor:
         """Return the loss of random good presses with new noise.
 
+        The noise of each press is multiplied by a random factor from 1 to `MAX_NOISE_FACTOR`, so that larger misfits
+        occur as well.
+
         Args:
             n_film: Number of films.
             n_press: Number of presses on each film.
@@ -475,14 +468,17 @@ class _MisfitTraining:
         n_good_film, n_good_press = self.good_charge.shape[:2]
         films = torch.randint(n_good_film, (n_film,), generator=random)
         rows = torch.randint(n_good_press, (n_film, n_press), generator=random)
-        charge = self.good_charge[films[:, None], rows]
+        film_column = films[:, None]
+        charge = self.good_charge[film_column, rows]
+
+        # The third power makes small factors frequent.
         noise_factor = 1.0 + (MAX_NOISE_FACTOR - 1.0) * torch.rand((n_film, n_press, 1), generator=random) ** 3
         deviation = noise_factor * torch.randn(charge.shape, generator=random)  # in standard deviations of the noise
         noise_std = torch.hypot(torch.tensor(self.noise.white), self.noise.gain * charge)
         noisy_charge = charge + noise_std * deviation
 
         # The residual is the part of the noise that no change of the contact explains.
-        residual = (self.good_projection[films[:, None], rows] @ deviation[..., None])[..., 0]
+        residual = (self.good_projection[film_column, rows] @ deviation[..., None])[..., 0]
         parameters = self.good.parameters[films.numpy()]
         misfit_vector = self.network(self.inputs.values(noisy_charge, parameters), self.inputs.context(parameters))
         return mean_squared_distance(misfit_vector, compress_length(residual))

@@ -1,7 +1,7 @@
 """Release of a network for all films as a model, with measured errors, a card and a folder."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -10,11 +10,13 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.contact_errors import position_error
 from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import draw_contacts
 from isocharge.train.films.films_file import FILE, films_bytes, films_from_bytes
 from isocharge.train.films.films_model import FilmsModel
 from isocharge.train.model_release.evaluate import ONLY_SIMULATED, contact_errors, rounded
 from isocharge.train.model_release.release import Release, release, yield_text
+from isocharge.train.model_release.unnoticed import unnoticed_section
 from isocharge.train.training.fitted import Fitted, Provenance
 
 N_FILMS = 64
@@ -59,9 +61,9 @@ class FilmsErrors:
 def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PRESSES, seed: int = SEED) -> FilmsErrors:
     """Measure the errors on new films from the prior, with presses that were not in the training.
 
-    The result contains position errors in mm and relative force errors in percent. They are computed over all presses,
-    for the median film and for the worst film. The result also contains the coverage of the 68 and 95 % intervals, as a
-    fraction of the coordinates from 0 to 1.
+    The result contains position errors in mm and relative force errors in percent. These errors are computed over all
+    presses, for the median film and for the worst film. The result also contains the coverage of the 68 and 95 %
+    intervals, as a fraction of the coordinates from 0 to 1.
 
     Args:
         films: The network.
@@ -75,33 +77,56 @@ def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PR
     """
     rng = np.random.default_rng(seed)
     true_films = films.prior.draw(rng, n_film)
-    contacts = []
-    charges = []
-    for parameters in true_films:
-        contact = draw_contacts(rng, films.domain, n_press)
-        charge = films.forward_map(parameters).charges(contact)
-        contacts.append(contact)
-        charges.append(films.noise.add(charge, rng))
-    true_contact = np.stack(contacts)
+    true_contact, noisy_charge = _draw_presses(films, true_films, n_press, rng)
 
     def errors_with(network_films: Array) -> Mapping[str, float]:
-        """Return the errors if the contacts of each film are estimated with the network of another film."""
-        estimates = [films.fold(film).predict(charge) for film, charge in zip(network_films, charges, strict=True)]
+        """Return the errors if the contacts on each true film are estimated with the network of another film.
+
+        Args:
+            network_films: Parameters of the film whose network is used for each true film, shape (n_film, n_parameter).
+        """
+        estimates = [
+            films.fold(network_film).predict(film_charge)
+            for network_film, film_charge in zip(network_films, noisy_charge, strict=True)
+        ]
         contact = np.stack([contact for contact, _, _ in estimates])
         std = np.stack([std for _, std, _ in estimates])
         return _errors(contact, std, true_contact)
 
+    # Two candidates for the assumed film, whose network is used for all films
     assumed_films = {"as described": films.prior.described, "in the middle of all": films.prior.mean}
     assumed_errors = {name: errors_with(np.tile(film, (n_film, 1))) for name, film in assumed_films.items()}
     rms_mm = {name: errors["position_rms_mm"] for name, errors in assumed_errors.items()}
-    best, second = sorted(rms_mm, key=lambda name: rms_mm[name])
-    best_film = assumed_films[best]
+    best_name, other_name = sorted(rms_mm, key=lambda name: rms_mm[name])
+    best_film = assumed_films[best_name]
     pretension_MPa = best_film[films.prior.index("pretension")]
     description = (
-        f"the film {best}, with a pretension of {pretension_MPa:g} MPa.\nThe error over all films is then "
-        f"{rms_mm[best]:g} mm rms (with the film {second}: {rms_mm[second]:g} mm)"
+        f"the film {best_name}, with a pretension of {pretension_MPa:g} MPa.\nThe error over all films is then "
+        f"{rms_mm[best_name]:g} mm rms (with the film {other_name}: {rms_mm[other_name]:g} mm)"
     )
-    return FilmsErrors(errors_with(true_films), assumed_errors[best], best_film, description)
+    return FilmsErrors(errors_with(true_films), assumed_errors[best_name], best_film, description)
+
+
+def _draw_presses(films: FilmsModel, true_films: Array, n_press: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Draw presses on several films, with noise in their charges.
+
+    Args:
+        films: The network, which contains the forward maps, the domain and the noise.
+        true_films: Parameters of the films, shape (n_film, n_parameter).
+        n_press: Number of presses on each film.
+        rng: Random number generator.
+
+    Returns:
+        Contacts (x, y, F), shape (n_film, n_press, 3), mm and N, and charges, shape (n_film, n_press, n_electrode), pC.
+    """
+    contacts = []
+    noisy_charges = []
+    for parameters in true_films:
+        contact = draw_contacts(rng, films.domain, n_press)
+        charge = films.forward_map(parameters).charges(contact)
+        contacts.append(contact)
+        noisy_charges.append(films.noise.add(charge, rng))
+    return np.stack(contacts), np.stack(noisy_charges)
 
 
 def _errors(contact: Array, std: Array, truth: Array) -> Mapping[str, float]:
@@ -130,6 +155,9 @@ def _errors(contact: Array, std: Array, truth: Array) -> Mapping[str, float]:
 def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command: str = "") -> Release:
     """Write a network for all films as a model: `films.npz`, and the model of the assumed film.
 
+    The network is evaluated as it is written, with rounded weights. Presses outside the working area are simulated on
+    the assumed film. The metadata state which share of them is answered wrongly without a flag.
+
     Args:
         films: The trained network.
         folder: Folder of the model, `models/NAME`. Its name is the name of the model.
@@ -144,11 +172,28 @@ def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command:
         TrainingError: If an exported graph and the network disagree.
     """
     data = films_bytes(films)
-    as_written = films_from_bytes(data, FILE)
-    errors = evaluate_films(as_written, N_FILMS)
-    provenance = Provenance(made_with={**films.made_with, "films": dict(errors.with_known_film)}, files={FILE: data})
-    fitted = as_written.film(errors.parameters, provenance=provenance)
-    return release(fitted, folder, version=version, command=command, card=partial(films_card, as_written, errors))
+    rounded_films = films_from_bytes(data, FILE)
+    errors = evaluate_films(rounded_films, N_FILMS)
+    made_with = {**films.made_with, "films": dict(errors.with_known_film)}
+    provenance = Provenance(made_with=made_with, files={FILE: data})
+    assumed_film = rounded_films.film(errors.parameters, provenance=provenance)
+    fitted = replace(assumed_film, outside=_outside_presses(rounded_films, errors.parameters))
+    return release(fitted, folder, version=version, command=command, card=partial(films_card, rounded_films, errors))
+
+
+def _outside_presses(films: FilmsModel, parameters: Array) -> OutsidePresses | None:
+    """Simulate one film outside the working area.
+
+    Args:
+        films: The network for all films, with the prior of the films and the working area.
+        parameters: Parameters of the film, shape (n_parameter,).
+
+    Returns:
+        Presses outside the working area; None if this part of the film cannot be simulated.
+    """
+    sensor, probe = films.prior.film(parameters)
+    whole_film = OutsidePresses.of(sensor, (probe.notation,), films.domain.force_range)
+    return None if whole_film is None else whole_film.beyond(films.domain.radius)
 
 
 def films_card(films: FilmsModel, errors: FilmsErrors, about: ModelMetadata, fitted: Fitted) -> str:
@@ -167,6 +212,11 @@ def films_card(films: FilmsModel, errors: FilmsErrors, about: ModelMetadata, fit
     exact = about.errors
     electrodes = ", ".join(about.electrodes)
     correlated = ", `contact_correlation` (xy, xF, yF)"
+    outside_section = ""
+    if about.unnoticed is not None:
+        outside_section = (
+            f"{unnoticed_section(about.unnoticed)}These shares hold for the film that `model.onnx` assumes.\n\n"
+        )
     lines = [f"| {text} | {known_film[key]:g} {unit} | {assumed_film[key]:g} {unit} |" for text, key, unit in ROWS]
     lines += [
         f"| coverage of the {level} % intervals | {100 * known_film[f'coverage_{level}']:.3g} % | "
@@ -213,7 +263,7 @@ On the film that it assumes, `model.onnx` has an error of {exact["position_rms_m
 {exact["position_median_mm"]:g} mm) and {exact["force_rms_percent"]:g} % of the force. 1 % of the good presses of that
 film have a misfit above {exact["misfit_p99"]:g}, and 0.1 % above {exact["misfit_p999"]:g}.
 
-## Limits
+{outside_section}## Limits
 
 - These figures compare with the simulator. It does not simulate films that wrinkle, creep or are not uniform.
 - On films with a large pretension, different contacts near the edge of the working area can have the same charges. No

@@ -39,7 +39,7 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
     """Measure the errors of a trained network.
 
     Args:
-        fitted: The network.
+        fitted: The network, with its noise and its presses for the test.
         presses: Presses on which the errors are measured; None for those on which the network was not trained. To
             simulated presses the network's noise is added. Measured presses are used as they are, so the errors include
             those of the measured places and forces.
@@ -65,13 +65,29 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
     all_errors = contact_errors(contact, std, test.contact)
     errors = {name: error for name, error in all_errors.items() if name not in ONLY_SIMULATED}
     errors[HELD_PRESSES] = float(len(test))
+    return errors | _good_press_misfits(fitted, seed)
+
+
+def _good_press_misfits(fitted: Fitted, seed: int) -> dict[str, float]:
+    """Compute the misfits that only a few good presses exceed, for a network that is judged by measured presses.
+
+    Simulated good presses get noise. For measured good presses, the misfits of the cross-validation are used if there
+    are any, and the misfits of the network otherwise.
+
+    Args:
+        fitted: The network, with its good presses.
+        seed: Seed of the noise.
+
+    Returns:
+        Errors by name, as `evaluate` returns them.
+    """
     if not fitted.good.measured and isinstance(fitted.noise, NoiseModel):
-        return errors | misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)
+        return misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)
     if fitted.cross_validated is None:
         _, _, misfit = fitted.predict(fitted.good.charge)
-        return errors | {"misfit_p99": rounded(alarm_threshold(misfit))}
+        return {"misfit_p99": rounded(alarm_threshold(misfit))}
     misfit = fitted.cross_validated.misfit
-    return errors | {
+    return {
         "misfit_p99": rounded(alarm_threshold(misfit)),
         "misfit_p999": rounded(np.percentile(misfit, 99.9)),
     }
@@ -112,7 +128,7 @@ def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]
         Errors by name, as `evaluate` returns them.
     """
     statistics = asdict(ContactErrorStatistics.of(contact, truth))
-    del statistics["presses"]
+    del statistics["presses"]  # their number is not an error
     deviation = np.abs(contact - truth) / std
     errors = {
         **statistics,
@@ -134,18 +150,21 @@ def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel,
     Returns:
         Errors by name, as `evaluate` returns them.
     """
-    unit = misfit_noise(noise)
-    good_misfits = []
+    noise_of_misfit = misfit_noise(noise)
+    misfits_by_draw = []
     for draw in range(N_NOISE_DRAWS):
-        _, _, misfit = predict(presses.noisy(unit, seed + draw))
-        good_misfits.append(misfit)
-    all_misfits = np.concatenate(good_misfits)
+        _, _, misfit = predict(presses.noisy(noise_of_misfit, seed + draw))
+        misfits_by_draw.append(misfit)
+    all_misfits = np.concatenate(misfits_by_draw)
     threshold = alarm_threshold(all_misfits)
-    presses_near_1_N = presses[is_near_1_N(presses.contact[:, 2])]
+
+    force = presses.contact[:, 2]
+    presses_near_1_N = presses[is_near_1_N(force)]
+    detected_fractions = _detected_faults(predict, presses_near_1_N, noise_of_misfit, threshold, seed + N_NOISE_DRAWS)
     return {
         "misfit_p99": rounded(threshold),
         "misfit_p999": rounded(np.percentile(all_misfits, 99.9)),
-        **_detected_faults(predict, presses_near_1_N, unit, threshold, seed + N_NOISE_DRAWS),
+        **detected_fractions,
     }
 
 
@@ -161,7 +180,7 @@ def is_near_1_N(force: Array) -> Booleans:
 
 
 def rounded(value: float | np.floating) -> float:
-    """Round a figure to four significant digits, as the metadata hold it."""
+    """Round a number to four significant digits, as in the metadata."""
     return float(f"{value:.4g}")
 
 
@@ -185,17 +204,24 @@ def _detected_faults(
     charge = presses.noisy(noise, seed)
     n_electrode = charge.shape[1]
 
-    def detected_fraction(gain: float) -> float:
-        """Return the fraction of presses with one wrong gain that are detected, averaged over the electrodes."""
+    def detected_fraction(wrong_gain: float) -> float:
+        """Return the fraction of presses that are detected if one electrode has a wrong gain.
+
+        The fraction is the mean over the electrodes, each of which has the wrong gain in turn.
+
+        Args:
+            wrong_gain: Gain of the faulty electrode, relative to the true gain; 0 for a dead electrode.
+        """
         faulty_charges = []
-        for electrode in range(n_electrode):
+        for electrode_index in range(n_electrode):
             gains = np.ones(n_electrode)
-            gains[electrode] = gain
+            gains[electrode_index] = wrong_gain
             faulty_charges.append(charge * gains)
         _, _, misfit = predict(np.concatenate(faulty_charges))
         return float(np.mean(misfit > threshold))
 
+    detected_gain_errors = 0.5 * (detected_fraction(0.8) + detected_fraction(1.2))  # gains too small and too large
     return {
-        "found_gain_20_percent": rounded(0.5 * (detected_fraction(0.8) + detected_fraction(1.2))),
+        "found_gain_20_percent": rounded(detected_gain_errors),
         "found_dead_electrode": rounded(detected_fraction(0.0)),
     }

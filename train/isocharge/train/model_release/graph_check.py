@@ -22,10 +22,14 @@ N_GOLDEN = 64
 TOLERANCES = {
     "contact": 1e-5,
     "contact_std": 1e-5,
-    CORRELATION: 5e-5,
+    CORRELATION: 2e-4,
     "misfit": 2e-4,
 }
-"""Largest relative difference of each output between the graph (float32) and the network."""
+"""Largest relative difference of each output between the graph (float32) and the network.
+
+Rounding errors grow with the number of layers. With four hidden layers, they change a correlation by up to 1e-4, which
+is much less than the statistical error of the correlation.
+"""
 
 N_COMPARED = 10_000
 """Number of presses with noise on which the graph and the network are compared."""
@@ -51,6 +55,8 @@ def check_graph(
 ) -> Singles:
     """Compare a graph with the network from which it was written.
 
+    The outputs are compared for noisy charges of presses and, with larger tolerances, for extreme charges.
+
     Args:
         graph: The ONNX file.
         exact: The outputs of the network in double precision.
@@ -67,10 +73,10 @@ def check_graph(
     session = open_session(graph, "the exported graph")
     ordinary, extreme = _golden_charges(exact, presses, noise)
     _check_finite(session, presses.charge.shape[1])
-    _compare(session, exact, extreme, floors, EXTREME_FACTOR)
-    rows = np.arange(N_COMPARED) % len(presses)
-    noisy = presses[rows].noisy(noise, seed=3).astype(np.float32)
-    _compare(session, exact, noisy, floors, 1.0)
+    _compare(session, exact, extreme, floors, tolerance_factor=EXTREME_FACTOR)
+    repeated_rows = np.arange(N_COMPARED) % len(presses)
+    noisy = presses[repeated_rows].noisy(noise, seed=3).astype(np.float32)
+    _compare(session, exact, noisy, floors, tolerance_factor=1.0)
     return np.concatenate([ordinary, extreme])
 
 
@@ -92,12 +98,14 @@ def _golden_charges(exact: OutputFunction, presses: LabelledPresses, noise: Nois
     _, std, *_ = exact(presses.charge)
     position_std = std[:, 0] + std[:, 1]
     well_determined = presses[np.flatnonzero(position_std <= np.median(position_std))]
+
+    # Half of the golden charges are those of presses without noise, and a quarter those of presses with noise.
     chosen_rows = np.linspace(0, len(well_determined) - 1, N_GOLDEN // 2).astype(int)
     chosen = well_determined[chosen_rows]
     every_second = chosen[np.arange(0, len(chosen), 2)]
     press_charge = np.concatenate([chosen.charge, every_second.noisy(noise, seed=2)])
 
-    # Very small and very large charges, zero charges, and negative charges
+    # The last quarter are very small and very large charges, zero charges, and negative charges.
     extreme_charge = every_second.charge * np.geomspace(1e-3, 1e3, len(every_second))[:, None]
     extreme_charge[0] = 0.0
     extreme_charge[1] = -extreme_charge[1]
@@ -110,15 +118,18 @@ def _check_finite(session: ort.InferenceSession, n_electrode: int) -> None:
     Args:
         session: The exported graph.
         n_electrode: Number of charges.
+
+    Raises:
+        TrainingError: If an output is not finite.
     """
     random = np.random.default_rng(4)
     charges = random.choice([-LARGEST, LOWEST_CHARGE, LARGEST], (N_COMPARED, n_electrode)).astype(np.float32)
-    for name, rows in run(session, charges).items():
-        infinite_rows = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    for name, output in run(session, charges).items():
+        infinite_rows = np.flatnonzero(~np.isfinite(output).all(axis=1))
         if infinite_rows.size:
             row = infinite_rows[0]
             raise TrainingError(
-                f"the network answers {name} = {rows[row]} to the charges {charges[row]} pC; expected finite "
+                f"the network answers {name} = {output[row]} to the charges {charges[row]} pC; expected finite "
                 "numbers for any charges: train with more steps or another seed"
             )
 
@@ -131,6 +142,9 @@ def _compare(
     tolerance_factor: float,
 ) -> None:
     """Check that the graph and the network agree.
+
+    For each output, the difference of a press is its largest difference among the columns. Nearly all presses must have
+    a difference below the tolerance, and all presses a difference below a larger tolerance.
 
     Args:
         session: The graph.
@@ -149,12 +163,13 @@ def _compare(
         # Differences are relative to the expected value, but at least to the floor.
         floor = contact_floor if name in ("contact", "contact_std") else 1.0
         relative_difference = np.abs(expected - given) / np.maximum(np.abs(expected), floor)
-        largest_of_press = relative_difference.max(axis=1)
-        quantile = float(np.quantile(largest_of_press, QUANTILE))
-        largest = float(largest_of_press.max())
+        press_difference = relative_difference.max(axis=1)
+        quantile = float(np.quantile(press_difference, QUANTILE))
+        largest = float(press_difference.max())
         quantile_tolerance = tolerance_factor * TOLERANCES[name]
         tolerance = EXTREME_FACTOR * TOLERANCES[name]
-        if not (quantile <= quantile_tolerance and largest <= tolerance):
+        agrees = quantile <= quantile_tolerance and largest <= tolerance
+        if not agrees:
             raise TrainingError(
                 f"the exported graph disagrees with the network on {name}: expected at most {quantile_tolerance:g} for "
                 f"{QUANTILE:.1%} of the charges and {tolerance:g} for all, got {quantile:.3g} and {largest:.3g}"

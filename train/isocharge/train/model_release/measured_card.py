@@ -32,21 +32,26 @@ def measured_errors(errors: Mapping[str, float], which: str, how: str) -> str:
 
 
 def measured_card(metadata: ModelMetadata) -> str:
-    """Return the text of `card.md` for a model that was trained on measured presses alone."""
-    low, high = metadata.force_range_N
-    noise = metadata.noise
+    """Return the text of `card.md` for a model that was trained on measured presses alone.
+
+    Args:
+        metadata: Metadata of the model.
+    """
+    min_force, max_force = metadata.force_range_N
     measured = metadata.made_with["measured"]
     width, height = np.ptp(np.array(metadata.working_area_mm), axis=0)
     channels = ", ".join(metadata.electrodes)
-    levels = "\n".join(
+    white_noise, gain_noise = metadata.noise.of_each(len(metadata.electrodes))
+    noise_rows = "\n".join(
         f"| noise of {name} | {white:g} and {100 * gain:.3g} % of the charge |"
-        for name, white, gain in zip(metadata.electrodes, *noise.of_each(len(metadata.electrodes)), strict=True)
+        for name, white, gain in zip(metadata.electrodes, white_noise, gain_noise, strict=True)
     )
-    position, force = measured["std_factors"]
-    how = f"""\
+    position_factor, force_factor = measured["std_factors"]
+    error_source = f"""\
 The errors are those of {measured["folds"]} networks, each on the places on which it was not trained. The model
 learned the mean of their answers, whose errors are slightly smaller. The standard deviations were multiplied by
-{position:g} for positions and {force:g} for forces, so that the intervals contain 68 and 95 % of these presses.
+{position_factor:g} for positions and {force_factor:g} for forces, so that the intervals contain 68 and 95 % of these \
+presses.
 """
     return f"""# {metadata.name}, version {metadata.version}
 
@@ -59,11 +64,11 @@ was fitted to measured presses alone, without a simulator.
 | outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each), `misfit` |
 | fitted to | {measured["presses"]} presses at {measured["places"]} places, in `presses.csv` |
 | working area | {width:.4g} mm x {height:.4g} mm, the outline of the presses; corners in the metadata |
-| forces | {low:g} to {high:g} N |
+| forces | {min_force:g} to {max_force:g} N |
 | probes | {", ".join(metadata.probes)} |
-{levels}
+{noise_rows}
 
-{measured_errors(metadata.errors, "at places that were left out", how)}
+{measured_errors(metadata.errors, "at places that were left out", error_source)}
 The misfit is the distance, in units of that noise, of the charges from those of the nearest press, with planes through
 its neighbours between presses; a network gives it. 1 % of the presses are farther from those at other places than
 {metadata.errors["misfit_p99"]:g}.

@@ -1,7 +1,7 @@
 """Writer of the ONNX graph of a network, and reader that recovers the network from such a graph.
 
-The reader takes the constants out of a graph, writes the graph of that definition again and compares the two node by
-node. The writer is therefore the only description of the graph. Graphs that another program wrote are refused.
+The reader takes the constants out of a graph, writes the graph for these constants again, and compares both graphs node
+by node. The writer is therefore the only description of the graph. Graphs that another program wrote are refused.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,7 +43,10 @@ class GraphBuilder:
     constants: list[onnx.TensorProto] = field(default_factory=list)
 
     def add(self, operator: str, *inputs: str, to: str = "", **attributes: Any) -> str:
-        """Add a node with one result, and return the name of the result. The name is `to` if `to` is given."""
+        """Add a node with one result, and return the name of the result.
+
+        If the argument `to` is given, it is the name of the result.
+        """
         (result,) = self.add_many(operator, *inputs, to=(to or f"t{len(self.nodes)}",), **attributes)
         return result
 
@@ -83,32 +86,48 @@ def write_graph(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
 def write_contact_graph(network: FoldedNetwork) -> bytes:
     """Write a network whose only answers are x, y and ln F as an ONNX file.
 
+    Args:
+        network: The network.
+
     Returns:
         The ONNX file: input `charge_pC` [n, n_electrode], output `contact` [n, 3], both float32.
     """
     build = GraphBuilder()
-    position, log_force = build.split(_add_answers(build, network), {"plane": 2, "log_force": 1})
-    build.add("Concat", position, build.add("Exp", log_force), to="contact", axis=1)
+    answers = _add_answers(build, network)
+    position, log_force = build.split(answers, {"plane": 2, "log_force": 1})
+    force = build.add("Exp", log_force)
+    build.add("Concat", position, force, to="contact", axis=1)
     model = _make_model(build, "contact", network.features.n_electrode, {"contact": 3})
     return bytes(model.SerializeToString())
 
 
 def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
-    """Return the ONNX model of a network, without metadata."""
+    """Return the ONNX model of a network, without metadata.
+
+    The nodes after the network compute the outputs: contact and standard deviations, correlations if the network has
+    them, and misfit. Tensors are represented by their names.
+
+    Args:
+        network: The network.
+    """
     build = GraphBuilder()
     n_electrode = network.features.n_electrode
     widths = {"plane": POSITION.stop, "logs": LOG_STD.stop - POSITION.stop}
     if network.n_angle:
         widths["angles"] = network.n_angle
     widths["misfit_vector"] = n_electrode
-    position, logarithms, *angles, misfit_vector = build.split(_add_answers(build, network), widths)
+    answers = _add_answers(build, network)
+    position, logarithms, *optional_angles, misfit_vector = build.split(answers, widths)
+
+    # The part `contact_std` is itself an output, so it needs no further node.
     force, _ = build.split(build.add("Exp", logarithms), {"force": 1, "contact_std": 3})
     build.add("Concat", position, force, to="contact", axis=1)
-    for arguments in angles:
-        cosines = build.add("Cos", arguments)
+    for angles in optional_angles:
+        cosines = build.add("Cos", angles)
         build.add("MatMul", cosines, build.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
-    length = build.add("ReduceL2", misfit_vector, axes=[1], keepdims=1)
-    build.add("Mul", build.add("Sinh", length), build.constant(MISFIT_UNIT), to="misfit")
+    compressed_misfit = build.add("ReduceL2", misfit_vector, axes=[1], keepdims=1)
+    build.add("Mul", build.add("Sinh", compressed_misfit), build.constant(MISFIT_UNIT), to="misfit")
+
     outputs = {name: width for name, width in OUTPUTS.items() if network.n_angle or name != CORRELATION}
     return _make_model(build, "isocharge", n_electrode, outputs, producer_name="isocharge")
 
@@ -121,7 +140,8 @@ def _add_answers(build: GraphBuilder, network: FoldedNetwork) -> str:
 def _add_features(build: GraphBuilder, features: ChargeFeatures) -> str:
     """Add nodes that compute the input features of the charges.
 
-    The features are ln(Q / typical charge), or asinh(Q / typical charge) - mean if charges may be negative.
+    The features are ln(Q / typical charge), or asinh(Q / typical charge) - mean if charges may be negative. In the
+    second case the limits are different for each electrode, so two nodes replace `Clip`, which needs single limits.
 
     Args:
         build: Builder of the graph.
@@ -143,6 +163,8 @@ def _add_features(build: GraphBuilder, features: ChargeFeatures) -> str:
 
 def _add_perceptron(build: GraphBuilder, inputs: str, perceptron: Perceptron[Array]) -> str:
     """Add nodes that evaluate a perceptron with hidden layers and a skip layer.
+
+    The operator `Gemm` computes inputs @ weights + bias.
 
     Args:
         build: Builder of the graph.
@@ -203,18 +225,21 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
         onnx.checker.check_model(model, full_check=True)
     except Exception as error:  # protobuf's exceptions have no base in onnx
         raise ModelError(f"{where}: not a valid ONNX file ({cut(str(error))})") from error
+
     versions = {entry.domain: entry.version for entry in model.opset_import}
     if versions != {"": OPSET}:
         _refuse(where, f"expected ONNX operators of version {OPSET} alone, got {versions}")
+
+    # The graph that is written for the recovered network must have the same nodes as the file. The nodes are compared
+    # before their number, because the first different node is the more helpful message.
     network = _network_of(model.graph, where)
-    expected = list(_plain_nodes(_whole_model(network).graph))
-    given = list(_plain_nodes(model.graph))
-    # Compare the nodes before their number, because the first different node is the more helpful message.
-    for expected_node, given_node in zip(expected, given, strict=False):
+    expected_nodes = list(_plain_nodes(_whole_model(network).graph))
+    given_nodes = list(_plain_nodes(model.graph))
+    for expected_node, given_node in zip(expected_nodes, given_nodes, strict=False):
         if expected_node != given_node:
             _refuse(where, f"expected the node {expected_node}, got the node {given_node}")
-    if len(expected) != len(given):
-        _refuse(where, f"expected {len(expected)} nodes, got {len(given)}")
+    if len(expected_nodes) != len(given_nodes):
+        _refuse(where, f"expected {len(expected_nodes)} nodes, got {len(given_nodes)}")
     return network
 
 
@@ -231,11 +256,13 @@ def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
     operators = [node.op_type for node in graph.node]
     activation = _activation_of(operators, where)
     constants = _constants_in_order(graph, where)
+    is_signed = operators[:1] == ["Max"]  # the first node limits charges of both signs
+    n_hidden = operators.count(activation.onnx_operator)  # each hidden layer has one activation
     # `write_graph` uses the constants of the features first, then those of the hidden layers, the skip layer, and the
     # bias and the weights of the last layer.
     try:
-        features = _take_features(constants, is_signed=operators[:1] == ["Max"])
-        hidden = [Layer(next(constants), next(constants)) for _ in range(operators.count(activation.onnx_operator))]
+        features = _take_features(constants, is_signed=is_signed)
+        hidden = [Layer(weight=next(constants), bias=next(constants)) for _ in range(n_hidden)]
         skip = next(constants)
         bias = next(constants)
         perceptron = Perceptron(tuple(hidden), Layer(next(constants), bias), skip, activation)
@@ -252,13 +279,14 @@ def _activation_of(operators: Sequence[str], where: str) -> Activation:
         operators: Operators of the nodes, in order.
         where: Beginning of the error message.
     """
-    by_operator = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
+    activation_of_operator = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
     first_layer = operators.index("Gemm") if "Gemm" in operators else len(operators)
     following = operators[first_layer + 1 : first_layer + 2]  # one operator, or none at the end of the graph
     for operator in following:
-        if operator in by_operator:
-            return by_operator[operator]
-    return _refuse(where, f"expected one of the activations {', '.join(by_operator)} after a Gemm, got {following}")
+        if operator in activation_of_operator:
+            return activation_of_operator[operator]
+    known_operators = ", ".join(activation_of_operator)
+    return _refuse(where, f"expected one of the activations {known_operators} after a Gemm, got {following}")
 
 
 def _constants_in_order(graph: onnx.GraphProto, where: str) -> Iterator[Array]:
@@ -293,29 +321,50 @@ def _check_shapes(features: ChargeFeatures, perceptron: Perceptron[Array], where
         features: Limits, typical charges and means of the features.
         perceptron: Weights and biases of the layers.
         where: Beginning of the error messages.
+
+    Raises:
+        ModelError: If the shapes do not fit.
     """
+    _check_feature_shapes(features, where)
     n_electrode = features.n_electrode
-    bounds = [features.low_pC, features.high_pC]
-    expected_bounds: list[tuple[int, ...]] = [(), ()]
-    if features.mean is not None:
-        bounds.append(features.mean)
-        expected_bounds = [(n_electrode,)] * len(bounds)
-    given_bounds = [values.shape for values in bounds]
-    if given_bounds != expected_bounds or features.typical_pC.shape != (n_electrode,):
-        _refuse(
-            where, f"expected limits and means of the charges with the shapes {expected_bounds}, got {given_bounds}"
-        )
-    width = n_electrode
+    width = n_electrode  # number of inputs of the next layer
     for layer in (*perceptron.hidden, perceptron.last):
         if layer.weight.ndim != 2 or layer.weight.shape[0] != width:
             _refuse(where, f"expected weights for {width} inputs, got an array of shape {layer.weight.shape}")
         width = layer.weight.shape[1]
         if layer.bias.shape != (width,):
             _refuse(where, f"expected a bias for each column of {layer.weight.shape}, got {layer.bias.shape}")
+
     if perceptron.skip.shape != (n_electrode, width):
         _refuse(where, f"expected a skip layer of shape {(n_electrode, width)}, got {perceptron.skip.shape}")
     if width < N_CONTACT_ANSWERS + n_electrode:
         _refuse(where, f"expected at least {N_CONTACT_ANSWERS} + {n_electrode} answers, got {width}")
+
+
+def _check_feature_shapes(features: ChargeFeatures, where: str) -> None:
+    """Raise an error if the limits, the typical charges and the means of features have wrong shapes.
+
+    The limits of logarithmic features are single numbers. The limits for charges of both signs have a value for each
+    electrode, and there are also means.
+
+    Args:
+        features: The features.
+        where: Beginning of the error message.
+
+    Raises:
+        ModelError: If the shapes do not fit.
+    """
+    n_electrode = features.n_electrode
+    limits_and_means = [features.low_pC, features.high_pC]
+    expected_shapes: list[tuple[int, ...]] = [(), ()]
+    if features.mean is not None:
+        limits_and_means.append(features.mean)
+        expected_shapes = [(n_electrode,)] * len(limits_and_means)
+    given_shapes = [values.shape for values in limits_and_means]
+    if given_shapes != expected_shapes or features.typical_pC.shape != (n_electrode,):
+        _refuse(
+            where, f"expected limits and means of the charges with the shapes {expected_shapes}, got {given_shapes}"
+        )
 
 
 @dataclass(frozen=True)
@@ -343,9 +392,13 @@ class _PlainNode:
 def _plain_nodes(graph: onnx.GraphProto) -> Iterator[_PlainNode]:
     """Yield the nodes of a graph in a form that can be compared with the nodes of another graph.
 
-    The names of tensors inside a graph are arbitrary. They are replaced by the number of the node that computes the
-    tensor, and constants are replaced by their values.
+    The names of tensors inside a graph are arbitrary. A name is replaced by the number of the node that computes the
+    tensor, and a constant is replaced by its values.
+
+    Args:
+        graph: The graph.
     """
+    # Descriptions of the tensors that nodes can have as inputs, by the name of the tensor
     plain_inputs: dict[str, object] = {tensor.name: tensor.name for tensor in graph.input}
     for tensor in graph.initializer:
         plain_inputs[tensor.name] = _plain_constant(numpy_helper.to_array(tensor))

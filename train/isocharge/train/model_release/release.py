@@ -129,23 +129,31 @@ model-index:
 
 
 def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
-    """Return the text of `card.md`."""
+    """Return the text of `card.md`.
+
+    Models of measured presses alone have a card of their own. In all other cards, the sections about the errors and the
+    limits depend on whether the test presses were measured or simulated.
+
+    Args:
+        metadata: Metadata of the model.
+        fitted: The network, its sensor and its presses.
+    """
     if isinstance(fitted.sensor, MeasuredSensor):
         return measured_card(metadata)
     if fitted.test.measured:
         measured_section = measured_errors(metadata.errors, "that were not used in the training", NO_NOISE)
-        errors = fitted.provenance.card + measured_section
-        truth = MEASURED_TRUTH
+        errors_text = fitted.provenance.card + measured_section
+        truth_text = MEASURED_TRUTH
     else:
-        errors = _errors_section(metadata.errors, len(fitted.test))
-        truth = SIMULATED_TRUTH
-    cautions = "".join(f"- {caution}.\n" for caution in fitted.cautions)
+        errors_text = _errors_section(metadata.errors, len(fitted.test))
+        truth_text = SIMULATED_TRUTH
+    cautions_text = "".join(f"- {caution}.\n" for caution in fitted.cautions)
     return f"""{_interface_section(metadata, fitted)}
-{errors}
+{errors_text}
 {_misfit_section(metadata, fitted)}
 {unnoticed_section(metadata.unnoticed)}## Limits
 
-{truth}{cautions}{LIMITS}
+{truth_text}{cautions_text}{LIMITS}
 ## Make it again
 
 ```bash
@@ -157,7 +165,7 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
 def yield_text(metadata: ModelMetadata) -> str:
     """Return the text about yielding for the row of the forces.
 
-    It is empty if the film does not yield within the range.
+    The text is empty if the film does not yield within the range of forces.
     """
     if metadata.yield_force_N is None:
         return ""
@@ -168,8 +176,13 @@ def yield_text(metadata: ModelMetadata) -> str:
 
 
 def _interface_section(metadata: ModelMetadata, fitted: Fitted) -> str:
-    """Return the section of the card with inputs, outputs and ranges."""
-    low, high = metadata.force_range_N
+    """Return the section of the card with inputs, outputs and ranges.
+
+    Args:
+        metadata: Metadata of the model.
+        fitted: The network and its domain.
+    """
+    min_force, max_force = metadata.force_range_N
     noise = metadata.noise
     teacher = metadata.made_with.get("teacher")
     electrodes = ", ".join(metadata.electrodes)
@@ -190,7 +203,7 @@ Estimates the position and the force of one press from the touch charges of the 
 | input | `charge_pC`, float32 [n, {len(metadata.electrodes)}], touch charges of {electrodes} in pC |
 | outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlation}, `misfit` |
 | working area | within {fitted.domain.radius:g} mm of the centre{domain_text} |
-| forces | {low:g} to {high:g} N{yield_text(metadata)} |
+| forces | {min_force:g} to {max_force:g} N{yield_text(metadata)} |
 | probes | {", ".join(metadata.probes)}{probe_text} |
 | trained for the noise | {noise.name}: {noise.white_pC:g} pC and {100 * noise.gain:g} % |
 """
@@ -269,6 +282,8 @@ def release(
 ) -> Release:
     """Write a trained network as a version of a model.
 
+    The errors of the network are measured first, and the written graph is compared with the network.
+
     Args:
         fitted: The network.
         folder: Folder of the model, `models/NAME`. Its name is the name of the model.
@@ -287,8 +302,8 @@ def release(
     """
     names = fitted.sensor.electrode_names
     check_target(folder, version, names)
-    packages = {package: metadata.version(package) for package in ("isocharge", "numpy", "onnx", "onnxruntime")}
-    about = ModelMetadata(
+    package_versions = {name: metadata.version(name) for name in ("isocharge", "numpy", "onnx", "onnxruntime")}
+    about_without_unnoticed = ModelMetadata(
         name=folder.resolve().name,
         version=version,
         sensor=_sensor_table(fitted),
@@ -301,13 +316,15 @@ def release(
         errors=evaluate(fitted) if errors is None else dict(errors),
         made_with={
             "command": command,
-            **packages,
+            **package_versions,
             "python": platform.python_version(),
             **fitted.provenance.made_with,
         },
         yield_force_N=_yield_force(fitted),
     )
-    about = structs.replace(about, unnoticed=unnoticed_presses(fitted, about))
+    unnoticed = unnoticed_presses(fitted, about_without_unnoticed)
+    about = structs.replace(about_without_unnoticed, unnoticed=unnoticed)
+
     graph = write_graph(fitted.network, about.to_props())
     golden_charges = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, contact_floors(about))
     card_text = hub_block(about) + card(about, fitted)
@@ -332,23 +349,29 @@ def _working_area(domain: Domain) -> tuple[tuple[float, float], ...]:
 def _yield_force(fitted: Fitted) -> float | None:
     """Compute the smallest force at which the film yields under any of the probes.
 
+    The film yields if its stress exceeds `DEFAULT_STRESS_LIMIT`.
+
+    Args:
+        fitted: The network, with the sensor, the probes and the range of forces.
+
     Returns:
         Force, N; None if the film does not yield within the range of forces, or its stress is not simulated.
     """
     if isinstance(fitted.sensor, MeasuredSensor):
         return None
     force_range = fitted.domain.force_range
-    smallest, largest = force_range
-    yield_force = largest
-    for probe in map(parse_probe, fitted.probes):
+    min_force, max_force = force_range
+    yield_force = max_force
+    for notation in fitted.probes:
+        probe = parse_probe(notation)
         try:
-            limit = force_within_stress(fitted.sensor.film, probe, DEFAULT_STRESS_LIMIT, force_range)
+            probe_limit = force_within_stress(fitted.sensor.film, probe, DEFAULT_STRESS_LIMIT, force_range)
         except SceneError:  # the film yields already at the smallest force
-            limit = smallest
+            probe_limit = min_force
         except SolveError:  # the stress of this film cannot be computed
             continue
-        yield_force = min(yield_force, limit)
-    return round(yield_force, 3) if yield_force < largest else None
+        yield_force = min(yield_force, probe_limit)
+    return round(yield_force, 3) if yield_force < max_force else None
 
 
 def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
@@ -362,15 +385,23 @@ def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
 def model_domain(about: ModelMetadata) -> Domain:
     """Read the contacts for which a model was trained from the metadata of the model.
 
-    If the working area is the polygon of a disk about the origin, as in models of simulated presses, the domain is the
-    largest disk in it, rounded to 0.001 mm. For every other working area, the domain is a `PressedArea` with the same
-    corners.
+    In models of simulated presses, the working area is the polygon of a disk about the origin. The domain is then the
+    largest disk in the polygon, rounded to 0.001 mm. For every other working area, the domain is a `PressedArea` with
+    the same corners.
+
+    Args:
+        about: Metadata of the model.
     """
     corners = np.array(about.working_area_mm)
+
+    # Distance of each edge from the origin: the cross product of edge and corner over the length of the edge
     edges = np.roll(corners, -1, axis=0) - corners
-    edge_distance = np.abs(edges[:, 0] * corners[:, 1] - edges[:, 1] * corners[:, 0]) / np.hypot(*edges.T)
+    cross_product = edges[:, 0] * corners[:, 1] - edges[:, 1] * corners[:, 0]
+    edge_distance = np.abs(cross_product) / np.hypot(edges[:, 0], edges[:, 1])
+
     radius = round(float(edge_distance.min()), 3)
     disk_corners = np.array(_disk_polygon(radius))
-    if corners.shape == disk_corners.shape and np.abs(corners - disk_corners).max() < CORNER_TOLERANCE_mm:
+    is_disk = corners.shape == disk_corners.shape and np.abs(corners - disk_corners).max() < CORNER_TOLERANCE_mm
+    if is_disk:
         return Domain(radius, about.force_range_N)
     return PressedArea.of_corners(corners, about.force_range_N)

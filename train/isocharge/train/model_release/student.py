@@ -1,8 +1,8 @@
 """Training data and settings of a student: a small network that learns the answers of a model.
 
 A student has the inputs and outputs of the model and about 5,000 weights and biases, so it fits into the flash memory
-of a microcontroller. It learns the contacts and standard deviations of the model. The misfit of the student, like that
-of the model, is trained with distances that were computed exactly.
+of a microcontroller. The student learns the contacts and standard deviations that the model estimates. The misfit of
+the student, like that of the model, is trained with distances that were computed exactly.
 """
 
 from dataclasses import dataclass, replace
@@ -39,7 +39,7 @@ def student_config(weights: Literal["float32", "int8"] = "float32") -> FitConfig
 class StudentCase:
     """Sensor, probes and contacts of a model.
 
-    They define a simulation of presses that are distributed as in the training of the model.
+    These values define a simulation of presses that are distributed as in the training of the model.
 
     Attributes:
         sensor: Sensor of the model.
@@ -87,10 +87,10 @@ def student_data(model: Path, dataset: Dataset) -> TrainingData:
 
     def answer(charge: Array) -> tuple[Array, Array]:
         """Estimate the contacts (x, y, F) and their standard deviations, each of shape (n, 3), mm and N."""
-        contact = predictor.predict_batch(charge)
-        position_and_force = np.stack([contact.x_mm, contact.y_mm, contact.force_N], axis=1)
-        std = np.stack([contact.x_std_mm, contact.y_std_mm, contact.force_std_N], axis=1)
-        return position_and_force.astype(float), std.astype(float)
+        answers = predictor.predict_batch(charge)
+        contact = np.stack([answers.x_mm, answers.y_mm, answers.force_N], axis=1)
+        std = np.stack([answers.x_std_mm, answers.y_std_mm, answers.force_std_N], axis=1)
+        return contact.astype(float), std.astype(float)
 
     checksum = sha256_of((model / "model.onnx").read_bytes())
     return replace(TrainingData.of(dataset), teacher=Teacher(about.label, checksum, answer))

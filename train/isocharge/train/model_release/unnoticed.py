@@ -1,6 +1,7 @@
 """Measured fraction of presses outside the working area for which a model gives a wrong answer without a flag."""
 
 import math
+from collections.abc import Iterator
 from textwrap import fill
 
 import numpy as np
@@ -28,7 +29,9 @@ MIN_NAMED_SHARE = 0.005
 
 
 def unnoticed_presses(fitted: Fitted, about: ModelMetadata) -> UnnoticedPresses | None:
-    """Press the film outside the working area, and measure which answers are wrong and carry no flag.
+    """Measure how many answers are wrong and carry no flag for simulated presses outside the working area.
+
+    An answer is wrong if one of its values differs from the truth by more than `WRONG_STDS` standard deviations.
 
     Args:
         fitted: The network.
@@ -43,7 +46,8 @@ def unnoticed_presses(fitted: Fitted, about: ModelMetadata) -> UnnoticedPresses 
     presses = outside.grid()
     contact, std, misfit = fitted.predict(presses.noisy(fitted.misfit_noise, NOISE_SEED))
     is_wrong = (np.abs(contact - presses.contact) > WRONG_STDS * std).any(axis=1)
-    return outside.unnoticed(is_wrong & ~is_flagged(about, contact, std, misfit))
+    is_unnoticed = is_wrong & ~is_flagged(about, contact, std, misfit)
+    return outside.unnoticed(is_unnoticed)
 
 
 def is_flagged(about: ModelMetadata, contact: Array, std: Array, misfit: Array) -> Booleans:
@@ -65,22 +69,39 @@ def is_flagged(about: ModelMetadata, contact: Array, std: Array, misfit: Array) 
 
 
 def unnoticed_section(unnoticed: UnnoticedPresses | None) -> str:
-    """Return the section of a card about presses outside the working area; empty if they were not measured."""
+    """Return the section of a card about presses outside the working area; empty if they were not measured.
+
+    The shares of wrong answers without a flag are listed by the distance from the centre, unless the total share is
+    very small. Neighbouring rings are joined, so that the table has at most `MAX_CARD_ROWS` rows.
+
+    Args:
+        unnoticed: Shares of the presses that are answered wrongly without a flag; None if they were not measured.
+    """
     if unnoticed is None:
         return ""
     sentence = fill(f"{unnoticed.summary}.", CARD_WIDTH)
     text = f"## Presses outside the working area\n\n{sentence}\n"
     if unnoticed.total_share < MIN_NAMED_SHARE:
         return text + "\n"
+
+    table_rows = "".join(_ring_rows(unnoticed))
+    return f"{text}\n| distance from the centre | wrong without a flag |\n|---|---|\n{table_rows}\n"
+
+
+def _ring_rows(unnoticed: UnnoticedPresses) -> Iterator[str]:
+    """Yield the rows of the table of distances from the centre, each with the share of several neighbouring rings.
+
+    Args:
+        unnoticed: Shares of the presses that are answered wrongly without a flag.
+    """
     edges = unnoticed.ring_edges_mm
     ring_areas = np.diff(edges**2)  # in units of pi
     ring_count = len(ring_areas)
     rings_per_row = math.ceil(ring_count / MAX_CARD_ROWS)
-    rows = []
     for first_ring in range(0, ring_count, rings_per_row):
         end_ring = min(first_ring + rings_per_row, ring_count)
         rings = slice(first_ring, end_ring)
+        # A ring counts in proportion to its area.
         row_share = np.average(unnoticed.ring_shares[rings], weights=ring_areas[rings])
         distances = f"{edges[first_ring]:.3g} to {edges[end_ring]:.3g} mm"
-        rows.append(f"| {distances} | {percent_text(float(row_share))} |\n")
-    return f"{text}\n| distance from the centre | wrong without a flag |\n|---|---|\n{''.join(rows)}\n"
+        yield f"| {distances} | {percent_text(float(row_share))} |\n"

@@ -38,8 +38,9 @@ def write_report(
     """Measure every method on every dataset and write `report.md`, `report.json` and the pictures.
 
     Methods are fitted to the presses of a dataset and tested on other presses. If the dataset was measured, a fifth of
-    its presses is held out for the test. If it was simulated, the test presses are simulated as well. A stopped report
-    leaves the folder `FOLDER.part` with its completed solves and limits, and the same call continues it.
+    its presses is held out for the test. If the dataset was simulated, the test presses are simulated as well. A
+    stopped report leaves its completed solves and limits in the folder `FOLDER.part`, and the same call continues the
+    report.
 
     Args:
         folder: Folder to write; it must not exist.
@@ -68,6 +69,7 @@ def write_report(
         "machine": machine(RECORDED_PACKAGES),
         "settings": asdict(settings),
     }
+    # A stopped report is continued only if its settings, its datasets and its models are the same.
     run_identity = {**header, "datasets": [evaluation.identity() for evaluation in evaluations]}
     file_stems = _file_stems([evaluation.case.sensor.name for evaluation in evaluations])
     with resume_folder(folder, run_identity, fresh=fresh) as run, threads_and_seed(1, settings.seed):
@@ -76,6 +78,8 @@ def write_report(
             section = evaluation.measure(run.storing_executor(file_stem))
             picture_files = section.save_pictures(run.data, file_stem)
             sections.append({**section.content, "pictures": picture_files})
+
+        # The page is written from the records of the methods, and `report.json` from their JSON form.
         page = report_page({**header, "datasets": sections})
         record = {**header, "datasets": [_json_section(section) for section in sections]}
         write_whole(run.data / "report.md", page.encode())
@@ -84,9 +88,13 @@ def write_report(
 
 
 def _file_stems(sensor_names: Sequence[str]) -> list[str]:
-    """Return the first part of the picture names of each dataset.
+    """Return, for each dataset, the text with which the file names of its pictures begin.
 
-    It is the name of the sensor, followed by the number of the dataset if several datasets have the same sensor.
+    This text is the name of the sensor. If several datasets have the same sensor, the number of the dataset is
+    appended, counted from 1.
+
+    Args:
+        sensor_names: Name of the sensor of each dataset.
     """
     stems = []
     for number, name in enumerate(sensor_names, start=1):

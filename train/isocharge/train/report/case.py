@@ -173,22 +173,32 @@ class EvaluationCase:
 
 
 def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
-    """Return the probes of a dataset, and whether the probes are rotated by random angles.
+    """Return the probes of a dataset, and whether the presses of a probe have several orientations.
 
-    A probe that pressed at a single angle is returned with this rotation.
+    A probe that pressed at a single angle is returned with this rotation. The angles of an axisymmetric probe are not
+    counted, because they have no effect.
+
+    Args:
+        samples: The presses of the dataset, each with the notation of its probe and its orientation.
+
+    Raises:
+        DatasetError: If the notation of a probe is not valid.
     """
     probes = []
     is_rotated = False
-    for name in np.unique(samples.probe):
-        angles_deg = samples.orientation_deg[samples.probe == name]
+    for notation in np.unique(samples.probe):
         try:
-            probe = parse_probe(str(name))
+            probe = parse_probe(str(notation))
         except ValueError as error:
-            raise DatasetError(f"the probe {str(name)!r} of the dataset: {error}") from error
-        has_several_angles = bool(np.ptp(angles_deg) > 0.0)
-        if not has_several_angles:
-            probe = probe.rotated(float(np.deg2rad(angles_deg[0])))
-        elif probe.period > 0.0:  # the angle of an axisymmetric probe, whose period is 0, has no effect
+            raise DatasetError(f"the probe {str(notation)!r} of the dataset: {error}") from error
+
+        angles_deg = samples.orientation_deg[samples.probe == notation]
+        smallest_angle_deg = angles_deg.min()
+        is_single_angle = bool(angles_deg.max() == smallest_angle_deg)
+        is_axisymmetric = probe.period == 0.0
+        if is_single_angle:
+            probe = probe.rotated(float(np.deg2rad(smallest_angle_deg)))
+        elif not is_axisymmetric:
             is_rotated = True
         probes.append(probe)
     return tuple(probes), is_rotated
@@ -243,7 +253,9 @@ class ErrorBounds:
         noisy_charge: Array,
         executor: Executor | None = None,
     ) -> "ErrorBounds":
-        """Compute both limits.
+        """Compute the Cramér-Rao limit of all presses and the Bayes limit of the presses with noise.
+
+        The Bayes limit is left out if the case has several probes or several orientations of a probe.
 
         Args:
             case: The case, with sensor, probes, working area, forces and noise.
@@ -254,13 +266,14 @@ class ErrorBounds:
             executor: Executor of the integrals of the Bayes limit; None to compute them in this process.
 
         Returns:
-            Cramer-Rao limits of all presses, and posterior means of the first m presses.
+            Cramér-Rao limits of all presses, and posterior means of the first m presses.
         """
-        posterior_mean = None
-        if len(case.probes) == 1 and not case.is_rotated:
-            problem = BayesProblem(case.sensor, case.probes[0], case.domain.radius, case.domain.force_range, case.noise)
-            posterior_mean, _ = bayes_estimate(problem, noisy_charge, charge_map=charge_map, executor=executor)
-        return cls(posterior_mean, limits_at(charge_map, clean.contact, case.noise))
+        cramer_rao = limits_at(charge_map, clean.contact, case.noise)
+        if len(case.probes) > 1 or case.is_rotated:
+            return cls(None, cramer_rao)
+        problem = BayesProblem(case.sensor, case.probes[0], case.domain.radius, case.domain.force_range, case.noise)
+        posterior_mean, _ = bayes_estimate(problem, noisy_charge, charge_map=charge_map, executor=executor)
+        return cls(posterior_mean, cramer_rao)
 
     def to_dict(self, truth: Array) -> dict[str, Any]:
         """Return the limits as `report.json` contains them.

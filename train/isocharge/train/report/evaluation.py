@@ -126,23 +126,27 @@ class DatasetEvaluation:
             PressError: If there are too few measured presses.
         """
         model = Predictor(model_folder).metadata
-        select_for_model = measured_presses_for if is_measured(dataset) else simulated_presses_for
-        usable = select_for_model(model, dataset)
-        case = EvaluationCase.of(usable, settings.presses, settings.seed)
-        held_out_presses = None
-        if is_measured(dataset):
-            all_presses = LabelledPresses.of(usable)
-            is_held_out = held_out(all_presses.contact)
-            held_out_presses = all_presses[is_held_out]
-            fitting_dataset = _first_presses(select_presses(usable, ~is_held_out), settings.learn_from)
-            fitting_presses = presses_of(fitting_dataset, MIN_TRAINING_PRESSES)
-        else:
-            fitting_dataset = _first_presses(usable, settings.learn_from)
-            fitting_presses = presses_of(fitting_dataset)
-        train, validation = split_by_position(fitting_presses, settings.hold_out, settings.seed)
-        task = FittingTask(train, validation, case.domain, case.noise, settings.seed, settings.quick)
         unique_students = dict.fromkeys(students)
         own_students = tuple(path for path in unique_students if Predictor(path).metadata.sensor == model.sensor)
+
+        select_for_model = measured_presses_for if is_measured(dataset) else simulated_presses_for
+        usable_dataset = select_for_model(model, dataset)
+        case = EvaluationCase.of(usable_dataset, settings.presses, settings.seed)
+
+        # The test presses of a simulated dataset are simulated later, so none of its presses is held out.
+        held_out_presses = None
+        if is_measured(dataset):
+            all_presses = LabelledPresses.of(usable_dataset)
+            is_held_out = held_out(all_presses.contact)
+            held_out_presses = all_presses[is_held_out]
+            fitting_dataset = _first_presses(select_presses(usable_dataset, ~is_held_out), settings.learn_from)
+            fitting_presses = presses_of(fitting_dataset, MIN_TRAINING_PRESSES)
+        else:
+            fitting_dataset = _first_presses(usable_dataset, settings.learn_from)
+            fitting_presses = presses_of(fitting_dataset)
+
+        train, validation = split_by_position(fitting_presses, settings.hold_out, settings.seed)
+        task = FittingTask(train, validation, case.domain, case.noise, settings.seed, settings.quick)
         return cls(fitting_dataset, ReleasedModel(model_folder), own_students, task, case, settings, held_out_presses)
 
     def identity(self) -> dict[str, Any]:
@@ -151,7 +155,7 @@ class DatasetEvaluation:
         return {"dataset_sha256": self.dataset.sha256, "models": [str(folder) for folder in folders]}
 
     def measure(self, executor: Executor) -> Section:
-        """Fit and measure all methods.
+        """Fit and measure all methods, and add a plot of the error against each cost of the methods.
 
         Args:
             executor: Executor of the solves and of the integrals of the Bayes limit.
@@ -163,26 +167,39 @@ class DatasetEvaluation:
             section = self._measure_on_simulated_presses(executor)
         else:
             section = self._measure_on_measured_presses(self.held_out_presses)
-        limits = pictures.limit_errors(section.content["limits"])
+
+        records = section.content["methods"]
+        limits_mm = pictures.limit_errors(section.content["limits"])
         drawings = dict(section.drawings)
         for cost in pictures.COST_LABELS:
-            drawings[cost] = partial(pictures.cost_plot, section.content["methods"], cost, limits)
+            drawings[cost] = partial(pictures.cost_plot, records, cost, limits_mm)
         return Section(section.content, drawings)
 
     def _measure_on_simulated_presses(self, executor: Executor) -> Section:
-        """Return the section of a simulated dataset, whose test presses are simulated."""
+        """Return the section of a simulated dataset, whose test presses are simulated.
+
+        The steps are: simulate the test presses, compute the theoretical limits of the error, fit and measure all
+        methods, and study the released model under several noise draws and under mismatches.
+
+        Args:
+            executor: Executor of the solves and of the integrals of the Bayes limit.
+        """
         case = self.case
         settings = self.settings
         forward_maps = case.forward_maps(range_factor=1.0, accuracy=settings.accuracy, executor=executor)
         clean = simulate_presses(self._test_maps(forward_maps, executor), case.test_sweep())
-        test = replace(clean, charge=clean.noisy(case.noise, case.seed + TEST_NOISE_SEED))
+        noisy_charge = clean.noisy(case.noise, case.seed + TEST_NOISE_SEED)
+        test = replace(clean, charge=noisy_charge)
+
         charge_map = ChargeSpline.of(forward_maps[0])
-        limits = ErrorBounds.of(case, charge_map, clean, test.charge[: settings.limited], executor)
+        limits = ErrorBounds.of(case, charge_map, clean, noisy_charge[: settings.limited], executor)
 
         methods = [*self._released_models(), *compared_methods(self.task, charge_map), *self._new_networks()]
+        # On simulated presses a method that cannot be fitted raises an error, so there are no reasons to report.
         fitted_methods, _ = fit_all(methods, self.task, test)
         fitted_by_name = {fitted.method.name: fitted for fitted in fitted_methods}
         records = measure_methods(fitted_methods, test, settings, limits.posterior_mean)
+
         draws = studies.NoiseDraws.of(self.released, clean, case, settings.draws)
         threshold = alarm_threshold(draws.misfit)
         content = {
@@ -209,7 +226,10 @@ class DatasetEvaluation:
     def _errors_by_force(
         self, fitted_by_name: Mapping[str, FittedMethod], limits: ErrorBounds, test: LabelledPresses
     ) -> dict[str, Any]:
-        """Compute the position errors of several methods and of the Bayes limit in bins of the force.
+        """Compute the position errors in bins of the force, for the limits and for some of the methods.
+
+        These methods are the released model and the methods of `STUDIED_METHODS`. The Bayes limit is left out if it was
+        not computed.
 
         Args:
             fitted_by_name: Fitted methods by name.
@@ -241,7 +261,11 @@ class DatasetEvaluation:
         ]
 
     def _measure_on_measured_presses(self, test: LabelledPresses) -> Section:
-        """Return the section of a measured dataset, which contains no results that need a simulation of the film."""
+        """Return the section of a measured dataset, which contains no results that need a simulation of the film.
+
+        Args:
+            test: The held-out presses.
+        """
         methods = [*self._released_models(), *compared_methods(self.task), *self._new_networks()]
         fitted_methods, failure_reasons = fit_all(methods, self.task, test)
         records = measure_methods(fitted_methods, test, self.settings)
@@ -261,10 +285,12 @@ class DatasetEvaluation:
         """
         models = {RELEASED: self.released}
         for path in self.students:
-            models[Predictor(path).metadata.name] = ReleasedModel(path)
+            student_name = Predictor(path).metadata.name
+            models[student_name] = ReleasedModel(path)
+
         methods = []
         for name, model in models.items():
-            methods.append(ComparedMethod(name, "network", "Predictor", model, choice="as released"))
+            full_model = ComparedMethod(name, "network", "Predictor", model, choice="as released")
             reduced_model = ComparedMethod(
                 f"{name}, contact only",
                 "network",
@@ -272,11 +298,11 @@ class DatasetEvaluation:
                 model.contact_only(),
                 choice="as released, only the contact",
             )
-            methods.append(reduced_model)
+            methods += [full_model, reduced_model]
         return methods
 
     def _new_networks(self) -> list[ComparedMethod]:
-        """Return networks of several sizes, which are trained for the comparison."""
+        """Return networks that are trained for the comparison, one for each size in the settings."""
         case = self.case
         steps = self.settings.steps
         data = TrainingData(
@@ -288,7 +314,8 @@ class DatasetEvaluation:
         )
         methods = []
         for widths in self.settings.sizes:
-            name = f"network {'-'.join(str(width) for width in widths)}"
+            widths_text = "-".join(str(width) for width in widths)
+            name = f"network {widths_text}"
             network = TrainedNetwork(data, widths, steps, case.noise, self.settings.seed)
             methods.append(ComparedMethod(name, "network", "ONNX Runtime, bound", network, choice=f"{steps} steps"))
         return methods
@@ -331,6 +358,9 @@ def _study_drawings(
 ) -> dict[str, DrawPicture]:
     """Return the functions that draw the pictures of the studies, by the name of the picture.
 
+    The results of the noise studies are listed in the order of `studies.NOISE_FACTORS`, so that the errors of each
+    method can be drawn against these factors.
+
     Args:
         content: Section of the report of a simulated dataset.
         case: The conditions of the test.
@@ -338,18 +368,23 @@ def _study_drawings(
     """
     by_force = content["by_force"]
     mismatch_results = content["cases"]
-    nominal_error_mm = content["methods"][0].errors.position_rms_mm
+    released_record = content["methods"][0]  # the released model is always listed first
+    nominal_error_mm = released_record.errors.position_rms_mm
 
     noise_results = [result for result in mismatch_results if result["group"] == "noise"]
-    errors_by_noise = {}
-    for name in noise_results[0]["errors"]:
-        errors_by_noise[name] = [result["errors"][name]["position_rms_mm"] for result in noise_results]
+    method_names = noise_results[0]["errors"].keys()
+    noise_errors_by_method = {}
+    for name in method_names:
+        noise_errors_by_method[name] = [result["errors"][name]["position_rms_mm"] for result in noise_results]
     return {
         "maps": partial(pictures.error_maps, case.sensor, case.domain, draws),
         "force": partial(pictures.error_lines, by_force["force_N"], by_force["position_rms_mm"], "force, N"),
         "calibration": partial(pictures.coverage_plot, content["calibration"]),
         "noise": partial(
-            pictures.error_lines, studies.NOISE_FACTORS, errors_by_noise, "noise, relative to the reference noise"
+            pictures.error_lines,
+            studies.NOISE_FACTORS,
+            noise_errors_by_method,
+            "noise, relative to the reference noise",
         ),
         "effects": partial(pictures.mismatch_plot, mismatch_results, nominal_error_mm),
     }

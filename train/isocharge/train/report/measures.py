@@ -1,8 +1,8 @@
 """Figures of merit of the compared methods: errors, costs, Pareto fronts, and the comparison with the released model.
 
-Each method has one error (the root-mean-square position error) and three costs (the time of one prediction, the
-throughput of batches and the memory). A method is on the Pareto front of a cost if no other method is at least as good
-in both error and cost and better in one of them.
+Each method has one error, which is the root-mean-square position error. Each method has three costs: the time of one
+prediction, the throughput of batches, and the memory. A method is on the Pareto front of a cost unless another method
+is better in error or cost, and at least as good in the other.
 """
 
 from collections.abc import Sequence
@@ -66,17 +66,24 @@ class ContactErrors:
         Returns:
             The errors, rounded to four significant digits.
         """
-        is_answered = np.isfinite(estimate[:, :2]).all(axis=1)
-        if not is_answered.any():
-            return cls(None, None, None, None, None, 0.0)
-        statistics = ContactErrorStatistics.of(estimate[is_answered], truth[is_answered])
+        has_position = np.isfinite(estimate[:, :2]).all(axis=1)
+        if not has_position.any():
+            return cls(
+                position_rms_mm=None,
+                position_median_mm=None,
+                position_p95_mm=None,
+                force_rms_percent=None,
+                force_median_percent=None,
+                answered=0.0,
+            )
+        statistics = ContactErrorStatistics.of(estimate[has_position], truth[has_position])
         return cls(
             position_rms_mm=round_significant(statistics.position_rms_mm),
             position_median_mm=round_significant(statistics.position_median_mm),
             position_p95_mm=round_significant(statistics.position_p95_mm),
             force_rms_percent=round_significant(statistics.force_rms_percent),
             force_median_percent=round_significant(statistics.force_median_percent),
-            answered=round_significant(float(np.mean(is_answered))) or 0.0,
+            answered=float(f"{np.mean(has_position):.4g}"),
         )
 
 
@@ -167,26 +174,30 @@ class MethodRecord:
 def with_pareto_fronts(records: Sequence[MethodRecord]) -> list[MethodRecord]:
     """Return the records with `pareto_costs` filled in.
 
-    Methods that are not comparable are on no Pareto front, and do not exclude other methods from a front.
-    """
-    error_mm = np.array([record.error_mm if record.is_comparable else np.nan for record in records])
-    is_on_front = {}
-    for cost, sign in COST_SIGNS.items():
-        signed_cost = sign * np.array([record.cost(cost) for record in records])
-        is_on_front[cost] = pareto_front(signed_cost, error_mm)
+    The function `pareto_front` defines when a method is on the Pareto front of a cost. Methods that are not comparable
+    are on no Pareto front, and do not exclude other methods from a front.
 
-    marked_records = []
+    Args:
+        records: Records of all methods.
+    """
+    # An error of NaN keeps a method off every front.
+    error_mm = np.array([record.error_mm if record.is_comparable else np.nan for record in records])
+    front_by_cost = {}
+    for cost, sign in COST_SIGNS.items():
+        signed_cost = sign * np.array([record.cost(cost) for record in records])  # smaller is better
+        front_by_cost[cost] = pareto_front(signed_cost, error_mm)  # booleans, shape (n_record,)
+
+    completed_records = []
     for index, record in enumerate(records):
-        pareto_costs = tuple(cost for cost in COST_SIGNS if is_on_front[cost][index])
-        marked_records.append(replace(record, pareto_costs=pareto_costs))
-    return marked_records
+        pareto_costs = tuple(cost for cost, is_on_front in front_by_cost.items() if is_on_front[index])
+        completed_records.append(replace(record, pareto_costs=pareto_costs))
+    return completed_records
 
 
 def pareto_front(cost: Array, error: Array) -> Booleans:
     """Determine which methods are on the Pareto front of cost and error.
 
-    A method is on the front unless another method has a lower or equal cost and a lower or equal error, and at least
-    one of the two is lower.
+    A method is on the front unless another method is better in cost or error, and at least as good in the other.
 
     Args:
         cost: Costs of the methods, shape (n,); smaller is better.
@@ -236,21 +247,19 @@ def compare_with_released(records: Sequence[MethodRecord]) -> dict[str, Any]:
     """
     released = records[0]
     comparable = [record for record in records[1:] if record.is_comparable]
-    labels = {}
+    faster_and_more_accurate = {}
     for cost in SPEED_NAMES:
         faster = _faster_records(comparable, released, cost)
-        labels[cost] = [record.label for record in faster if record.error_mm < released.error_mm]
+        labels = [record.label for record in faster if record.error_mm < released.error_mm]
+        faster_and_more_accurate[cost] = labels
 
     other_methods = [record for record in comparable if record.method.kind != "network"]
     networks = [record for record in comparable if record.method.kind == "network"]
     sentences = []
-    for group_name, group in (
-        ("other methods", other_methods),
-        ("other networks", networks),
-    ):
+    for group_name, group in (("other methods", other_methods), ("other networks", networks)):
         if group:
             sentences += [_comparison_sentence(cost, released, group, group_name) for cost in SPEED_NAMES]
-    return {"both": labels, "sentences": sentences}
+    return {"both": faster_and_more_accurate, "sentences": sentences}
 
 
 def _speed_ratio(record: MethodRecord, released: MethodRecord, cost: Cost) -> float:
@@ -265,7 +274,10 @@ def _faster_records(records: Sequence[MethodRecord], released: MethodRecord, cos
 
 
 def _comparison_sentence(cost: Cost, released: MethodRecord, group: Sequence[MethodRecord], group_name: str) -> str:
-    """Return a sentence on how many methods of a group are faster and more accurate than the released model.
+    """Return the text that says how many methods of a group are faster and more accurate than the released model.
+
+    The text also compares the released model with the most accurate of the faster methods. If no method is faster, the
+    text says only this.
 
     Args:
         cost: The kind of speed: "latency" or "throughput".

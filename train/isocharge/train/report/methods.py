@@ -50,6 +50,9 @@ def fit_all(
 ) -> tuple[list[FittedMethod], dict[str, str]]:
     """Fit all methods and predict the test presses with each of them.
 
+    If a method cannot be fitted to measured presses, the reason is recorded and the next method is fitted. If a method
+    cannot be fitted to simulated presses, the error is raised.
+
     Args:
         methods: The methods to fit.
         task: The presses and conditions to which the methods are fitted.
@@ -75,7 +78,8 @@ def fit_all(
             failure_reasons[method.name] = str(error)
             continue
         fit_seconds = time.perf_counter() - start
-        estimate = fitted.regressor.predict(_test_inputs(fitted, test))
+        test_inputs = _test_inputs(fitted, test)
+        estimate = fitted.regressor.predict(test_inputs)
         fitted_methods.append(FittedMethod(fitted, estimate, fit_seconds))
     return fitted_methods, failure_reasons
 
@@ -102,12 +106,14 @@ def measure_methods(
         The records of the methods, in the order of `fitted_methods`.
     """
     methods = [fitted.method for fitted in fitted_methods]
+    method_count = len(methods)
     single_contenders = [Contender(method.name, 1, _single_press_call(method, test)) for method in methods]
     batch_contenders = [_batch_contender(method, test, settings.batch) for method in methods]
-    total_seconds = 2 * len(methods) * settings.seconds  # for single presses and for batches
+    total_seconds = 2 * method_count * settings.seconds  # for single presses and for batches
     timings = take_turns([*single_contenders, *batch_contenders], total_seconds)
-    single_timings = timings[: len(methods)]
-    batch_timings = timings[len(methods) :]
+    # The timings are in the order of the contenders: those of single presses, then those of batches.
+    single_timings = timings[:method_count]
+    batch_timings = timings[method_count:]
 
     records = []
     for fitted, single_timing, batch_timing in zip(fitted_methods, single_timings, batch_timings, strict=True):
@@ -121,9 +127,10 @@ def _test_inputs(method: ComparedMethod, test: LabelledPresses) -> Array:
 
 
 def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callable[[], object]:
-    """Return a function that predicts one press. Each call predicts the next press.
+    """Return a function without arguments that predicts one press.
 
-    ONNX networks are called in the same way as by `Predictor`, with arrays that are bound only once.
+    Each call predicts the next of the first `SINGLE_PRESSES` presses. After the last of these presses, the first one
+    follows again. For ONNX networks the arrays of each press are bound before the timing, as `Predictor` binds them.
 
     Args:
         method: Fitted method.
@@ -135,6 +142,7 @@ def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callabl
     if isinstance(regressor, OnnxContact | ReleasedModel):
         calls = [regressor.single(press_input) for press_input in inputs]
     else:
+        # `predict` expects a batch, so each press becomes a batch of one press, shape (1, n_input).
         calls = [partial(regressor.predict, press_input[None]) for press_input in inputs]
     cyclic_calls = cycle(calls)
     return lambda: next(cyclic_calls)()
@@ -152,15 +160,16 @@ def _batch_contender(method: ComparedMethod, test: LabelledPresses, batch_size: 
         batch_size: Number of presses in the whole batch.
     """
     inputs = _test_inputs(method, test)
-    batch = inputs[np.arange(batch_size) % len(inputs)]
+    repeated_rows = np.arange(batch_size) % len(inputs)
+    batch = inputs[repeated_rows]
     small_batch = batch[: max(1, batch_size // BATCH_REDUCTION)]
+
     start = time.perf_counter()
     method.regressor.predict(small_batch)
     small_batch_seconds = time.perf_counter() - start
-    batch_seconds = small_batch_seconds * batch_size / len(small_batch)
-    if batch_seconds > MAX_BATCH_SECONDS:
-        batch = small_batch
-    return Contender(method.name, len(batch), partial(method.regressor.predict, batch))
+    estimated_seconds = small_batch_seconds * batch_size / len(small_batch)
+    timed_batch = small_batch if estimated_seconds > MAX_BATCH_SECONDS else batch
+    return Contender(method.name, len(timed_batch), partial(method.regressor.predict, timed_batch))
 
 
 def _method_record(
@@ -173,7 +182,8 @@ def _method_record(
     Args:
         fitted: Fitted method and its estimates of the contacts.
         truth: True contacts, shape (n, 3), mm and N.
-        posterior_mean: Posterior means of the contacts, shape (n, 3), mm and N; None if they are not computed.
+        posterior_mean: Posterior means of the first m contacts, shape (m, 3), mm and N, for the ratio of the error to
+            the Bayes limit; None if they are not computed.
         single_timing: Time of the prediction of one press.
         batch_timing: Time of the prediction of many presses.
     """

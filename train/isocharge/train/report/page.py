@@ -34,8 +34,14 @@ def report_page(record: Mapping[str, Any]) -> str:
 
 
 def _summary_lines(section: Section) -> Iterator[str]:
-    """Yield the summary of a section, which contains the errors of the released model and the comparison."""
-    released: MethodRecord = section["methods"][0]
+    """Yield the lines of the summary: the errors of the released model, and its comparison with the other methods.
+
+    The comparison with the Bayes limit is left out if this limit was not computed.
+
+    Args:
+        section: Section of the report.
+    """
+    released: MethodRecord = section["methods"][0]  # the released model is always listed first
     errors = released.errors
     yield f"**{section['sensor']}**, released model `{section['model']['label']}`:\n"
     yield (
@@ -55,7 +61,11 @@ def _summary_lines(section: Section) -> Iterator[str]:
 
 
 def _simulated_section(section: Section) -> Iterator[str]:
-    """Yield the blocks of the section of a simulated dataset."""
+    """Yield the blocks of the section of a simulated dataset.
+
+    Args:
+        section: Section of the report.
+    """
     min_force, max_force = section["force_N"]
     presses = section["presses"]
     noise = section["noise"]
@@ -79,7 +89,11 @@ def _simulated_section(section: Section) -> Iterator[str]:
 
 
 def _measured_section(section: Section) -> Iterator[str]:
-    """Yield the blocks of the section of a measured dataset."""
+    """Yield the blocks of the section of a measured dataset.
+
+    Args:
+        section: Section of the report.
+    """
     min_force, max_force = section["force_N"]
     presses = section["presses"]
     yield f"## {section['sensor']}"
@@ -119,7 +133,13 @@ TEXT_COLUMNS = 2
 
 
 def _method_comparison(section: Section) -> Iterator[str]:
-    """Yield the table of limits and methods, an explanation, and the plots of the error against each cost."""
+    """Yield the table of limits and methods, an explanation, and the plots of the error against each cost.
+
+    The methods are sorted by their position error.
+
+    Args:
+        section: Section of the report.
+    """
     records: Sequence[MethodRecord] = section["methods"]
     sorted_records = sorted(records, key=_error_and_latency)
     rows = [*_limit_rows(section["limits"]), *(_method_row(record) for record in sorted_records)]
@@ -163,6 +183,9 @@ def _method_row(record: MethodRecord) -> list[str]:
     """Return the row of a method in the table of methods.
 
     The row is in bold if the method is on the Pareto front of the latency.
+
+    Args:
+        record: Record of the method.
     """
     errors = record.errors
     name = record.method.name
@@ -187,7 +210,11 @@ def _method_row(record: MethodRecord) -> list[str]:
 
 
 def _mismatch_effects(section: Section) -> Iterator[str]:
-    """Yield the blocks on the errors if the film, the probe or the electronics differ from the models' assumptions."""
+    """Yield the blocks on the errors if the film, the probe or the electronics differ from the models' assumptions.
+
+    Args:
+        section: Section of a simulated dataset.
+    """
     yield "### Errors if the film, the probe or the electronics differ from the assumptions"
     yield _picture(section, "noise")
     yield _picture(section, "effects")
@@ -232,7 +259,11 @@ def _chosen_parameters(records: Sequence[MethodRecord]) -> Iterator[str]:
 
 
 def _conditions(record: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the blocks on how the durations were measured, on which machine, and with which command."""
+    """Yield the blocks on how the durations were measured, on which machine, and with which command.
+
+    Args:
+        record: The content of `report.json`.
+    """
     batch_size = record["settings"]["batch"]
     yield "## How the report was measured"
     yield (
@@ -292,7 +323,11 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], text_co
 
 
 def _number_text(value: float | None) -> str:
-    """Return a number with three significant digits, or with all digits before the decimal point; empty for None."""
+    """Format a number for a table: three significant digits, or a rounded integer from 1000; empty for None.
+
+    Args:
+        value: The number, or None if there is none.
+    """
     if value is None:
         return ""
     if abs(value) < 1000:

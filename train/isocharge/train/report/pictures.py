@@ -71,36 +71,43 @@ def cost_plot(records: Sequence[MethodRecord], cost: Cost, limits: Mapping[str, 
         Figure with logarithmic axes and the Pareto front.
     """
     figure, axes = new_axes(10.5, 6.0)
-    answering = [record for record in records if record.errors.position_rms_mm]
-    answering.sort(key=lambda record: record.error_mm)
-    _draw_methods(axes, answering, cost)
-    _draw_pareto_front(axes, answering, cost)
-    largest_error_mm = max(record.error_mm for record in answering if not record.method.given_force)
+    # Methods without an estimate, and methods with an error of zero, have no place on a logarithmic axis.
+    drawn_records = [record for record in records if record.errors.position_rms_mm]
+    drawn_records.sort(key=lambda record: record.error_mm)
+    _draw_methods(axes, drawn_records, cost)
+    _draw_pareto_front(axes, drawn_records, cost)
+
+    largest_error_mm = max(record.error_mm for record in drawn_records if not record.method.given_force)
     for name, limit_mm in limits.items():
         if limit_mm <= largest_error_mm:
             line_style = LINE_STYLES[name]["ls"]
             axes.axhline(limit_mm, color=INK, ls=line_style, zorder=1, label=f"{name}, {limit_mm:.3g} mm")
+
     _set_logarithmic_axes(axes, COST_LABELS[cost], POSITION_ERROR_LABEL)
     axes.xaxis.set_major_formatter("{x:,g}")
-    if cost == "throughput":
+    if cost == "throughput":  # better methods are on the left in all plots
         axes.invert_xaxis()
     figure.legend(loc="outside right center", fontsize=8, frameon=False)
     return figure
 
 
 def _draw_methods(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> None:
-    """Draw one point for each method. Points of methods that are not comparable are hollow.
+    """Draw one point for each method.
+
+    The colour shows the kind of the method. Methods of one kind have different markers. Points of methods that are not
+    comparable are hollow, and the released model is a star.
 
     Args:
         axes: Axes of matplotlib.
         records: Results of the methods.
         cost: Cost on the horizontal axis.
     """
-    markers = {kind: cycle(MARKERS) for kind in KIND_COLOURS}
+    markers_by_kind = {kind: cycle(MARKERS) for kind in KIND_COLOURS}
     for record in records:
-        colour = KIND_COLOURS[record.method.kind]
+        kind = record.method.kind
+        colour = KIND_COLOURS[kind]
         fill_colour = colour if record.is_comparable else "white"
-        marker = next(markers[record.method.kind])
+        marker = next(markers_by_kind[kind])
         style: dict[str, Any] = {"color": colour, "mfc": fill_colour, "marker": marker, "ms": 7}
         if record.method.name == RELEASED:
             style = {"color": FELT, "marker": "*", "ms": 14}
@@ -121,7 +128,9 @@ def _draw_pareto_front(axes: Axes, records: Sequence[MethodRecord], cost: Cost) 
 
 
 def _set_logarithmic_axes(axes: Axes, x_label: str, y_label: str) -> None:
-    """Set both axes to logarithmic scales with plain numbers.
+    """Set both axes to logarithmic scales, labelled with plain numbers instead of powers of ten.
+
+    An axis that covers less than three decades also has labels at 2 and 5 times the powers of ten.
 
     Args:
         axes: Axes of matplotlib.
@@ -131,9 +140,9 @@ def _set_logarithmic_axes(axes: Axes, x_label: str, y_label: str) -> None:
     axes.set(xscale="log", yscale="log", xlabel=x_label, ylabel=y_label)
     for axis in (axes.xaxis, axes.yaxis):
         lower, upper = axis.get_view_interval()
-        is_short = upper < 1e3 * lower  # a short axis has labels between the powers of ten, too
-        multiples = (1.0, 2.0, 5.0) if is_short else (1.0,)
-        axis.set_major_locator(LogLocator(subs=multiples))
+        is_short = upper < 1e3 * lower
+        labelled_multiples = (1.0, 2.0, 5.0) if is_short else (1.0,)
+        axis.set_major_locator(LogLocator(subs=labelled_multiples))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
     axes.grid(alpha=0.25, which="both", lw=0.5)
@@ -161,10 +170,15 @@ def error_maps(sensor: Sensor, domain: Domain, draws: NoiseDraws) -> Figure:
     x_mm = draws.truth[:, 0]
     y_mm = draws.truth[:, 1]
     for axes, (label, errors) in zip(figure.subplots(1, 2), errors_by_label.items(), strict=True):
+        # Each hexagonal cell shows the root mean square of the errors of the presses in it.
         cells = axes.hexbin(x_mm, y_mm, errors, gridsize=22, reduce_C_function=rms, cmap="viridis", lw=0.1)
-        cells.set_clip_path(Circle((0, 0), domain.radius, transform=axes.transData))
+        working_area = Circle((0, 0), domain.radius, transform=axes.transData)
+        cells.set_clip_path(working_area)
+
+        # Single outliers do not determine the colour scale.
         cell_errors = np.ma.compressed(cells.get_array())
-        cells.set_clim(*np.percentile(cell_errors, (0.5, 99.5)))
+        lowest_colour, highest_colour = np.percentile(cell_errors, (0.5, 99.5))
+        cells.set_clim(lowest_colour, highest_colour)
         figure.colorbar(cells, ax=axes, shrink=0.85, label=label)
         draw_layout(axes, sensor, domain.radius)
     return figure
@@ -195,10 +209,13 @@ def _line_style(name: str) -> dict[str, Any]:
 
 
 def coverage_plot(record: Mapping[str, Any]) -> Figure:
-    """Draw the coverage of the released model's intervals minus the nominal level, in percentage points.
+    """Draw how far the coverage of the released model's intervals is from the nominal level, in percentage points.
+
+    A shaded band shows the tolerance. Points above zero mean that the intervals contain more true values than they
+    state.
 
     Args:
-        record: Result of `studies.coverage_by_level`.
+        record: Result of `studies.coverage_by_level`, with the nominal levels and the coverage of each coordinate.
 
     Returns:
         Figure with one curve for x, y and the force.
@@ -218,6 +235,8 @@ def coverage_plot(record: Mapping[str, Any]) -> Figure:
 def mismatch_plot(results: Sequence[Mapping[str, Any]], nominal_error_mm: float | None) -> Figure:
     """Draw the position errors and the alarms for all mismatches except those of the noise.
 
+    Each mismatch is one row, which both panels of the figure share.
+
     Args:
         results: Results of `studies.measure_mismatch`.
         nominal_error_mm: Position error of the released model without a mismatch, mm; None if it is unknown.
@@ -230,23 +249,37 @@ def mismatch_plot(results: Sequence[Mapping[str, Any]], nominal_error_mm: float 
     figure = new_figure(11.5, 1.9 + 0.36 * len(shown_results))
     error_axes, alarm_axes = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1.0))
 
-    for name in results[0]["errors"]:
+    method_names = results[0]["errors"].keys()
+    for name in method_names:
         errors_mm = [result["errors"][name]["position_rms_mm"] for result in shown_results]
-        style = _line_style(name) | {"ls": ""}
-        error_axes.plot(errors_mm, labels, **style, label=name)
+        point_style = {**_line_style(name), "ls": ""}
+        error_axes.plot(errors_mm, labels, **point_style, label=name)
     error_axes.axvline(nominal_error_mm or np.nan, color=FELT, lw=0.9, ls="--", label="without mismatch")
     error_axes.set(xlabel=POSITION_ERROR_LABEL, xscale="log")
-    error_axes.invert_yaxis()
+    error_axes.invert_yaxis()  # the first mismatch is the top row
     error_axes.xaxis.set_major_formatter("{x:g}")
     error_axes.grid(alpha=0.25, lw=0.5)
 
     alarms_percent = [result["alarms_percent"] for result in shown_results]
-    bars = alarm_axes.barh(labels, alarms_percent, color=FELT, alpha=0.8, height=0.6)
-    alarm_axes.bar_label(bars, fmt="{:g}", padding=3, fontsize=8)
-    alarm_axes.axvline(100.0 * FALSE_ALARM_RATE, color=INK, lw=0.9, ls="--")
-    alarm_axes.set(xlabel="presses with an alarm from the misfit, %", xlim=(0, 112))
+    _draw_alarms(alarm_axes, labels, alarms_percent)
     figure.legend(loc="outside lower center", fontsize=8, ncol=6, frameon=False)
     return figure
+
+
+def _draw_alarms(axes: Axes, labels: Sequence[str], alarms_percent: Sequence[float]) -> None:
+    """Draw the percentage of presses with an alarm as one bar for each mismatch.
+
+    A dashed line shows the percentage among good presses.
+
+    Args:
+        axes: Axes of matplotlib.
+        labels: Labels of the mismatches.
+        alarms_percent: Percentage of presses with an alarm for each mismatch.
+    """
+    bars = axes.barh(labels, alarms_percent, color=FELT, alpha=0.8, height=0.6)
+    axes.bar_label(bars, fmt="{:g}", padding=3, fontsize=8)
+    axes.axvline(100.0 * FALSE_ALARM_RATE, color=INK, lw=0.9, ls="--")
+    axes.set(xlabel="presses with an alarm from the misfit, %", xlim=(0, 112))
 
 
 def limit_errors(limits: Mapping[str, Any]) -> dict[str, float]:

@@ -34,6 +34,8 @@ def select_presses(dataset: Dataset, is_selected: Booleans) -> Dataset:
 def simulated_presses_for(model: ModelMetadata, dataset: Dataset) -> Dataset:
     """Return the presses of a simulated dataset that lie in the working area of a model.
 
+    The radius in the manifest of the returned dataset is the radius of the model's working area.
+
     Args:
         model: Metadata of the model.
         dataset: The simulated dataset. Its working area may be larger than the working area of the model.
@@ -45,24 +47,29 @@ def simulated_presses_for(model: ModelMetadata, dataset: Dataset) -> Dataset:
     domain = domain_of(dataset)
     min_force, max_force = domain.force_range
     model_min_force, model_max_force = model.force_range_N
-    if min_force * RANGE_TOLERANCE < model_min_force or max_force > model_max_force * RANGE_TOLERANCE:
+    is_below_range = min_force * RANGE_TOLERANCE < model_min_force
+    is_above_range = max_force > model_max_force * RANGE_TOLERANCE
+    if is_below_range or is_above_range:
         raise ModelError(
             f"model {model.label}: expected forces from {model_min_force:g} to {model_max_force:g} N, for which the "
             f"model was trained, got a dataset with forces from {min_force:.4g} to {max_force:.4g} N; simulate a "
             "dataset within the range of the model, or train another model"
         )
+
     model_radius = model_domain(model).radius
-    if domain.radius <= model_radius * RANGE_TOLERANCE:
+    lies_inside_model = domain.radius <= model_radius * RANGE_TOLERANCE
+    if lies_inside_model:
         return dataset
     is_inside = np.hypot(dataset.samples.x_mm, dataset.samples.y_mm) <= model_radius
+    selected_dataset = select_presses(dataset, is_inside)
     ranges = {**dataset.manifest.get("ranges", {}), "radius_mm": model_radius}
-    return replace(select_presses(dataset, is_inside), manifest={**dataset.manifest, "ranges": ranges})
+    return replace(selected_dataset, manifest={**dataset.manifest, "ranges": ranges})
 
 
 def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
     """Raise an error if a model was trained for another sensor than the sensor of a dataset.
 
-    The names of the two sensors may differ.
+    All values of the two sensors are compared except their names, which may differ.
 
     Args:
         model: Metadata of the model.
@@ -70,8 +77,8 @@ def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
     """
     expected = sensor_to_dict(dataset.sensor)
     given = dict(model.sensor)
-    keys = (expected.keys() | given.keys()) - {"name"}
-    different_keys = sorted(key for key in keys if expected.get(key) != given.get(key))
+    compared_keys = (expected.keys() | given.keys()) - {"name"}
+    different_keys = sorted(key for key in compared_keys if expected.get(key) != given.get(key))
     if different_keys:
         raise ModelError(
             f"model {model.label}: expected a model of the dataset's sensor {expected['name']!r}, got a model of "
@@ -81,7 +88,9 @@ def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
 
 
 def measured_presses_for(model: ModelMetadata, dataset: Dataset) -> Dataset:
-    """Return the measured presses that lie within the working area and the forces of a model.
+    """Return the measured presses that lie within the working area and the range of forces of a model.
+
+    The returned dataset has an empty manifest, because the ranges of the manifest include the excluded presses.
 
     Args:
         model: Metadata of the model.
@@ -98,5 +107,6 @@ def measured_presses_for(model: ModelMetadata, dataset: Dataset) -> Dataset:
         )
     presses = LabelledPresses.of(dataset)
     is_inside = model_domain(model).contains(presses.contact)
-    check_enough(int(is_inside.sum()), len(presses), dataset.sensor.name)
+    inside_count = int(is_inside.sum())
+    check_enough(inside_count, len(presses), dataset.sensor.name)
     return replace(select_presses(dataset, is_inside), manifest={})

@@ -1,8 +1,8 @@
 """Studies of the released model beyond its mean error.
 
-The studies compute the errors over the film and the force, and the coverage of the reported standard deviations. They
-also compute the errors if the noise, the probe, the pretension, the gains or an electrode differ from those of the
-training.
+The studies compute the errors over the film and the force, and the coverage of the reported standard deviations. The
+studies also compute the errors if the noise, the probe, the pretension, the gains or an electrode differ from those of
+the training.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -65,8 +65,9 @@ class NoiseDraws:
             The estimates of all draws, one after the other.
         """
         first_seed = case.seed + NOISE_DRAWS_SEED
-        noisy_charges = [clean.noisy(case.noise, first_seed + draw) for draw in range(draw_count)]
-        estimate, std, misfit = released.answer(np.concatenate(noisy_charges))
+        charges_by_draw = [clean.noisy(case.noise, first_seed + draw) for draw in range(draw_count)]
+        all_charges = np.concatenate(charges_by_draw)  # shape (draw_count * n_press, n_electrode)
+        estimate, std, misfit = released.answer(all_charges)
         truth = np.tile(clean.contact, (draw_count, 1))
         return cls(truth, estimate, std, misfit[:, 0])
 
@@ -87,18 +88,23 @@ def errors_by_force(
         The geometric centres of the bins ("force_N"), and the errors in the bins by the name of the method
         ("position_rms_mm"). An error is None if a bin contains no estimate.
     """
-    edges = np.geomspace(*domain.force_range, FORCE_BINS + 1)
-    bin_index = np.digitize(truth[:, 2], edges[1:-1])
-    position_errors = {}
+    min_force, max_force = domain.force_range
+    edges = np.geomspace(min_force, max_force, FORCE_BINS + 1)
+    geometric_centres = np.sqrt(edges[:-1] * edges[1:])
+    true_force = truth[:, 2]
+    bin_index = np.digitize(true_force, edges[1:-1])  # with the inner edges, the first bin has the index 0
+
+    errors_by_name = {}
     for name, estimate in estimates.items():
-        position_errors[name] = position_error(estimate, truth[: len(estimate)])
-    position_errors[CRAMER_RAO] = cramer_rao_mm
-    centres = np.sqrt(edges[:-1] * edges[1:])
+        errors_by_name[name] = position_error(estimate, truth[: len(estimate)])
+    errors_by_name[CRAMER_RAO] = cramer_rao_mm
+
+    binned_errors = {}
+    for name, errors in errors_by_name.items():
+        binned_errors[name] = _rms_in_bins(errors, bin_index[: len(errors)])
     return {
-        "force_N": [round_significant(force) for force in centres],
-        "position_rms_mm": {
-            name: _rms_in_bins(errors, bin_index[: len(errors)]) for name, errors in position_errors.items()
-        },
+        "force_N": [round_significant(force) for force in geometric_centres],
+        "position_rms_mm": binned_errors,
     }
 
 
@@ -112,12 +118,13 @@ def _rms_in_bins(errors: Array, bin_index: Integers) -> list[float | None]:
     Returns:
         Errors, mm; None for a bin without finite errors.
     """
-    values: list[float | None] = []
+    is_finite = np.isfinite(errors)
+    rms_by_bin: list[float | None] = []
     for index in range(FORCE_BINS):
-        errors_in_bin = errors[(bin_index == index) & np.isfinite(errors)]
-        value = round_significant(rms(errors_in_bin)) if errors_in_bin.size else None
-        values.append(value)
-    return values
+        errors_in_bin = errors[is_finite & (bin_index == index)]
+        bin_rms = round_significant(rms(errors_in_bin)) if errors_in_bin.size else None
+        rms_by_bin.append(bin_rms)
+    return rms_by_bin
 
 
 def coverage_by_level(draws: NoiseDraws) -> dict[str, Any]:
@@ -182,7 +189,9 @@ class Mismatch:
 def mismatches(
     case: EvaluationCase, clean: LabelledPresses, settings: Settings, executor: Executor | None = None
 ) -> Iterator[Mismatch]:
-    """Yield the presses of all mismatches.
+    """Yield the presses of all mismatches: other noise, other probes, another pretension, wrong gains, dead electrodes.
+
+    The film is solved again only for the other probes and for the other pretension.
 
     Args:
         case: The conditions that the models assume.
@@ -197,14 +206,14 @@ def mismatches(
 
     probe_accuracy = max(MISMATCH_ACCURACY, settings.accuracy)
     for notation in settings.shapes:
-        other_probe = replace(case, probes=(parse_probe(notation),))
-        yield _solved_mismatch("probe", notation, other_probe, probe_accuracy, executor)
+        case_of_other_probe = replace(case, probes=(parse_probe(notation),))
+        yield _solved_mismatch("probe", notation, case_of_other_probe, probe_accuracy, executor)
 
     if settings.mismatch_cases:
         film = replace(case.sensor.film, pretension=case.sensor.film.pretension + PRETENSION_ERROR_MPa)
-        other_film = replace(case, sensor=replace(case.sensor, film=film))
+        case_of_other_film = replace(case, sensor=replace(case.sensor, film=film))
         name = f"+{PRETENSION_ERROR_MPa:g} MPa"
-        yield _solved_mismatch("pretension", name, other_film, MISMATCH_ACCURACY, executor)
+        yield _solved_mismatch("pretension", name, case_of_other_film, MISMATCH_ACCURACY, executor)
 
     noisy_charge = clean.noisy(case.noise, noise_seed)
     rng = np.random.default_rng(noise_seed)
@@ -243,11 +252,11 @@ def _gain_mismatches(
         noisy_charge: Charges with noise, shape (n, n_electrode), pC.
         rng: Random number generator.
     """
-    gains = 1.0 + GAIN_STD * rng.standard_normal(noisy_charge.shape)
-    yield Mismatch("gain", f"each off by {100 * GAIN_STD:g} % rms", truth, gains * noisy_charge)
-    for electrode, name in enumerate(case.sensor.electrode_names):
+    random_gains = 1.0 + GAIN_STD * rng.standard_normal(noisy_charge.shape)
+    yield Mismatch("gain", f"each off by {100 * GAIN_STD:g} % rms", truth, random_gains * noisy_charge)
+    for electrode_index, name in enumerate(case.sensor.electrode_names):
         charge = noisy_charge.copy()
-        charge[:, electrode] *= 1.0 + SINGLE_GAIN_ERROR
+        charge[:, electrode_index] *= 1.0 + SINGLE_GAIN_ERROR
         yield Mismatch("gain", f"{name} off by {100 * SINGLE_GAIN_ERROR:g} %", truth, charge)
 
 
@@ -263,9 +272,9 @@ def _dead_electrodes(
         rng: Random number generator.
     """
     noise_charge = case.noise.white * rng.standard_normal(noisy_charge.shape)
-    for electrode, name in enumerate(case.sensor.electrode_names):
+    for electrode_index, name in enumerate(case.sensor.electrode_names):
         charge = noisy_charge.copy()
-        charge[:, electrode] = noise_charge[:, electrode]
+        charge[:, electrode_index] = noise_charge[:, electrode_index]
         yield Mismatch("dead electrode", f"{name} dead", truth, charge)
 
 
@@ -277,6 +286,9 @@ def measure_mismatch(
     alarm_threshold: float,
 ) -> dict[str, Any]:
     """Measure the errors of the released model and of other methods under a mismatch.
+
+    The estimates of the other methods are clipped to plus or minus `CLIP_LIMIT`, because polynomials diverge for
+    charges outside their training range.
 
     Args:
         mismatch: The presses with their charges.
@@ -293,8 +305,8 @@ def measure_mismatch(
     errors = {released_name: asdict(ContactErrors.of(estimate, mismatch.truth))}
     for method in other_methods:
         with np.errstate(over="ignore"):
-            other_estimate = method.regressor.predict(mismatch.charge)
-        clipped_estimate = np.clip(other_estimate, -CLIP_LIMIT, CLIP_LIMIT)
+            method_estimate = method.regressor.predict(mismatch.charge)
+        clipped_estimate = np.clip(method_estimate, -CLIP_LIMIT, CLIP_LIMIT)
         errors[method.name] = asdict(ContactErrors.of(clipped_estimate, mismatch.truth))
     alarm_fraction = float(np.mean(misfit[:, 0] > alarm_threshold))
     inside_fraction = float(np.mean(np.abs(estimate - mismatch.truth) < std))

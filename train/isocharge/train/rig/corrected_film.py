@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # loads a part when it is used
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.common.measured_presses import MeasuredPresses, row_words
 from isocharge.common.statistics import rms
 from isocharge.simulate import Domain, ForwardMap, NoiseModel
@@ -68,23 +68,41 @@ def correct_film(presses: MeasuredPresses, forward_map: ForwardMap, domain: Doma
         The forward map with a smooth correction, and the scatter of the presses about it.
     """
     residuals = Residuals.of(presses, forward_map, noise)
+    correction, is_gross = _robust_correction(residuals)
+    if is_gross.any():
+        left_out = presses[is_gross]
+        left_out_rows = row_words(left_out.lines, left_out.row_noun)
+        _log.warning("%s: left out, since these presses differ from all others; look at them again", left_out_rows)
+
+    # The scatter is the root of chi-squared over its degrees of freedom: residuals less fitted coefficients.
+    good_residuals = residuals[~is_gross]
+    total_chi2 = good_residuals.chi2(correction.log_factor(good_residuals.contact)).sum()
+    freedom = max(good_residuals.log_ratio.size - correction.freedom, 1.0)
+    scatter = float(np.sqrt(total_chi2 / freedom))
+    is_improbable = scipy.stats.chi2.sf(total_chi2, freedom) < SCATTER_PROBABILITY
+    is_scattered = bool(scatter > SCATTER_RATIO and is_improbable)
+    return CorrectedFilm(forward_map, correction, domain, scatter, is_scattered)
+
+
+def _robust_correction(residuals: Residuals) -> tuple[Correction, Booleans]:
+    """Fit a correction to the presses without gross errors.
+
+    A press has a gross error if its squared residual is much larger than the median. The correction and the selection
+    of presses are computed in turn until the selection no longer changes.
+
+    Args:
+        residuals: Differences between measured presses and a forward map.
+
+    Returns:
+        The correction, and whether each press has a gross error, shape (n,).
+    """
     correction = fit_correction(residuals)
     is_gross = np.zeros(len(residuals), dtype=bool)
     for _ in range(MAX_ROUNDS):
-        chi2 = residuals.chi2(correction.log_factor(presses.contact))
+        chi2 = residuals.chi2(correction.log_factor(residuals.contact))
         was_gross = is_gross
         is_gross = chi2 > GROSS_ERROR_RATIO * np.median(chi2)
         if np.array_equal(is_gross, was_gross):
             break
         correction = fit_correction(residuals[~is_gross])
-    if is_gross.any():
-        left_out = presses[is_gross]
-        words = row_words(left_out.lines, left_out.row_noun)
-        _log.warning("%s: left out, since these presses differ from all others; look at them again", words)
-        residuals = residuals[~is_gross]
-
-    total_chi2 = residuals.chi2(correction.log_factor(residuals.contact)).sum()
-    freedom = max(residuals.log_ratio.size - correction.freedom, 1.0)
-    scatter = float(np.sqrt(total_chi2 / freedom))
-    is_improbable = scipy.stats.chi2.sf(total_chi2, freedom) < SCATTER_PROBABILITY
-    return CorrectedFilm(forward_map, correction, domain, scatter, bool(scatter > SCATTER_RATIO and is_improbable))
+    return correction, is_gross

@@ -1,10 +1,10 @@
 """Smooth correction of the charges of a forward map, fitted to measured presses by generalised least squares.
 
-The correction is a factor on the charge of each electrode. Its logarithm is a sum of the polynomials of
+The correction is a factor on the charge of each electrode. The logarithm of this factor is a sum of the polynomials of
 `calibration.discrepancy` in the place and the logarithm of the force. The covariance of the residuals contains the
-noise of the charges, and the errors of the measured places and forces, which act through the derivatives of the map.
-The probability of several sizes of the correction is computed. If the size zero is the most probable, the charges are
-not corrected.
+noise of the charges. The covariance also contains the errors of the measured places and forces, which are converted to
+charges with the derivatives of the map. The probability of several sizes of the correction is computed. If the size
+zero is the most probable, the charges are not corrected.
 """
 
 from dataclasses import dataclass
@@ -56,6 +56,9 @@ class Residuals:
     @classmethod
     def of(cls, presses: MeasuredPresses, charge_map: ChargeMap, noise: NoiseModel) -> "Residuals":
         """Compute the residuals of presses whose places, forces and charges are known.
+
+        The covariance of the residuals is the sum of two parts: the noise of the charges, and the errors of the
+        measured contacts.
 
         Args:
             presses: Measured presses without missing values.
@@ -116,18 +119,46 @@ class Correction:
 def fit_correction(residuals: Residuals) -> Correction:
     """Fit a correction to residuals by generalised least squares.
 
+    The correction is a series of polynomials for each electrode. Several sizes of the correction are compared as
+    hypotheses, one of which is no correction.
+
     Args:
         residuals: Differences between measured presses and a forward map.
 
     Returns:
         The correction. It is zero if the residuals are most probable without a correction.
     """
+    # The domain of the polynomials is the range of the presses.
     x, y, force = residuals.contact.T
     n_electrode = residuals.log_ratio.shape[1]
     domain = Domain(float(np.hypot(x, y).max()), (float(force.min()), float(force.max())))
     n_coefficient = term_count() * n_electrode
 
-    # Sum the normal equations over chunks of presses, which limits the memory.
+    def prior_covariance(hypothesis: Hypothesis) -> Array:
+        """Return the covariance of the coefficients before the presses. The coefficients are independent."""
+        return hypothesis.discrepancy**2 * np.eye(n_coefficient)
+
+    # Average over the hypotheses about the size of the correction, with their probabilities as weights.
+    model = _normal_equations(residuals, domain, n_coefficient)
+    hypotheses = [Hypothesis(discrepancy=size) for size in SIZES]
+    model_without_force_scatter = {0.0: model}
+    mixture = mix_hypotheses(model_without_force_scatter, prior_covariance, hypotheses)
+
+    is_best_without_correction = mixture.best.discrepancy == 0.0
+    if is_best_without_correction:
+        return Correction(domain, np.zeros((term_count(), n_electrode)), 0.0)
+    degrees_of_freedom = float(np.trace(mixture.covariance @ model.normal))
+    return Correction(domain, mixture.mean.reshape(term_count(), -1), degrees_of_freedom)
+
+
+def _normal_equations(residuals: Residuals, domain: Domain, n_coefficient: int) -> LinearModel:
+    """Return the normal equations of all residuals, summed over chunks of presses to limit the memory.
+
+    Args:
+        residuals: Differences between measured presses and a forward map.
+        domain: Domain of the polynomials.
+        n_coefficient: Number of coefficients of the correction.
+    """
     normal = np.zeros((n_coefficient, n_coefficient))
     moment = np.zeros(n_coefficient)
     square = 0.0
@@ -137,36 +168,29 @@ def fit_correction(residuals: Residuals) -> Correction:
         normal += chunk.normal
         moment += chunk.moment
         square += chunk.square
-
-    # Average over the hypotheses about the size of the correction, with their probabilities as weights.
-    hypotheses = [Hypothesis(discrepancy=size) for size in SIZES]
-    model_without_force_scatter = {0.0: LinearModel(normal, moment, square)}
-    mixture = mix_hypotheses(
-        model_without_force_scatter,
-        lambda hypothesis: hypothesis.discrepancy**2 * np.eye(n_coefficient),
-        hypotheses,
-    )
-    if mixture.best.discrepancy == 0.0:
-        return Correction(domain, np.zeros((term_count(), n_electrode)), 0.0)
-    degrees_of_freedom = float(np.trace(mixture.covariance @ normal))
-    return Correction(domain, mixture.mean.reshape(term_count(), -1), degrees_of_freedom)
+    return LinearModel(normal, moment, square)
 
 
 def _linearised(residuals: Residuals, domain: Domain) -> LinearModel:
     """Return the sum of the squared residuals as a function of the coefficients of the correction.
 
+    A residual is the difference between the correction and the measured ln(Q / expected Q), so it is linear in the
+    coefficients. Each residual is whitened with the covariance of its press.
+
     Args:
         residuals: Residuals of n presses.
         domain: Domain of the polynomials.
     """
-    # The whitened residuals have unit covariance.
+    # The whitened residuals have unit covariance. These are the residuals without a correction.
     whitening = np.linalg.inv(np.linalg.cholesky(residuals.covariance))
     whitened_residuals = -(whitening @ residuals.log_ratio[:, :, None])[:, :, 0]
+
+    # Derivatives of residual g of press n with respect to the coefficient of term t for electrode e, shape (n, g, t, e)
     polynomials = terms(residuals.contact, domain)
-    # Derivatives of residual g of press n with respect to the coefficient of term t for electrode e
-    design = polynomials[:, None, :, None] * whitening[:, :, None, :]
+    derivatives = polynomials[:, None, :, None] * whitening[:, :, None, :]
     n_coefficient = term_count() * residuals.log_ratio.shape[1]
-    return LinearModel.of(design.reshape(-1, n_coefficient), whitened_residuals.ravel(), np.zeros(n_coefficient))
+    design = derivatives.reshape(-1, n_coefficient)
+    return LinearModel.of(design, whitened_residuals.ravel(), np.zeros(n_coefficient))
 
 
 def _log_ratio(ratio: Array) -> Array:

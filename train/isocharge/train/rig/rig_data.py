@@ -1,7 +1,7 @@
 """Training data from measured presses on a sensor for which no network for all films exists.
 
-The film of such a sensor cannot be calibrated. The forward map of the sensor as described is corrected by the presses,
-and a network is trained on presses of the corrected map.
+The film of such a sensor cannot be calibrated. Instead, the forward map of the described sensor is corrected by the
+presses. A network is then trained on presses of the corrected map.
 """
 
 import logging
@@ -84,6 +84,8 @@ def rig_data(rig: Rig, *, drawn: int = DRAWN_PRESSES, seed: int = 0) -> Training
     domain = Domain(rig.radius, DEFAULT_FORCE_RANGE)
     presses = _usable_presses(rig, domain)
     is_held_out = held_out(presses.contact)
+
+    # The map is solved with a margin around the domain, for the derivatives at its edge.
     min_force, max_force = domain.force_range
     map_force_range = (min_force / MAP_MARGIN, max_force * MAP_MARGIN)
     forward_map = ForwardMap.build(rig.sensor, rig.probe, domain.radius * MAP_MARGIN, map_force_range)
@@ -113,9 +115,9 @@ def _usable_presses(rig: Rig, domain: Domain) -> MeasuredPresses:
         PressError: If too few presses remain.
     """
     presses = rig.presses.of_electrodes(rig.sensor.electrode_names, rig.sensor.name)
-    low, high = domain.force_range
+    min_force, max_force = domain.force_range
     is_incomplete = ~complete(presses)
-    is_outside = ~is_incomplete & domain.is_outside(presses.contact)
+    is_outside = ~is_incomplete & domain.is_outside(presses.contact)  # each press is left out for one reason only
     is_usable = ~(is_incomplete | is_outside)
     check_enough(int(is_usable.sum()), len(presses), rig.sensor.name)
 
@@ -124,7 +126,8 @@ def _usable_presses(rig: Rig, domain: Domain) -> MeasuredPresses:
         reasons.append(f"{is_incomplete.sum()} with an unknown place, force or charge")
     if is_outside.any():
         reasons.append(
-            f"{is_outside.sum()} beyond {domain.radius:g} mm from the centre, or outside {low:.3g} to {high:.3g} N"
+            f"{is_outside.sum()} beyond {domain.radius:g} mm from the centre, or outside {min_force:.3g} to "
+            f"{max_force:.3g} N"
         )
     if reasons:
         _log.warning("%d of %d presses are left out: %s", (~is_usable).sum(), len(presses), "; ".join(reasons))
@@ -144,11 +147,14 @@ def _draw_dataset(film: CorrectedFilm, count: int, seed: int) -> Dataset:
     """
     contact = draw_contacts(np.random.default_rng(seed), film.domain, count)
     charge = film.charges(contact)
+    # Because of its entry for the solver, the dataset counts as simulated.
     manifest = {
         "ranges": {"radius_mm": film.domain.radius, "force_N": list(film.domain.force_range)},
         SOLVER: {"map": "forward map of the film, corrected by measured presses"},
     }
-    checksum = sha256_of(np.ascontiguousarray(contact).tobytes() + np.ascontiguousarray(charge).tobytes())
+    contact_bytes = np.ascontiguousarray(contact).tobytes()
+    charge_bytes = np.ascontiguousarray(charge).tobytes()
+    checksum = sha256_of(contact_bytes + charge_bytes)
     x_mm, y_mm, force_N = contact.T
     probe = np.full(count, film.forward_map.probe.notation)
     orientation = np.zeros(count)

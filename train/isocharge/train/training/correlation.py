@@ -1,12 +1,9 @@
 """Correlations of the errors of x, y and ln F, as additional answers of a trained network.
 
 The other answers of the network do not change. A correlation matrix is the Gram matrix of three unit vectors. The
-vectors
-
-    (1, 0, 0),  (cos a, sin a, 0),  (cos b, sin b cos c, sin b sin c)
-
-give a valid matrix for any angles a, b and c; they are the rows of its Cholesky factor. Products of sines and cosines
-are sums of cosines, so the correlations are linear in eight cosines:
+vectors (1, 0, 0), (cos a, sin a, 0), (cos b, sin b cos c, sin b sin c) give a valid matrix for any angles a, b and c.
+These vectors are the rows of the Cholesky factor of the matrix. Products of sines and cosines are sums of cosines, so
+the correlations are linear in eight cosines:
 
     xy = cos a,  xF = cos b,
     yF = (cos(a - b) + cos(a + b)) / 2 + (cos(a - b - c) + cos(a - b + c) - cos(a + b - c) - cos(a + b + c)) / 4.
@@ -73,8 +70,9 @@ ANGLE_SUMS = np.array([[1, 0, 1, 1, 1, 1, 1, 1], [0, 1, -1, 1, -1, -1, 1, 1], [0
 def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: NoiseModel, seed: int) -> FoldedNetwork:
     """Add correlations to a network.
 
-    The network estimates the contacts of presses with noise. The angles of the correlations are fitted to its errors.
-    They depend only on hidden units that influence the contact, and on the input features.
+    The network estimates the contacts of presses with noise, and the angles of the correlations are fitted to the
+    errors of these estimates. The angles depend only on the input features and on hidden units that influence the
+    contact.
 
     Args:
         network: The trained network.
@@ -85,6 +83,7 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
     Returns:
         The network with additional answers, the angles of the correlations.
     """
+    # Errors of (x, y, ln F) and their stated standard deviations, each of shape (n, 3)
     layers = network.layers
     examples = presses.repeated(N_EXAMPLES)
     features = network.features.evaluate(examples.noisy(noise, seed))
@@ -99,6 +98,8 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
     with threadpool_limits(1):  # the steps are small: two threads would take three times as long
         angles = _fit_angles(inputs, error / error_std)
 
+    # The first rows of the weights belong to the hidden units of the contact, the others to the features. All other
+    # hidden units get the weight zero. The output layer contains the sums of angles whose cosines are needed.
     hidden_weight, skip_weight = np.split(angles.weight, [np.count_nonzero(is_contact_unit)])
     last_weight = np.zeros((hidden_output.shape[1], 3))
     last_weight[is_contact_unit] = hidden_weight
@@ -109,6 +110,9 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
 def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
     """Fit the linear layer that gives the angles.
 
+    The inputs are whitened for the fit, and the whitening is included in the returned layer. The loss is that of
+    `correlation_loss` plus a penalty on the squared weights.
+
     Args:
         inputs: Inputs of the layer, shape (n, k).
         deviation: Errors of (x, y, ln F) over their standard deviations, shape (n, 3).
@@ -118,7 +122,8 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
     """
     mean, matrix = whitening(inputs[::WHITENING_STRIDE], MIN_RELATIVE_STD)
     white_inputs = np.ascontiguousarray((inputs - mean) @ matrix, dtype=np.float32)
-    targets = np.ascontiguousarray(np.clip(deviation, -MAX_DEVIATION, MAX_DEVIATION).T, dtype=np.float32)
+    clipped_deviation = np.clip(deviation, -MAX_DEVIATION, MAX_DEVIATION)
+    targets = np.ascontiguousarray(clipped_deviation.T, dtype=np.float32)  # shape (3, n)
     n_input = inputs.shape[1]
 
     def loss(scaled: Array) -> tuple[float, Array]:
@@ -127,19 +132,23 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
         Args:
             scaled: Bias and weights of the three angles over FIRST_STEP, flattened, shape (3 (1 + n_input),).
         """
-        bias, weight = np.split(FIRST_STEP * scaled.reshape(-1, 3), [1])
+        bias, weight = np.split(FIRST_STEP * scaled.reshape(-1, 3), [1])  # shapes (1, 3) and (n_input, 3)
         single_weight = weight.astype(np.float32)
-        angles = single_weight.T @ white_inputs.T + bias.astype(np.float32).T
-        total, angle_gradient = correlation_loss(angles, targets)
+        angles = single_weight.T @ white_inputs.T + bias.astype(np.float32).T  # shape (3, n)
+        correlation_part, angle_gradient = correlation_loss(angles, targets)
+        penalty = RIDGE * float((weight**2).sum())
+
         bias_gradient = angle_gradient.sum(axis=1, dtype=float)
         weight_gradient = white_inputs.T @ angle_gradient.T + 2.0 * RIDGE * single_weight
         gradient = np.vstack([bias_gradient, weight_gradient])
-        return total + RIDGE * float((weight**2).sum()), FIRST_STEP * gradient.ravel()
+        return correlation_part + penalty, FIRST_STEP * gradient.ravel()
 
+    # The search begins without correlations: all angles are right angles, whose cosines are zero.
     start = np.zeros((1 + n_input, 3))
-    start[0] = 0.5 * np.pi / FIRST_STEP  # all cosines are zero: no correlation
-    scaled = _minimise(loss, start.ravel())
-    bias, white_weight = np.split(FIRST_STEP * scaled.reshape(start.shape), [1])
+    start[0] = 0.5 * np.pi / FIRST_STEP
+    scaled_solution = _minimise(loss, start.ravel())
+    bias, white_weight = np.split(FIRST_STEP * scaled_solution.reshape(start.shape), [1])
+    # ((inputs - mean) @ matrix) @ white_weight + bias, as a layer of the inputs themselves
     weight = matrix @ white_weight
     return Layer(weight, bias[0] - mean @ weight)
 
@@ -157,7 +166,7 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Arr
     Returns:
         Position at which the search ended, shape (n,).
     """
-    tolerance = FIRST_STEP * GRADIENT_TOLERANCE
+    tolerance = FIRST_STEP * GRADIENT_TOLERANCE  # the loss is a function of the position in units of FIRST_STEP
     options = {"ftol": 0.0, "gtol": tolerance, "maxcor": N_UPDATES}
     position = start
     remaining_iterations = MAX_ITERATIONS
@@ -166,7 +175,8 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Arr
         result = minimize(loss, position, jac=True, method="L-BFGS-B", options=start_options)
         position = result.x
         remaining_iterations -= result.nit
-        if remaining_iterations <= 0 or np.abs(result.jac).max() <= tolerance:
+        is_converged = np.abs(result.jac).max() <= tolerance
+        if is_converged or remaining_iterations <= 0:
             return np.asarray(position)
     largest_gradient = np.abs(result.jac).max() / FIRST_STEP
     _log.warning("the training of the correlations has not converged: the gradient is %.1g", largest_gradient)
@@ -175,6 +185,9 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Arr
 
 def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tuple[float, Array | Singles]:
     """Compute the negative logarithm of a Gaussian likelihood with unit variances, without its constant.
+
+    The rows (1, 0, 0), (cos a, sin a, 0) and (cos b, sin b cos c, sin b sin c) are the Cholesky factor of the matrix of
+    correlations. The errors are whitened with it. Sines are limited to at least `MIN_SINE` in magnitude.
 
     Args:
         angles: Angles a, b and c, shape (3, n), rad.
@@ -187,13 +200,15 @@ def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tup
     cos_a, cos_b, cos_c = np.cos(angles)
     sin_a, sin_b, sin_c = np.copysign(np.maximum(np.abs(sine), MIN_SINE), sine)
 
-    # The Cholesky factor is inverted row by row: the covariance of the whitened errors is the identity matrix.
+    # The Cholesky factor is inverted row by row: the covariance of the whitened errors is the identity matrix. The
+    # determinant of the factor is sin a sin b sin c. The square of the first error does not depend on the angles.
     x_deviation, y_deviation, force_deviation = deviation
     first = x_deviation
     second = (y_deviation - cos_a * first) / sin_a
     third = (force_deviation - cos_b * first - sin_b * cos_c * second) / (sin_b * sin_c)
     loss = np.log(np.abs(sin_a * sin_b * sin_c)) + 0.5 * (second**2 + third**2)
 
+    # Derivatives of the loss with respect to a, b and c, in which the cotangents replace quotients
     cot_a = cos_a / sin_a
     cot_b = cos_b / sin_b
     cot_c = cos_c / sin_c

@@ -1,16 +1,18 @@
 """Training of a network on measured presses alone, for a sensor that is not simulated.
 
 Five networks are trained, each without a fifth of the places (cross-validation). The errors of the model are measured
-with the answers of each network at the places on which it was not trained. The same answers give factors of the
-standard deviations, with which the intervals contain the truth as often as they state (split conformal prediction,
-Papadopoulos et al. 2002). The mean of the five networks has smaller errors than a single network. One further network
-learns this mean (Hinton et al. 2015), so that the released model is as small and fast as those of simulated sensors.
+with the answers of each network at the places on which it was not trained. The same answers give factors by which the
+standard deviations are multiplied. The intervals then contain the truth as often as they state (split conformal
+prediction, Papadopoulos et al., 2002). The mean of the five networks has smaller errors than a single network. One
+further network learns this mean (Hinton et al., 2015), so that the released model is as small and fast as the models of
+simulated sensors.
 
 The noise of the presses is estimated from the presses (`isocharge.train.data.channel_noise`). In every training step,
 half of this noise is added to the charges as a regularisation.
 """
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from importlib import metadata
@@ -43,7 +45,7 @@ from isocharge.train.training.fit import contact_stage, threads_and_seed, train_
 from isocharge.train.training.fitted import Answers, Fitted, Provenance
 from isocharge.train.training.losses import distillation_loss
 from isocharge.train.training.misfit_training import misfit_stage
-from isocharge.train.training.network import InverseNetwork, as_tensor, fold_network
+from isocharge.train.training.network import InverseNetwork, TrainablePerceptron, as_tensor, fold_network
 
 _log = logging.getLogger(__name__)
 
@@ -72,7 +74,11 @@ ONE_STD_COVERAGE = 0.6827
 """Probability that a Gaussian variable is within one standard deviation of its mean."""
 
 TWO_STD_COVERAGE = 0.95
-"""Probability that a Gaussian variable is within 1.96 standard deviations of its mean."""
+"""Probability that a Gaussian variable is within `TWO_STD_LIMIT` standard deviations of its mean."""
+
+TWO_STD_LIMIT = 1.96
+"""Half width of the interval that contains the fraction `TWO_STD_COVERAGE` of a Gaussian variable, in standard
+deviations."""
 
 
 def fit_presses(
@@ -85,8 +91,8 @@ def fit_presses(
 ) -> Fitted:
     """Train a network on measured presses of any sensor with three to eight channels.
 
-    The steps are those of the module: cross-validation, distillation of the mean of its networks into one network, and
-    training of the misfit. A warning is logged if presses are left out, and if all presses have the same force.
+    The steps are cross-validation, distillation of the mean of its networks into one network, and training of the
+    misfit. A warning is logged if presses are left out, and if all presses have the same force.
 
     Args:
         presses: At least 500 presses at 50 places. Presses with an unknown place, force or charge are left out.
@@ -164,9 +170,12 @@ def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, o
 
 
 def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
-    """Return the presses whose place, force and charges are all known.
+    """Return the presses whose place, force and charges are all known, after a check that they suffice for a training.
 
-    A warning is logged if presses are left out, and if all presses have the same force.
+    A warning is logged if presses are left out, and another one if all presses have nearly the same force.
+
+    Args:
+        presses: All presses of the file.
 
     Raises:
         PressError: If there are too few presses or places, fewer than three or more than eight channels, or if
@@ -181,7 +190,8 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
         )
 
     usable = presses[complete(presses)]
-    place_count = len(np.unique(np.round(usable.contact[:, :2], 3), axis=0))
+    rounded_places_mm = np.round(usable.contact[:, :2], 3)  # places within a micrometre count as the same place
+    place_count = len(np.unique(rounded_places_mm, axis=0))
     if len(usable) < FEWEST or place_count < FEWEST_POSITIONS:
         raise PressError(
             f"expected at least {FEWEST} presses at {FEWEST_POSITIONS} places with known place, force and charges, got "
@@ -223,8 +233,10 @@ def _std_factor(deviation: Array) -> float:
     Args:
         deviation: Absolute errors divided by their standard deviations, any shape.
     """
+    # The deviations that the stated fractions of the errors do not exceed. For a normal distribution with the reported
+    # standard deviations, they would be 1 and `TWO_STD_LIMIT`, so each gives a factor.
     one_std, two_std = np.quantile(deviation, [ONE_STD_COVERAGE, TWO_STD_COVERAGE])
-    return float(np.sqrt(one_std * two_std / 1.96))
+    return float(np.sqrt(one_std * two_std / TWO_STD_LIMIT))
 
 
 def _train_members(
@@ -252,37 +264,63 @@ def _train_members(
         Number of steps.
     """
 
-    def train(number: int, steps: int) -> Descent:
-        """Train the network of one fold with a number of steps, and return the finished training."""
-        is_validation = fold == number
+    def train(fold_index: int, steps: int) -> Descent:
+        """Train the network of one fold with a number of steps, and return the finished training.
+
+        The presses of the fold are used for validation, and those of the other folds for training.
+
+        Args:
+            fold_index: Index of the fold and of its network.
+            steps: Number of steps.
+        """
+        is_validation = fold == fold_index
         stage = contact_stage(
-            members[number],
+            members[fold_index],
             presses[~is_validation],
             presses[is_validation],
             noise.scaled(TRAINING_NOISE_FACTOR),
             structs.replace(config, steps=steps),
         )
-        stage = replace(stage, name=f"contact-{number + 1}-{steps}")
+        named_stage = replace(stage, name=f"contact-{fold_index + 1}-{steps}")
         patience = max(steps // 2, 1)
-        descent = Descent(stage, config.learning_rate, patience, config.seed + number)
+        descent = Descent(named_stage, config.learning_rate, patience, config.seed + fold_index)
         descent.run(run)
         return descent
 
-    largest_steps = config.contact_steps(members[0].n_electrode)
+    first_member = members[0]
+    largest_steps = config.contact_steps(first_member.n_electrode)
+    steps = _train_with_best_steps(first_member.contact, partial(train, 0), largest_steps)
+    for fold_index in range(1, len(members)):
+        train(fold_index, steps)
+    return steps
+
+
+def _train_with_best_steps(network: TrainablePerceptron, train: Callable[[int], Descent], largest_steps: int) -> int:
+    """Train a network with more and more steps, and keep the weights of the best training.
+
+    Each training begins at the same initial weights and has twice the steps of the training before. The trainings end
+    if the validation score is no better than before, or if twice the steps would exceed `largest_steps`.
+
+    Args:
+        network: The network, which is trained.
+        train: Function that trains the network with a number of steps, and returns the finished training.
+        largest_steps: Largest number of steps.
+
+    Returns:
+        Number of steps of the best training.
+    """
+    initial_weights = {name: weight.clone() for name, weight in network.state_dict().items()}
     steps = min(FIRST_STEPS, largest_steps)
-    first_network = members[0].contact
-    initial_weights = {name: weight.clone() for name, weight in first_network.state_dict().items()}
-    best_training = train(0, steps)
+    best_training = train(steps)
     while 2 * steps <= largest_steps:
-        first_network.load_state_dict(initial_weights)
-        longer_training = train(0, 2 * steps)
-        if longer_training.best >= best_training.best:
-            first_network.load_state_dict(best_training.best_weights)
+        network.load_state_dict(initial_weights)
+        longer_training = train(2 * steps)
+        is_better = longer_training.best < best_training.best
+        if not is_better:
+            network.load_state_dict(best_training.best_weights)
             break
         best_training = longer_training
         steps = 2 * steps
-    for number in range(1, len(members)):
-        train(number, steps)
     return steps
 
 
@@ -299,10 +337,11 @@ def _cross_validated_contact(members: list[InverseNetwork], charge: Array, fold:
     """
     contact = np.empty((len(charge), 3))
     std = np.empty((len(charge), 3))
-    for number, member in enumerate(members):
-        is_in_fold = fold == number
+    for fold_index, member in enumerate(members):
+        # The network estimates all presses, of which those of its own fold are kept.
         with torch.no_grad():
             member_contact, member_std, _ = member(as_tensor(charge))
+        is_in_fold = fold == fold_index
         contact[is_in_fold] = member_contact.double().numpy()[is_in_fold]
         std[is_in_fold] = member_std.double().numpy()[is_in_fold]
     return contact, std
@@ -325,14 +364,18 @@ def _distillation_stage(
         noise: Noise of the presses.
         config: Number of steps, batch size and seed.
     """
+    # Inputs: copies of the charges with noise, in random order
     rng = np.random.default_rng(config.seed)
     copies = [noise.scaled(factor).add(presses.charge, rng) for factor in DISTILLATION_NOISE_FACTORS]
     order = rng.permutation(len(copies) * len(presses))
     charge = as_tensor(np.concatenate(copies)[order])
+    n_validation = len(presses) // 2
+    n_train = len(charge) - n_validation
+
+    # Targets: mean and logarithm of the standard deviation, averaged over the networks
     with torch.no_grad():
         member_outputs = [torch.stack(member.posterior(charge)) for member in members]
     target_mean, target_log_std = torch.stack(member_outputs).mean(dim=0)
-    n_train = len(charge) - len(presses) // 2
     network.contact.fit_linear_part(network.inputs(charge[:n_train]), target_mean[:n_train])
 
     def divergence(rows: Tensor | slice) -> Tensor:
@@ -363,7 +406,9 @@ def _distillation_stage(
 def _misfit_examples(
     presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, config: TrainingConfig
 ) -> Array:
-    """Draw charges of many kinds and compute their distance from the charges of the nearest press.
+    """Draw charges of many kinds, and compute their residuals at the nearest press.
+
+    The charges near the measured presses are approximated by local planes.
 
     Args:
         presses: All presses.
@@ -376,9 +421,10 @@ def _misfit_examples(
     """
     rng = np.random.default_rng(config.seed)
     planes = LocalPlanes.through(domain.to_unit(presses.contact), noise.level(presses.charge))
-    chosen = presses.charge[rng.integers(len(presses), size=config.misfit_charges)]
-    _, charge = draw_charges(rng, chosen, presses.charge, noise)
-    return np.stack([charge, planes.residuals(noise.level(charge))])
+    chosen_rows = rng.integers(len(presses), size=config.misfit_charges)
+    _, charge = draw_charges(rng, presses.charge[chosen_rows], presses.charge, noise)
+    residual = planes.residuals(noise.level(charge))
+    return np.stack([charge, residual])
 
 
 def _cross_validated_misfit(
@@ -395,11 +441,12 @@ def _cross_validated_misfit(
     Returns:
         Misfits, shape (n, 1), in standard deviations of the noise.
     """
-    unit = domain.to_unit(presses.contact)
-    level = noise.level(presses.charge)
+    unit_contact = domain.to_unit(presses.contact)
+    level = noise.level(presses.charge)  # charges on a scale on which the noise has the standard deviation 1
     misfit = np.empty((len(presses), 1))
-    for number in range(N_FOLDS):
-        is_in_fold = fold == number
-        planes = LocalPlanes.through(unit[~is_in_fold], level[~is_in_fold])
-        misfit[is_in_fold] = np.linalg.norm(planes.residuals(level[is_in_fold]), axis=1, keepdims=True)
+    for fold_index in range(N_FOLDS):
+        is_in_fold = fold == fold_index
+        planes = LocalPlanes.through(unit_contact[~is_in_fold], level[~is_in_fold])
+        residual = planes.residuals(level[is_in_fold])
+        misfit[is_in_fold] = np.linalg.norm(residual, axis=1, keepdims=True)
     return misfit

@@ -56,7 +56,15 @@ class Optimiser(Protocol):
 
 
 def soap_optimiser(stage: "TrainingStage") -> list[Optimiser]:
-    """Return the optimiser SOAP for the parameters of a stage's network. Rounded weights are not trained."""
+    """Return the optimiser SOAP for the parameters of a stage's network.
+
+    The slow parameters of the stage have a smaller learning rate. Rounded weights, which need no gradient, are not
+    trained.
+
+    Args:
+        stage: The training of the network.
+    """
+    # Tensors are compared by identity, because == compares their elements.
     slow_ids = {id(parameter) for parameter in stage.slow_parameters}
     trained = [parameter for parameter in stage.network.parameters() if parameter.requires_grad]
     slow = [parameter for parameter in trained if id(parameter) in slow_ids]
@@ -65,7 +73,8 @@ def soap_optimiser(stage: "TrainingStage") -> list[Optimiser]:
         {"params": fast, "rate_factor": 1.0},
         {"params": slow, "rate_factor": SLOW_RATE_FACTOR},
     ]
-    return [Soap(group for group in groups if group["params"])]
+    groups_with_parameters = [group for group in groups if group["params"]]
+    return [Soap(groups_with_parameters)]
 
 
 @dataclass(frozen=True)
@@ -134,6 +143,8 @@ class Descent:
     def run(self, run: ResumableRun | None = None) -> None:
         """Train the network, and give it the weights with the best validation score.
 
+        The training ends after the steps of the stage, or earlier if the validation score no longer improves.
+
         Args:
             run: Saves the state every few seconds, so that an interrupted training can be continued and ends with the
                 same weights.
@@ -143,39 +154,56 @@ class Descent:
         """
         saved_at = time.monotonic()
         if run is not None:
-            state = run.load(self.stage.name, tensors)
+            state = run.load(self.stage.name, tensors)  # None if nothing was saved
             if state is not None:
                 self._restore(state)
+
         while self.step < self.stage.steps and not self._is_stalled():
             loss = self.take_step()
-            if self.step % REPORT_EVERY == 0 or self.step == self.stage.steps:
+            is_last_step = self.step == self.stage.steps
+            if is_last_step or self.step % REPORT_EVERY == 0:
                 self._evaluate(loss.item())
             if run is not None and time.monotonic() - saved_at >= SAVE_EVERY_S:
                 run.save(self.stage.name, tensor_bytes(self._state()))
                 saved_at = time.monotonic()
+
         if run is not None:
             run.save(self.stage.name, tensor_bytes(self._state()))
         self.stage.network.load_state_dict(self.best_weights)
 
     def take_step(self) -> Tensor:
-        """Change the weights by one step of the optimisers, and return the loss before the step."""
-        network = self.stage.network
-        rate = self.rate * self.stage.rate_factor * _relative_rate(self.step / self.stage.steps)
+        """Change the weights by one step of the optimisers, and return the loss before the step.
+
+        The gradient is limited to the largest gradient of the stage, except during the warm-up.
+        """
+        stage = self.stage
+        rate = self.rate * stage.rate_factor * _relative_rate(self.step / stage.steps)
         for optimiser in self.optimisers:
             for group in optimiser.param_groups:
                 group["lr"] = rate * group["rate_factor"]
-        loss = self.stage.loss(self.step, self.random)
-        network.zero_grad()
+
+        loss = stage.loss(self.step, self.random)
+        stage.network.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        if self.step >= self.stage.warm_up_steps and math.isfinite(self.stage.largest_gradient):
-            torch.nn.utils.clip_grad_norm_(network.parameters(), self.stage.largest_gradient)
+        is_warm_up = self.step < stage.warm_up_steps
+        if not is_warm_up and math.isfinite(stage.largest_gradient):
+            torch.nn.utils.clip_grad_norm_(stage.network.parameters(), stage.largest_gradient)
         for optimiser in self.optimisers:
             optimiser.step()
         self.step += 1
         return loss
 
     def _evaluate(self, loss: float) -> None:
-        """Compute the validation score, keep the weights if they are the best so far, and report the progress."""
+        """Compute the validation score, keep the weights if they are the best so far, and report the progress.
+
+        Weights of the warm-up are never kept, because the warm-up minimises another loss.
+
+        Args:
+            loss: Loss of the last batch.
+
+        Raises:
+            TrainingError: If the loss or the score is not finite.
+        """
         with torch.no_grad():
             score, text = self.stage.score()
         if not (math.isfinite(loss) and math.isfinite(score)):
@@ -183,7 +211,8 @@ class Descent:
                 f"the {self.stage.name} loss is {loss} at step {self.step} of {self.stage.steps}; lower "
                 "training.learning_rate"
             )
-        if self.step > self.stage.warm_up_steps and score < self.best:
+        is_after_warm_up = self.step > self.stage.warm_up_steps
+        if is_after_warm_up and score < self.best:
             self.best = score
             self.best_step = self.step
             self.best_weights = copy.deepcopy(self.stage.network.state_dict())
@@ -205,10 +234,14 @@ class Descent:
         }
 
     def _restore(self, state: dict[str, Any]) -> None:
-        """Continue from the state of a checkpoint."""
+        """Continue from the state of a checkpoint.
+
+        Args:
+            state: Result of `_state`.
+        """
         self.stage.network.load_state_dict(state["part"])
-        for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
-            optimiser.load_state_dict(saved)
+        for optimiser, optimiser_state in zip(self.optimisers, state["optimisers"], strict=True):
+            optimiser.load_state_dict(optimiser_state)
         self.random.set_state(state["random"])
         self.step = state["step"]
         self.best, self.best_step = state["best"]
@@ -223,7 +256,10 @@ def tensor_bytes(state: object) -> bytes:
 
 
 def tensors(data: bytes) -> Any:
-    """Return the tensors, numbers and texts in bytes of `tensor_bytes`. Code in the bytes is not executed."""
+    """Return the tensors, numbers and texts that `tensor_bytes` converted into bytes.
+
+    Code in the bytes is not executed.
+    """
     return torch.load(io.BytesIO(data), weights_only=True)
 
 

@@ -70,7 +70,9 @@ def logarithmic_features(mean_logarithm: Array) -> ChargeFeatures:
 
 
 def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
-    """Return features for charges of both signs.
+    """Return features for charges of both signs: inverse hyperbolic sines of the charges over typical charges.
+
+    Charges are limited to the range of the given charges, enlarged by a margin on both sides.
 
     Args:
         charge: Charges of presses, shape (n, n_electrode), pC.
@@ -99,8 +101,11 @@ def whitening(values: Array, min_relative_std: float = 0.0) -> tuple[Array, Arra
     Returns:
         Mean, shape (k,), and matrix M, shape (k, k): (values - mean) @ M has unit covariance.
     """
+    # The principal axes are the rows of `axes`, and the singular values are the standard deviations along them times
+    # the root of the number of values.
     mean = values.mean(axis=0)
     _, singular_values, axes = np.linalg.svd(values - mean, full_matrices=False)
-    smallest = max(MIN_SINGULAR_VALUE, min_relative_std * singular_values[0])
-    scale = np.sqrt(len(values)) / np.maximum(singular_values, smallest)
-    return mean, axes.T * scale
+    largest_singular_value = singular_values[0]
+    smallest_used = max(MIN_SINGULAR_VALUE, min_relative_std * largest_singular_value)
+    inverse_std = np.sqrt(len(values)) / np.maximum(singular_values, smallest_used)
+    return mean, axes.T * inverse_std

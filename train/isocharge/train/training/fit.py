@@ -1,9 +1,9 @@
 """Training of a network on presses.
 
 The contact perceptron learns the mean and the standard deviation of the contact by maximum likelihood, with fresh noise
-on the charges in every step. In the first steps it learns the mean by least squares. If a teacher is given, it learns
-the teacher's answers to these charges instead. The misfit perceptron learns from charges of many kinds, whose distance
-from the nearest contact of the domain is computed beforehand.
+on the charges in every step. In the first steps, it learns only the mean, by least squares. If a teacher is given, the
+contact perceptron learns the teacher's answers to these charges instead. The misfit perceptron learns from charges of
+many kinds, whose distance from the nearest contact of the domain is computed beforehand.
 """
 
 import logging
@@ -63,7 +63,7 @@ N_STD_PRESSES = 60_000
 
 
 def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run: ResumableRun | None = None) -> Fitted:
-    """Train a network on presses.
+    """Train a network on presses, fold it into the form of a release, and calibrate its standard deviations.
 
     A warning is logged if two contacts of the requested domain have the same charges.
 
@@ -81,8 +81,12 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
         TrainingError: If the loss is not finite.
     """
     data = source if isinstance(source, TrainingData) else TrainingData.of(source)
-    settings = (config or FitConfig()).checked().for_electrodes(len(data.sensor.electrode_names))
+    n_electrode = len(data.sensor.electrode_names)
+    checked_config = (config or FitConfig()).checked()
+    settings = checked_config.for_electrodes(n_electrode)
     trained = train_network(data, settings, run=run)
+
+    # The threshold of the alarm needs many good presses, so all measured presses are used, not only those for the test.
     split = trained.split
     good_presses = data.presses.within(split.domain.radius) if data.presses.measured else split.test
     return Fitted(
@@ -123,7 +127,12 @@ def _fold_and_calibrate(trained: "TrainedNetwork", config: TrainingConfig) -> Fo
 def _provenance(data: TrainingData, split: Split, config: FitConfig) -> Provenance:
     """Return the provenance of the training data with the settings of the training.
 
-    If the map folds, the charges of all presses are added as a file.
+    If two contacts of the requested domain have the same charges, the charges of all presses are added as a file.
+
+    Args:
+        data: Training data.
+        split: The split of the presses, with its cautions.
+        config: Settings of the training.
     """
     made_with: dict[str, object] = {"config": config.to_dict(), "torch": torch.__version__}
     if split.cautions:
@@ -163,8 +172,8 @@ class TrainedNetwork:
 def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | None = None) -> TrainedNetwork:
     """Train the contact perceptron and, at the same time in a second thread, the misfit perceptron.
 
-    The second thread first simulates the whole film, while this thread splits the presses. It then trains the misfit
-    perceptron on examples from the working area and from the rest of the film.
+    The second thread first simulates the whole film, while this thread splits the presses. The second thread then
+    trains the misfit perceptron on examples from the working area and from the rest of the film.
 
     Args:
         data: Presses, and possibly a teacher.
@@ -179,9 +188,12 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
     _check_electrodes(config.network, data.sensor)
     training = config.training
     with threads_and_seed(training.threads, training.seed), second_thread() as executor:
+        # Second thread: simulate the whole film
         whole_film = None
         if not data.presses.measured:
             whole_film = executor.submit(OutsidePresses.of, data.sensor, data.probes, data.domain.force_range)
+
+        # This thread: split the presses, and draw the examples from the working area
         split = Split.of(data, training)
         for caution in split.cautions:
             _log.warning("%s", caution)
@@ -192,15 +204,16 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
 
         def train_misfit() -> OutsidePresses | None:
             """Train the misfit perceptron, and return the film outside the working area if it is simulated."""
-            simulated = whole_film.result() if whole_film is not None else None
-            outside = simulated.beyond(split.domain.radius) if simulated is not None else None
+            film_presses = whole_film.result() if whole_film is not None else None
+            outside = film_presses.beyond(split.domain.radius) if film_presses is not None else None
             all_examples = examples.with_outside(inner_examples, outside)
             train_perceptron(misfit_stage(network, all_examples, training), network.misfit_vector, config, run)
             return outside
 
+        # Second thread: train the misfit perceptron. This thread: train the contact perceptron
         misfit_training = executor.submit(train_misfit)
-        contact = contact_stage(network, split.train, split.validation, training.noise_model, training, data.teacher)
-        train_perceptron(contact, network.contact, config, run)
+        stage = contact_stage(network, split.train, split.validation, training.noise_model, training, data.teacher)
+        train_perceptron(stage, network.contact, config, run)
         outside = misfit_training.result()
     return TrainedNetwork(network.eval(), split, outside)
 
@@ -219,8 +232,8 @@ def _check_electrodes(config: NetworkConfig, sensor: Sensor) -> None:
 def threads_and_seed(count: int, seed: int) -> Iterator[None]:
     """Set the seed and the number of threads of PyTorch in a block, and restore the caller's values after it.
 
-    BLAS and OpenMP get the same number of threads. Their threads wait actively at barriers, so a busy second core would
-    make them many times slower.
+    BLAS and OpenMP get the same number of threads. The threads of these libraries wait actively at barriers, so a busy
+    second core would make them many times slower.
 
     Args:
         count: Number of threads.
@@ -241,6 +254,8 @@ def train_perceptron(
 ) -> None:
     """Train a perceptron; with 8-bit weights, round its hidden weights and then train the other weights further.
 
+    The further training continues to count the steps of the first training, so that its loss has no warm-up.
+
     Args:
         stage: Loss, validation score and number of steps.
         perceptron: The perceptron of the stage.
@@ -251,6 +266,7 @@ def train_perceptron(
     Descent(stage, settings.learning_rate, settings.patience, settings.seed).run(run)
     if config.network.weights != "int8":
         return
+
     perceptron.round_hidden_matrices()
     rounded_stage = replace(
         stage,
@@ -297,7 +313,7 @@ def contact_stage(
         """Return the loss of a random batch with new noise.
 
         The first steps use the warm-up loss. The later steps use the loss of mean and standard deviations plus the loss
-        of the correlations.
+        of the correlations. With a teacher, the targets are its outputs for the same charges.
         """
         rows = torch.randint(len(charge), (batch,), generator=random)
         noisy = with_fresh_noise(charge[rows], noise, random)
@@ -313,6 +329,8 @@ def contact_stage(
             if is_warm_up:
                 return warm_up_loss(mean, log_std, teacher_mean)
             posterior_loss = distillation_loss(mean, log_std, teacher_mean, teacher_log_std)
+
+        # Errors in units of their standard deviations, from which the correlations are learned
         deviation = (contact - mean) * torch.exp(-log_std)
         return posterior_loss + CORRELATION_WEIGHT * robust_correlation_loss(angles, deviation)
 

@@ -113,7 +113,8 @@ class FoldedNetwork:
                 deviations, the angles of the correlations if there are any, and the misfit vector.
 
         Returns:
-            Contact, standard deviations, correlations if there are any, and misfit.
+            Contact, standard deviations, correlations if there are any, and misfit. Each of them has one row for each
+            press.
         """
         force = np.exp(answers[:, LOG_FORCE])
         outputs = [
@@ -121,10 +122,12 @@ class FoldedNetwork:
             np.exp(answers[:, LOG_STD]),
         ]
         if self.n_angle:
+            # Each correlation is a weighted sum of the cosines of the eight angles.
             outputs.append(np.cos(answers[:, self.angle_columns]) @ COSINES_TO_CORRELATIONS)
+        # The misfit vector follows the angles. Its length is the inverse hyperbolic sine of the misfit over its unit.
         misfit_vector = answers[:, self.angle_columns.stop :]
-        length = np.linalg.norm(misfit_vector, axis=1, keepdims=True)
-        outputs.append(MISFIT_UNIT * np.sinh(length))
+        compressed_misfit = np.linalg.norm(misfit_vector, axis=1, keepdims=True)
+        outputs.append(MISFIT_UNIT * np.sinh(compressed_misfit))
         return tuple(outputs)
 
     def with_scaled_std(self, position_factor: float, force_factor: float) -> "FoldedNetwork":
@@ -144,8 +147,8 @@ class FoldedNetwork:
 
         def with_columns(values: Array, angle_values: Array) -> Array:
             """Insert the columns of the angles between those of the contact and those of the misfit vector."""
-            contact, misfit_vector = np.split(values, [N_CONTACT_ANSWERS], axis=-1)
-            return np.concatenate([contact, angle_values, misfit_vector], axis=-1)
+            contact_values, misfit_values = np.split(values, [N_CONTACT_ANSWERS], axis=-1)
+            return np.concatenate([contact_values, angle_values, misfit_values], axis=-1)
 
         output_layer = self.layers.last
         new_output_layer = Layer(

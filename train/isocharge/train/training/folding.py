@@ -25,6 +25,9 @@ def fold(
 ) -> Perceptron[Array]:
     """Fold perceptrons with the same inputs, number of layers and activation into one perceptron.
 
+    The whitening of the features becomes part of the first layer and of the skip layer. The linear map to the answers
+    becomes part of the last layer and of the skip layer.
+
     Args:
         perceptrons: Perceptrons whose inputs are (features - mean) @ matrix.
         mean: Mean of the features, shape (n_electrode,).
@@ -36,20 +39,23 @@ def fold(
         Perceptron from the features to the answers.
     """
     joined = _join(perceptrons)
-    first, *others = joined.hidden
+    first, *other_hidden = joined.hidden
+    # ((features - mean) @ matrix) @ W + b  =  features @ (matrix W) + (b - mean @ (matrix W))
     first_weight = matrix @ first.weight
+    first_bias = first.bias - mean @ first_weight
     skip = matrix @ joined.skip @ units.weight
+    last_weight = joined.last.weight @ units.weight
     last_bias = joined.last.bias @ units.weight + units.bias - mean @ skip
     return replace(
         joined,
-        hidden=(Layer(first_weight, first.bias - mean @ first_weight), *others),
-        last=Layer(joined.last.weight @ units.weight, last_bias),
+        hidden=(Layer(first_weight, first_bias), *other_hidden),
+        last=Layer(last_weight, last_bias),
         skip=skip,
     )
 
 
 def transform_inputs(perceptron: Perceptron[Array], transform: Layer[Array]) -> Perceptron[Array]:
-    """Return the perceptron whose answer to x is the answer of the given one to x @ weight + bias.
+    """Return the perceptron whose output for x is the output of the given perceptron for x @ weight + bias.
 
     Args:
         perceptron: The given perceptron.
@@ -77,13 +83,18 @@ def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: in
         offset: Vector o, shape (3,).
         n_electrode: Width of the misfit vector.
     """
+    # The identity matrix leaves the logarithms of the standard deviations and the misfit vector as they are.
     n_answer = N_CONTACT_ANSWERS + n_electrode
     weight = np.eye(n_answer)
-    weight[MEAN, MEAN] = rotation.T * domain.scale
-    weight[MEAN, LOG_FORCE_STD] = weight[MEAN, LOG_FORCE]
     bias = np.zeros(n_answer)
+
+    # Mean: (T u + o) * scale + centre. Layers multiply row vectors from the right, so the matrix is transposed.
+    weight[MEAN, MEAN] = rotation.T * domain.scale
     bias[MEAN] = offset * domain.scale + domain.centre
+
+    # Logarithms of the standard deviations: add ln(scale), and for the force also ln F.
     bias[LOG_STD] = np.log(domain.scale)
+    weight[MEAN, LOG_FORCE_STD] = weight[MEAN, LOG_FORCE]
     bias[LOG_FORCE_STD] += bias[LOG_FORCE]
     return Layer(weight, bias)
 

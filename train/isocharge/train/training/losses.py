@@ -82,22 +82,24 @@ def weighted_likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> T
     """Compute a loss with the same minimum as `likelihood_loss`, in which uncertain presses count more.
 
     The gradient of a Gaussian likelihood with respect to the mean is divided by the variance. Where a network
-    overestimates the standard deviation, it therefore learns the mean slowly (Seitzer et al. 2022, arXiv 2203.09168).
-    Here the squared errors of the mean in the likelihood are multiplied by the estimated standard deviation to the
-    power of `2 * STD_EXPONENT`. The mean of these weights over the presses is 1. The standard deviations have the
-    gradient of the likelihood.
+    overestimates the standard deviation, it therefore learns the mean slowly (Seitzer et al., 2022, arXiv 2203.09168).
+    In this loss, the squared errors of the mean are multiplied by the estimated standard deviation to the power of `2 *
+    STD_EXPONENT`. The mean of these weights over the presses is 1. The standard deviations have the gradient of the
+    likelihood.
 
     Args:
         mean: Estimated unit coordinates, shape (n, 3).
         log_std: Logarithms of their standard deviations, shape (n, 3).
         target: True unit coordinates, shape (n, 3).
     """
-    squares = (mean - target) ** 2
+    squared_error = (mean - target) ** 2
+    # Loss of the mean, in which the standard deviations are constants: the weight is std^(2 STD_EXPONENT).
     fixed_log_std = log_std.detach()
     mean_of_weights = torch.exp(2.0 * STD_EXPONENT * fixed_log_std).mean(dim=0)
     weight_over_variance = torch.exp((2.0 * STD_EXPONENT - 2.0) * fixed_log_std) / mean_of_weights
-    mean_loss = 0.5 * weight_over_variance * squares
-    std_loss = log_std + 0.5 * squares.detach() * torch.exp(-2.0 * log_std)
+    mean_loss = 0.5 * weight_over_variance * squared_error
+    # Loss of the standard deviations, in which the errors are constants
+    std_loss = log_std + 0.5 * squared_error.detach() * torch.exp(-2.0 * log_std)
     return (std_loss + mean_loss).sum(dim=1).mean()
 
 
@@ -119,11 +121,13 @@ def robust_correlation_loss(angles: Tensor, deviation: Tensor) -> Tensor:
     cos_a, cos_b, cos_c = torch.sin(-angles).unbind(dim=1)
     first, second, third = deviation.detach().clamp(-MAX_DEVIATION, MAX_DEVIATION).unbind(dim=1)
 
-    # The Cholesky factor is inverted row by row: `first` and the two whitened errors have unit covariance.
+    # The Cholesky factor of the correlations has the rows (1, 0, 0), (cos a, sin a, 0) and (cos b, sin b cos c,
+    # sin b sin c). It is inverted row by row: `first` and the two whitened errors have unit covariance.
     white_second = (second - cos_a * first) / sin_a
     white_third = (third - cos_b * first - sin_b * cos_c * white_second) / (sin_b * sin_c)
     squares = _long_tailed_square(white_second) + _long_tailed_square(white_third)
-    return (torch.log(sin_a * sin_b * sin_c) + 0.5 * squares).mean()
+    log_determinant = torch.log(sin_a * sin_b * sin_c)
+    return (log_determinant + 0.5 * squares).mean()
 
 
 def _long_tailed_square(values: Tensor) -> Tensor:
@@ -138,7 +142,7 @@ def _long_tailed_square(values: Tensor) -> Tensor:
 
 
 def distillation_loss(mean: Tensor, log_std: Tensor, teacher_mean: Tensor, teacher_log_std: Tensor) -> Tensor:
-    """Compute the Kullback-Leibler divergence of the network's Gaussians from those of the teacher.
+    """Compute the Kullback-Leibler divergence of the network's normal distributions from those of the teacher.
 
     Args:
         mean: Unit coordinates that the network estimates, shape (n, 3).
@@ -186,7 +190,8 @@ def validation_score(mean: Tensor, log_std: Tensor, target: Tensor, domain: Doma
         samples: Noun for the validation data in the text, for example "presses".
     """
     loss = likelihood_loss(mean, log_std, target).item()
-    x_mm, y_mm, log_force = ((mean - target).double().numpy() * domain.scale).T
-    position_mm = rms(np.hypot(x_mm, y_mm))
-    force_percent = 100.0 * rms(log_force)
+    error = (mean - target).double().numpy() * domain.scale
+    x_error_mm, y_error_mm, log_force_error = error.T
+    position_mm = rms(np.hypot(x_error_mm, y_error_mm))
+    force_percent = 100.0 * rms(log_force_error)
     return loss, f"{loss:.3f} on watched {samples}: {position_mm:.4f} mm and {force_percent:.3f} % of force rms"

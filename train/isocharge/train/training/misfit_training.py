@@ -1,6 +1,7 @@
 """Training of the misfit perceptron: the examples from which it learns, and its loss.
 
-An example is a set of charges with the residuals of these charges at the nearest contact, which a search finds.
+An example consists of the charges of one press and the residuals of these charges at the nearest contact. A search
+finds the nearest contact.
 """
 
 from collections.abc import Callable
@@ -12,11 +13,17 @@ import torch
 from torch import Tensor
 
 from isocharge.common.arrays import Array
+from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.train.data.channel_noise import ChannelNoise, Noise
-from isocharge.train.data.misfit_charges import draw_misfit_examples, draw_outside_examples, misfit_noise
+from isocharge.train.data.misfit_charges import (
+    ExampleOptions,
+    draw_misfit_examples,
+    draw_outside_examples,
+    misfit_noise,
+)
 from isocharge.train.data.outside_presses import OutsidePresses
-from isocharge.train.training.config import FEW_ELECTRODES, TrainingConfig
+from isocharge.train.training.config import TrainingConfig
 from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.folded_network import MISFIT_UNIT
@@ -81,12 +88,12 @@ class MisfitExamples:
             self._noise(),
             self.config.misfit_charges,
             self.config.seed,
-            starts=self._search_starts,
+            options=self._options,
         )
         return self._saved_or_drawn("misfit-charges", draw)
 
     def with_outside(self, inner_examples: Array, outside: OutsidePresses | None) -> Array:
-        """Replace a share of the examples by presses outside the working area.
+        """Replace a share of the examples by presses outside the working area, if the film is simulated there.
 
         Args:
             inner_examples: Result of `inner`.
@@ -107,9 +114,11 @@ class MisfitExamples:
             self._noise(),
             n_outside,
             seed,
-            starts=self._search_starts,
+            options=self._options,
         )
         outside_examples = self._saved_or_drawn("misfit-outside", draw)
+
+        # Arrays of examples have the shape (2, n, n_electrode). The second axis is shuffled for the validation.
         examples = np.concatenate([inner_examples[:, n_outside:], outside_examples], axis=1)
         return np.random.default_rng(seed).permutation(examples, axis=1)
 
@@ -119,15 +128,21 @@ class MisfitExamples:
         return self.features.charge_features.n_electrode > FEW_ELECTRODES
 
     @property
-    def _search_starts(self) -> int:
-        """Number of starts of a search for the nearest contact."""
-        return MANY_SEARCH_STARTS if self._has_many_electrodes else SEARCH_STARTS
+    def _options(self) -> ExampleOptions:
+        """Options of the examples. For charges of both signs, the limits are those of the input features."""
+        starts = MANY_SEARCH_STARTS if self._has_many_electrodes else SEARCH_STARTS
+        charge_features = self.features.charge_features
+        is_positive = charge_features.mean is None  # only features of charges of both signs have a mean
+        if is_positive:
+            return ExampleOptions(starts=starts)
+        return ExampleOptions(starts=starts, limits=(charge_features.low_pC, charge_features.high_pC))
 
     def _noise(self) -> Noise:
-        """Return the noise of good presses. For charges of both signs, return it as the noise of each channel."""
+        """Return the noise of good presses. For charges of both signs, return the noise of each channel."""
         noise = misfit_noise(self.config.noise_model)
         charge_features = self.features.charge_features
-        if charge_features.mean is None:
+        is_positive = charge_features.mean is None  # only features of charges of both signs have a mean
+        if is_positive:
             return noise
         return ChannelNoise.alike(noise, charge_features.n_electrode)
 
@@ -136,21 +151,19 @@ class MisfitExamples:
 
         Args:
             name: Name of the examples in the run.
-            draw: Function that draws the examples. Its keyword argument `limits` sets the limits of the charges. For
-                charges of both signs, these are the limits of the input features.
+            draw: Function that draws the examples.
         """
-        charge_features = self.features.charge_features
-        limited_draw = draw
-        if charge_features.mean is not None:
-            limited_draw = partial(draw, limits=(charge_features.low_pC, charge_features.high_pC))
         if self.run is None:
-            return limited_draw()
-        examples: Array = self.run.storing_executor(name).submit(limited_draw).result()
+            return draw()
+        examples: Array = self.run.storing_executor(name).submit(draw).result()
         return examples
 
 
 def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfig) -> TrainingStage:
     """Return the training of the misfit perceptron.
+
+    The perceptron learns the residuals, whose lengths are compressed. Examples with misfits far above `FOCUS_MISFIT`
+    count less than others.
 
     Args:
         network: The network, whose misfit perceptron is trained.
@@ -163,7 +176,7 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     targets = compress_length(torch.tensor(residuals)).float()
     n_validation = max(1, round(VALIDATION_FRACTION * config.hold_out * len(inputs)))
     n_train = len(inputs) - n_validation
-    focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_UNIT))
+    focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_UNIT))  # the compressed length of a residual of `FOCUS_MISFIT`
 
     def distance(rows: Tensor | slice) -> Tensor:
         """Return the weighted mean squared distance between outputs and targets, for some rows of the examples."""

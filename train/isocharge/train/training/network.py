@@ -1,13 +1,11 @@
 """The network during training, in PyTorch: from charges to contact, standard deviations and misfit.
 
 The inputs are whitened logarithms of the charges (`isocharge.train.training.features`). The force scales all charges by
-nearly the same factor, so the common factor carries the force and the ratios carry the position. One perceptron gives
-the mean and the logarithm of the standard deviation of (x, y, ln F). A second perceptron gives the misfit
-
-    min over the contacts c of the domain of |(Q - Q(c)) / sigma|
-
-as the length of a vector, (Q - Q(c)) / sigma at the nearest contact. Unlike its length, this vector is smooth where the
-charges Q are those of a contact. Its length, which ranges from a tenth to thousands, is compressed by asinh.
+nearly the same factor. The common factor therefore depends mostly on the force, and the ratios depend mostly on the
+position. One perceptron gives the mean and the logarithm of the standard deviation of (x, y, ln F). A second perceptron
+gives the vector (Q - Q(c)) / sigma at the contact c of the domain where this vector is shortest. The length of the
+vector is the misfit. Unlike its length, the vector is smooth where the charges Q are exactly those of a contact. The
+length of the vector ranges from a tenth to thousands, and is compressed by asinh.
 """
 
 from collections.abc import Sequence
@@ -72,7 +70,8 @@ class TrainablePerceptron(nn.Module):
         """
         super().__init__()
         self.activation = activation
-        self.layers = nn.ModuleList([nn.Linear(*sizes) for sizes in pairwise((n_input, *hidden, n_output))])
+        widths = (n_input, *hidden, n_output)
+        self.layers = nn.ModuleList([nn.Linear(n_in, n_out) for n_in, n_out in pairwise(widths)])
         self.skip = nn.Linear(n_input, n_output, bias=False)
         nn.init.zeros_(self.skip.weight)
 
@@ -80,7 +79,8 @@ class TrainablePerceptron(nn.Module):
         """Draw the first layer again with larger weights, so that the units bend at random places among the inputs.
 
         The posterior mean of contacts at the rim of the working area bends within a small distance. Units that are
-        nearly linear over all inputs learn this slowly.
+        nearly linear over all inputs learn this slowly. Each unit gets a random direction in the space of the inputs, a
+        random slope along this direction, and a random centre at which its output is zero.
         """
         first, *_ = self.linear_layers()
         n_unit = first.out_features
@@ -90,7 +90,7 @@ class TrainablePerceptron(nn.Module):
         centre = torch.randn(n_unit, first.in_features)
         with torch.no_grad():
             first.weight.copy_(slope * direction)
-            first.bias.copy_(-(first.weight * centre).sum(dim=1))  # the output of each unit is zero at its centre
+            first.bias.copy_(-(first.weight * centre).sum(dim=1))  # weight @ centre + bias = 0
 
     def fit_linear_part(self, inputs: Tensor, targets: Tensor) -> None:
         """Set the skip layer to the linear least-squares fit of the first outputs.
@@ -104,7 +104,7 @@ class TrainablePerceptron(nn.Module):
         n_input = inputs.shape[1]
         n_target = targets.shape[1]
         *_, last = self.linear_layers()
-        design = torch.cat([inputs, torch.ones(len(inputs), 1)], dim=1)
+        design = torch.cat([inputs, torch.ones(len(inputs), 1)], dim=1)  # the column of ones is for the offset
         coefficients = torch.linalg.lstsq(design.double(), targets.double()).solution.float()
         slopes, offset = torch.split(coefficients, [n_input, 1])
         with torch.no_grad():
@@ -135,11 +135,15 @@ class TrainablePerceptron(nn.Module):
         return [layer.weight for layer in between]
 
     def round_hidden_matrices(self) -> None:
-        """Round the weights between hidden layers to 8 bits, one scale for each output, and stop their training."""
+        """Round the weights between hidden layers to 8 bits, one scale for each output, and stop their training.
+
+        A rounded weight is an integer from -127 to 127 times the scale of its output.
+        """
         for matrix in self.hidden_matrices():
-            weights = matrix.detach()
+            weights = matrix.detach()  # shares its memory with the matrix
             scale = weights.abs().amax(dim=1, keepdim=True) / LARGEST_INT8
-            weights.copy_(torch.round(weights / scale.clamp(min=1e-30)) * scale)
+            integers = torch.round(weights / scale.clamp(min=1e-30))  # the limit avoids a division by zero
+            weights.copy_(integers * scale)
             matrix.requires_grad_(False)
 
 
@@ -154,6 +158,8 @@ class InverseNetwork(nn.Module):
 
     def __init__(self, domain: Domain, features: WhitenedFeatures, config: NetworkConfig) -> None:
         """Create the perceptrons with random weights.
+
+        The scales of the contacts and the whitening of the features are buffers, which are not trained.
 
         Args:
             domain: Contacts that the network estimates.
@@ -224,14 +230,18 @@ class InverseNetwork(nn.Module):
         Returns:
             Contact (x, y, F), shape (n, 3), mm and N; its standard deviations, shape (n, 3); misfit, shape (n, 1).
         """
-        mean, log_std = self.posterior(charge)
-        value = mean * self.scale + self.centre
-        std = torch.exp(log_std) * self.scale
-        force = torch.exp(value[:, 2:])
-        contact = torch.cat([value[:, :2], force], dim=1)
-        contact_std = torch.cat([std[:, :2], std[:, 2:] * force], dim=1)
-        length = torch.linalg.vector_norm(self.misfit_vector(self.inputs(charge)), dim=1, keepdim=True)
-        return contact, contact_std, MISFIT_UNIT * torch.sinh(length)
+        # (x, y, ln F) and the standard deviations of these values
+        unit_mean, unit_log_std = self.posterior(charge)
+        log_contact = unit_mean * self.scale + self.centre
+        log_contact_std = torch.exp(unit_log_std) * self.scale
+
+        force = torch.exp(log_contact[:, 2:])  # shape (n, 1)
+        contact = torch.cat([log_contact[:, :2], force], dim=1)
+        contact_std = torch.cat([log_contact_std[:, :2], log_contact_std[:, 2:] * force], dim=1)
+
+        misfit_vector = self.misfit_vector(self.inputs(charge))
+        compressed_misfit = torch.linalg.vector_norm(misfit_vector, dim=1, keepdim=True)
+        return contact, contact_std, MISFIT_UNIT * torch.sinh(compressed_misfit)
 
 
 def compress_length(residual: Tensor) -> Tensor:

@@ -53,9 +53,9 @@ def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent: Array, c
 
     The new network estimates from `charge` the contacts that the given network estimates from `equivalent`. A linear
     map from the features of `charge` to those of `equivalent` is included in the first layer, and the last layer is
-    fitted to the remaining differences. The standard deviations are then fitted to the errors of the new network by
-    maximising the Gaussian likelihood with Fisher's scoring (McCullagh and Nelder 1989, 2.5), which is a regression on
-    the squares of error / standard deviation.
+    fitted to the remaining differences. The standard deviations are then fitted to the errors of the new network, so
+    that the Gaussian likelihood is largest. The method is Fisher's scoring (McCullagh and Nelder 1989, 2.5), a
+    regression on the squares of error / standard deviation.
 
     Args:
         network: The given network.
@@ -70,13 +70,10 @@ def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent: Array, c
     features = network.features.evaluate(charge)
     equivalent_features = network.features.evaluate(equivalent)
     equivalent_outputs = evaluate(network.layers, equivalent_features)
-    log_contact = np.column_stack([contact[:, :2], np.log(contact[:, 2])])
+    log_contact = np.column_stack([contact[:, :2], np.log(contact[:, 2])])  # (x, y, ln F)
 
-    # Linear map from the features of `charge` to those of `equivalent`, by least squares
-    design = np.column_stack([features, np.ones(len(features))])
-    coefficients, *_ = np.linalg.lstsq(design, equivalent_features)
-    matrix, shift = np.split(coefficients, [features.shape[1]])
-    transformed = transform_inputs(network.layers, Layer(matrix, shift[0]))
+    # The first layer includes the linear map between the features.
+    transformed = transform_inputs(network.layers, _linear_fit(features, equivalent_features))
 
     def contact_targets(outputs: Array) -> Array:
         """Return the outputs for the equivalent charges, with the standard deviations of the present outputs."""
@@ -85,24 +82,44 @@ def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent: Array, c
         return targets
 
     def std_targets(outputs: Array) -> Array:
-        """Return outputs whose standard deviations are changed by one scoring step, from the present outputs."""
+        """Return the present outputs with standard deviations that are changed by one scoring step.
+
+        The step changes the logarithm of a standard deviation by half of (error / standard deviation)^2 - 1.
+        """
         relative_error = np.abs(outputs[:, MEAN] - log_contact) * np.exp(-relative_log_std(outputs))
+        limited_error = np.minimum(relative_error, MAX_ERROR)
         targets = outputs.copy()
-        targets[:, LOG_STD] += 0.5 * (np.minimum(relative_error, MAX_ERROR) ** 2 - 1.0)
+        targets[:, LOG_STD] += 0.5 * (limited_error**2 - 1.0)
         return targets
 
+    # The last layer is fitted first to the contacts, and then in several scoring steps to the standard deviations.
     contact_regression = Regression(contact_targets, EXACT_RIDGE)
     std_regressions = [Regression(std_targets, NOISY_RIDGE) for _ in range(N_SCORING_STEPS)]
-    return replace(network, layers=refit_last_layer(transformed, features, [contact_regression, *std_regressions]))
+    layers = refit_last_layer(transformed, features, [contact_regression, *std_regressions])
+    return replace(network, layers=layers)
+
+
+def _linear_fit(inputs: Array, outputs: Array) -> Layer[Array]:
+    """Return the linear layer that computes outputs from inputs with the smallest sum of squared errors.
+
+    Args:
+        inputs: Shape (n, n_input).
+        outputs: Shape (n, n_output).
+    """
+    design = np.column_stack([inputs, np.ones(len(inputs))])  # the column of ones is for the bias
+    coefficients, *_ = np.linalg.lstsq(design, outputs)
+    n_input = inputs.shape[1]
+    weight, bias_row = np.split(coefficients, [n_input])
+    return Layer(weight, bias_row[0])
 
 
 def fit_std(network: FoldedNetwork, charge: Array, contact: Array) -> FoldedNetwork:
     """Fit the standard deviations of a trained network to its errors, by a change of the last layer.
 
-    At places where the map from contacts to charges nearly folds, the errors have longer tails than a normal
-    distribution, and the intervals of a Gaussian likelihood contain more than the stated share of the contacts. Errors
-    are therefore limited to `CORE_ERROR` standard deviations, and their mean square is compared with that of a limited
-    normal variable (Huber 1964, proposal 2).
+    Where the map from contacts to charges nearly folds, the errors have longer tails than a normal distribution. The
+    intervals of a Gaussian likelihood then contain more than the stated share of the contacts. Errors are therefore
+    limited to `CORE_ERROR` standard deviations, and their mean square is compared with that of a limited normal
+    variable (Huber 1964, proposal 2).
 
     Args:
         network: The trained network.
@@ -113,24 +130,33 @@ def fit_std(network: FoldedNetwork, charge: Array, contact: Array) -> FoldedNetw
         The network with other standard deviations.
     """
     log_contact = np.column_stack([contact[:, :2], np.log(contact[:, 2])])
-    central_share = norm.cdf(CORE_ERROR) - norm.cdf(-CORE_ERROR)
-    central_square = central_share - 2.0 * CORE_ERROR * norm.pdf(CORE_ERROR)
-    limited_square = central_square + CORE_ERROR**2 * (1.0 - central_share)
+    # Mean square of a standard normal variable that is limited to plus or minus `CORE_ERROR`: the integral of the
+    # square within the limits, plus the squared limit times the probability beyond them.
+    probability_within = norm.cdf(CORE_ERROR) - norm.cdf(-CORE_ERROR)
+    square_within = probability_within - 2.0 * CORE_ERROR * norm.pdf(CORE_ERROR)
+    limited_mean_square = square_within + CORE_ERROR**2 * (1.0 - probability_within)
 
     def std_targets(outputs: Array) -> Array:
-        """Return outputs whose standard deviations are changed by one scoring step, from the present outputs."""
+        """Return the present outputs with standard deviations that are changed by one scoring step.
+
+        The step changes the logarithm of a standard deviation by half of q - 1. Here q is the squared limited error
+        over its mean for a normal distribution.
+        """
         relative_error = np.abs(outputs[:, MEAN] - log_contact) * np.exp(-relative_log_std(outputs))
+        limited_error = np.minimum(relative_error, CORE_ERROR)
         targets = outputs.copy()
-        targets[:, LOG_STD] += 0.5 * (np.minimum(relative_error, CORE_ERROR) ** 2 / limited_square - 1.0)
+        targets[:, LOG_STD] += 0.5 * (limited_error**2 / limited_mean_square - 1.0)
         return targets
 
-    regressions = [Regression(std_targets, CORE_RIDGE)] * N_CORE_STEPS
     features = network.features.evaluate(charge)
+    regressions = [Regression(std_targets, CORE_RIDGE) for _ in range(N_CORE_STEPS)]
     return replace(network, layers=refit_last_layer(network.layers, features, regressions))
 
 
 def add_variance(network: FoldedNetwork, charge: Array, variance: Array) -> FoldedNetwork:
-    """Return the network with larger standard deviations.
+    """Return the network with larger standard deviations, whose squares contain given additional variances.
+
+    The last layer is fitted to the larger standard deviations at the given charges.
 
     Args:
         network: The given network.
@@ -146,7 +172,8 @@ def add_variance(network: FoldedNetwork, charge: Array, variance: Array) -> Fold
         return targets
 
     features = network.features.evaluate(charge)
-    return replace(network, layers=refit_last_layer(network.layers, features, [Regression(larger_std, EXACT_RIDGE)]))
+    layers = refit_last_layer(network.layers, features, [Regression(larger_std, EXACT_RIDGE)])
+    return replace(network, layers=layers)
 
 
 def refit_last_layer(
@@ -154,7 +181,7 @@ def refit_last_layer(
 ) -> Perceptron[Array]:
     """Fit the last layer and the skip layer to new outputs, by ridge regression of the changes of the weights.
 
-    Weights that are zero remain zero, so that an output depends on the same hidden units as before.
+    Weights of the last layer that are zero remain zero, so that an output depends on the same hidden units as before.
 
     Args:
         perceptron: The perceptron.
@@ -164,21 +191,26 @@ def refit_last_layer(
     Returns:
         The perceptron with new weights.
     """
+    # The outputs are linear in the weights: outputs = design @ weights. The rows of the weights are those of the last
+    # layer, those of the skip layer, and the bias.
     hidden_output = evaluate_hidden_layers(perceptron.hidden, perceptron.activation, features)
     n_sample, n_hidden = hidden_output.shape
     n_input = features.shape[1]
     design = np.column_stack([hidden_output, features, np.ones(n_sample)])
     weights = np.vstack([perceptron.last.weight, perceptron.skip, perceptron.last.bias])
     is_skip_or_bias = np.ones((n_input + 1, weights.shape[1]), dtype=bool)
-    is_used = np.vstack([weights[:n_hidden] != 0.0, is_skip_or_bias])
+    is_fitted = np.vstack([weights[:n_hidden] != 0.0, is_skip_or_bias])
+
     normal_matrix = design.T @ design
     for regression in regressions:
         outputs = design @ weights
         change = regression.target(outputs) - outputs
         moment = design.T @ change
-        for column in np.flatnonzero(change.any(axis=0)):
-            used = np.flatnonzero(is_used[:, column])
-            damped_matrix = normal_matrix[np.ix_(used, used)] + regression.ridge * n_sample * np.eye(len(used))
-            weights[used, column] += np.linalg.solve(damped_matrix, moment[used, column])
+        changed_columns = np.flatnonzero(change.any(axis=0))
+        for column in changed_columns:
+            rows = np.flatnonzero(is_fitted[:, column])
+            damped_matrix = normal_matrix[np.ix_(rows, rows)] + regression.ridge * n_sample * np.eye(len(rows))
+            weights[rows, column] += np.linalg.solve(damped_matrix, moment[rows, column])
+
     last, skip, bias = np.split(weights, [n_hidden, n_hidden + n_input])
     return replace(perceptron, last=Layer(last, bias[0]), skip=skip)

@@ -1,9 +1,9 @@
 """SOAP: Adam in the eigenbasis of the second moments of the gradient.
 
-A weight matrix W has a gradient G. The optimiser averages G G^T and G^T G over the steps. Their eigenvectors are axes
-along which the entries of the gradient are nearly uncorrelated, so that Adam, which scales each entry separately, comes
-close to a second-order method (Vyas et al. 2024, arXiv 2409.11321, algorithm 3). The eigenvectors change slowly and are
-updated every few steps by one orthogonal iteration.
+A weight matrix W has a gradient G. The optimiser averages G G^T and G^T G over the steps. The entries of the gradient
+are nearly uncorrelated along the eigenvectors of these averages. Adam scales each entry separately, so in this basis it
+comes close to a second-order method (Vyas et al., 2024, arXiv 2409.11321, algorithm 3). The eigenvectors change slowly
+and are updated every few steps by one orthogonal iteration.
 """
 
 import copy
@@ -23,8 +23,8 @@ EPSILON = 1e-10
 class Soap:
     """The optimiser SOAP. Parameters with one dimension, such as biases, are trained by Adam.
 
-    The class has the methods of PyTorch's optimisers that a training needs. It is not derived from
-    `torch.optim.Optimizer`, because the first optimiser of that class imports PyTorch's compiler, which takes 2 s.
+    The class has the methods of PyTorch's optimisers that a training needs. The class is not derived from
+    `torch.optim.Optimizer`, because the first object of that class imports PyTorch's compiler, which takes 2 s.
 
     Args:
         params: Parameters, or groups of parameters as of all optimisers of PyTorch. A parameter with more than two
@@ -42,22 +42,25 @@ class Soap:
         lr: float = 1e-3,
         betas: tuple[float, float] = (0.95, 0.95),
     ) -> None:
-        """Prepare the optimiser. See the class for the arguments."""
+        """Prepare the optimiser. See the class for the arguments.
+
+        Parameters that are given without a group form one group with the default settings.
+        """
         defaults: dict[str, Any] = {"lr": lr, "betas": betas}
         self.param_groups: list[dict[str, Any]] = []
         single_parameters: list[Tensor] = []
-        for item in params:
-            if isinstance(item, Tensor):
-                single_parameters.append(item)
+        for parameter_or_group in params:
+            if isinstance(parameter_or_group, Tensor):
+                single_parameters.append(parameter_or_group)
             else:
-                self.param_groups.append(defaults | item)
+                self.param_groups.append(defaults | parameter_or_group)
         if single_parameters:
             self.param_groups.append(defaults | {"params": single_parameters})
         self._states: list[dict[str, Any]] = [{} for group in self.param_groups for _ in group["params"]]
 
     @torch.no_grad()
     def step(self) -> None:
-        """Change all parameters that have a gradient."""
+        """Update all parameters that have a gradient, each with its own state."""
         states = iter(self._states)
         for group in self.param_groups:
             for parameter in group["params"]:
@@ -77,10 +80,10 @@ class Soap:
 def _update(
     parameter: Tensor, gradient: Tensor, state: dict[str, Any], rate: float, betas: tuple[float, float]
 ) -> None:
-    """Change one parameter and its state by a step of algorithm 3 of Vyas et al. (2024).
+    """Change one parameter and its state by a step of SOAP (Vyas et al., 2024, algorithm 3).
 
-    The averaged gradient is rotated into the eigenbasis. Its entries are divided by their root mean squares, as in
-    Adam. The result is rotated back and gives the direction of the step.
+    The averaged gradient is rotated into the eigenbasis. The entries of the rotated gradient are divided by their root
+    mean squares, as in Adam. The result is rotated back and gives the direction of the step.
 
     Args:
         parameter: The parameter.
@@ -93,26 +96,35 @@ def _update(
         state.update(_initial_state(gradient))
     state["step"] += 1
     mean_decay, square_decay = betas
+
+    # Matrices have an eigenbasis, which follows the moving averages of G G' and G' G of the gradient G.
     if gradient.ndim > 1:
         state["row_moment"].lerp_(gradient @ gradient.mT, 1.0 - square_decay)
         state["column_moment"].lerp_(gradient.mT @ gradient, 1.0 - square_decay)
         if state["step"] % BASIS_PERIOD == 1:
             _update_basis(state)
 
+    # Moving averages of the gradient, and of its squared entries in the eigenbasis
     mean = state["mean"].lerp_(gradient, 1.0 - mean_decay)
     rotated_gradient = _rotate(gradient, state)
-    square = state["square"].mul_(square_decay)
-    square.addcmul_(rotated_gradient, rotated_gradient, value=1.0 - square_decay)
+    mean_square = state["square"].mul_(square_decay)
+    mean_square.addcmul_(rotated_gradient, rotated_gradient, value=1.0 - square_decay)
 
+    # The averages begin at zero, so they are divided by the total weight of the gradients so far.
     mean_weight = 1.0 - mean_decay ** state["step"]
     square_weight = 1.0 - square_decay ** state["step"]
-    size = (square / square_weight).sqrt_().add_(EPSILON)
-    step = _rotate_back(_rotate(mean, state) / size, state)
-    parameter.add_(step, alpha=-rate / mean_weight)
+    root_mean_square = (mean_square / square_weight).sqrt_().add_(EPSILON)
+    direction = _rotate_back(_rotate(mean, state) / root_mean_square, state)
+    parameter.add_(direction, alpha=-rate / mean_weight)
 
 
 def _initial_state(gradient: Tensor) -> dict[str, Any]:
-    """Return the state of a parameter before its first step."""
+    """Return the state of a parameter before its first step: averages of zero, and identity matrices as eigenbases.
+
+    Args:
+        gradient: Gradient of the parameter: matrices of shape (..., n_row, n_column), or a vector, which has no
+            eigenbases.
+    """
     state: dict[str, Any] = {
         "step": 0,
         "mean": torch.zeros_like(gradient),
@@ -121,8 +133,9 @@ def _initial_state(gradient: Tensor) -> dict[str, Any]:
     if gradient.ndim > 1:
         *batch, n_row, n_column = gradient.shape
         for name, size in (("row", n_row), ("column", n_column)):
+            identity = torch.eye(size, dtype=gradient.dtype)
             state[f"{name}_moment"] = gradient.new_zeros(*batch, size, size)
-            state[f"{name}_basis"] = torch.eye(size, dtype=gradient.dtype).expand(*batch, size, size).clone()
+            state[f"{name}_basis"] = identity.expand(*batch, size, size).clone()
     return state
 
 

@@ -48,8 +48,8 @@ class Split:
     def of(cls, data: TrainingData, training: TrainingConfig) -> "Split":
         """Split presses into presses for training, for validation and for the test, and fit a charge field to them.
 
-        A first charge field is fitted to all presses. It gives the largest disk in which the map certainly does not
-        fold. Only presses within this disk are used.
+        A first charge field is fitted to all presses. This field gives the largest disk in which the map certainly does
+        not fold. Only presses within this disk are used.
 
         Args:
             data: Presses of the sensor.
@@ -57,21 +57,18 @@ class Split:
         """
         presses = data.presses
         names = data.sensor.electrode_names
-        whole_field = ChargeField.fit(data.domain, names, *split_by_position(presses, training.hold_out, training.seed))
+        field_train, field_validation = split_by_position(presses, training.hold_out, training.seed)
+        whole_field = ChargeField.fit(data.domain, names, field_train, field_validation)
         domain, cautions = invertible_domain(whole_field, presses, misfit_noise(training.noise_model))
         is_folded = domain != data.domain
         inside = presses.within(domain.radius) if is_folded else presses
-        if presses.measured:
-            is_test = held_out(inside.contact)
-            remaining = inside[~is_test]
-            test = inside[is_test]
-        else:
-            remaining, test = split_by_position(inside, training.hold_out, training.seed)
-        validation_share = VALIDATION_FRACTION * training.hold_out
-        train, validation = split_by_position(remaining, validation_share, training.seed + 1)
 
+        train, validation, test = _split_presses(inside, training)
+
+        # The first field was fitted to presses beyond the fold, or to measured test presses. Then another field is
+        # fitted, unless the first one is more accurate within the fold.
         field: ChargeMap = whole_field
-        if is_folded or presses.measured:  # the first field was fitted to presses beyond the fold, or to test presses
+        if is_folded or presses.measured:
             field = ChargeField.fit(domain, names, train, validation)
             if is_folded and whole_field.error < field.error:
                 field = within(whole_field, domain.radius)
@@ -79,10 +76,37 @@ class Split:
         return cls(domain, train, validation, test, field, cautions, folded_charges)
 
     def features(self, noise: NoiseModel) -> WhitenedFeatures:
-        """Fit the input features: logarithms if all charges are positive, otherwise inverse hyperbolic sines."""
+        """Fit the input features: logarithms if all charges are positive, otherwise inverse hyperbolic sines.
+
+        Args:
+            noise: Noise of the charges, which gives the scale on which the inverse hyperbolic sines bend.
+        """
         charge = self.train.charge
-        if not (self.train.signed or self.validation.signed or self.test.signed):
+        has_both_signs = self.train.signed or self.validation.signed or self.test.signed
+        if not has_both_signs:
             return WhitenedFeatures.fit_logarithms(charge)
-        channels = ChannelNoise.alike(noise, charge.shape[1])
-        scaled = replace(channels, white=SIGNED_FEATURE_SCALE * channels.white)
-        return WhitenedFeatures.fit_signed(charge, scaled.bend(charge))
+        channel_noise = ChannelNoise.alike(noise, charge.shape[1])
+        larger_noise = replace(channel_noise, white=SIGNED_FEATURE_SCALE * channel_noise.white)
+        return WhitenedFeatures.fit_signed(charge, larger_noise.bend(charge))
+
+
+def _split_presses(
+    presses: LabelledPresses, training: TrainingConfig
+) -> tuple[LabelledPresses, LabelledPresses, LabelledPresses]:
+    """Split presses by position into presses for training, for validation and for the test.
+
+    The test presses of measured presses are always the same ones. Simulated presses are split at random.
+
+    Args:
+        presses: The presses.
+        training: Fraction of the presses for the test, and the seed.
+    """
+    if presses.measured:
+        is_test = held_out(presses.contact)
+        remaining = presses[~is_test]
+        test = presses[is_test]
+    else:
+        remaining, test = split_by_position(presses, training.hold_out, training.seed)
+    validation_share = VALIDATION_FRACTION * training.hold_out
+    train, validation = split_by_position(remaining, validation_share, training.seed + 1)
+    return train, validation, test

@@ -1,4 +1,4 @@
-/* The board $board: its numbers for the signal chain, from its device file. Written by isocharge train export-c. */
+/* The numbers of the signal chain, $origin. Written by isocharge train export-c. */
 #ifndef ISOCHARGE_DEVICE_H
 #define ISOCHARGE_DEVICE_H
 
