@@ -23,9 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from matplotlib.ticker import FormatStrFormatter, NullFormatter, ScalarFormatter
+from measured_films import FORCE_STD, POSITION_STD_mm, measured_presses, with_rig_errors
 from shared import arguments
 
 from isocharge.common.contact_errors import position_error
+from isocharge.common.errors import PressError
 from isocharge.common.statistics import rms
 from isocharge.serve import MeasuredPresses
 from isocharge.serve.benchmark import machine
@@ -40,10 +42,6 @@ from isocharge.train.data.presses import draw_contacts
 SENSORS = "four-25um-biaxial,three-25um-biaxial,four-25um-uniaxial"
 COUNTS = (1, 3, 5, 8, 15, 30)
 """Numbers of presses."""
-
-POSITION_STD_mm = 0.1
-FORCE_STD = 0.01
-"""Standard deviation of the forces of the presses, relative to the force."""
 
 N_TEST_CONTACTS = 1000
 """Number of contacts on which the errors are measured, for each film."""
@@ -61,31 +59,6 @@ def problem_of(sensor: str) -> CalibrationProblem:
 def rms_errors(contact: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     """Return the root-mean-square errors of the position, mm, and of the force, %."""
     return rms(position_error(contact, truth)), 100.0 * rms(contact[:, 2] / truth[:, 2] - 1.0)
-
-
-def measured_presses(
-    problem: CalibrationProblem, contact: np.ndarray, charge: np.ndarray, rng: np.random.Generator
-) -> MeasuredPresses:
-    """Return presses of a rig that measures positions and forces with random errors.
-
-    Args:
-        problem: The films, whose electrodes are those of the presses.
-        contact: True contacts (x, y, F), shape (n, 3), mm and N.
-        charge: Charges with noise, shape (n, n_electrode), pC.
-        rng: Random number generator of the errors.
-    """
-    count = len(contact)
-    measured = contact.copy()
-    measured[:, :2] += POSITION_STD_mm * rng.standard_normal((count, 2))
-    measured[:, 2] *= np.exp(FORCE_STD * rng.standard_normal(count))
-    return MeasuredPresses(
-        contact=measured,
-        charge_pC=charge,
-        position_std_mm=np.full(count, POSITION_STD_mm),
-        force_std=np.full(count, FORCE_STD),
-        electrodes=problem.electrodes,
-        lines=tuple(range(count)),
-    )
 
 
 def linearised_limit(problem: CalibrationProblem, truth: np.ndarray, contact: np.ndarray) -> tuple[float, float]:
@@ -150,7 +123,7 @@ def study_film(job: FilmJob) -> dict[str, Any]:
     test_contact = draw_contacts(rng, problem.domain, N_TEST_CONTACTS)
     press_charge = problem.noise.add(film.charges(press_contact), rng)
     test_charge = problem.noise.add(film.charges(test_contact), rng)
-    presses = measured_presses(problem, press_contact, press_charge, rng)
+    presses = measured_presses(problem, with_rig_errors(press_contact, rng), press_charge)
 
     def estimate(parameters: np.ndarray) -> np.ndarray:
         """Estimate the test contacts with the network of a film."""
@@ -161,7 +134,10 @@ def study_film(job: FilmJob) -> dict[str, Any]:
     by_count = {}
     for count in COUNTS:
         start = time.perf_counter()
-        result = calibrate(presses[:count], problem)
+        try:
+            result = calibrate(presses[:count], problem)
+        except PressError:  # a single press of an unusual film may look like a press with swapped channels
+            continue
         seconds = time.perf_counter() - start
         contact, _, _ = result.fitted.predict(test_charge)
         with_gains = film_with_fitted_gains(problem, presses[:count])
@@ -201,7 +177,7 @@ def count_covered(job: tuple[str, int]) -> tuple[int, int]:
     truth = problem.prior.draw(rng, 1)[0]
     contact = draw_contacts(rng, problem.domain, COVERAGE_PRESSES)
     charge = problem.noise.add(problem.charges.charges(truth, contact), rng)
-    result = calibrate(measured_presses(problem, contact, charge, rng), problem)
+    result = calibrate(measured_presses(problem, with_rig_errors(contact, rng), charge), problem)
     deviation = (result.posterior.parameters - truth) / problem.prior.std
     identified = [quantity for quantity in result.quantities.values() if quantity.identified]
     covered = [abs(float(quantity.weights @ deviation)) <= NORMAL_95 * quantity.std for quantity in identified]
@@ -226,7 +202,7 @@ def summarise(records: list[dict[str, Any]]) -> dict[str, Any]:
         "uncalibrated": rms_pair([record["uncalibrated"] for record in records]),
     }
     for count in COUNTS:
-        rows = [record["by_count"][count] for record in records]
+        rows = [record["by_count"][count] for record in records if count in record["by_count"]]
         entry: dict[str, Any] = {}
         for method in ("left", "limit", "error", "gains_only", "gauss_newton"):
             pairs = [row[method] for row in rows if method in row]
@@ -235,6 +211,7 @@ def summarise(records: list[dict[str, Any]]) -> dict[str, Any]:
         table[str(count)] = entry | {
             "over_limit_median": np.median(ratio, axis=0).tolist(),
             "over_limit_max": ratio.max(axis=0).tolist(),
+            "refused": len(records) - len(rows),
             "bad": sum(row["bad"] for row in rows),
             "seconds_median": float(np.median([row["seconds"] for row in rows])),
         }

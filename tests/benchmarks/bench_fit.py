@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from shared import arguments, print_results
 from sklearn.ensemble import HistGradientBoostingRegressor
 from sklearn.multioutput import MultiOutputRegressor
@@ -30,7 +31,7 @@ from isocharge.simulate import Circle, Domain, Sweep, load_sensor, noise_model
 from isocharge.train import LabelledPresses, NetworkConfig, TrainingConfig
 from isocharge.train.baselines.learned import SubsetProcess, on_logarithms
 from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
-from isocharge.train.films.fit import muon_and_adam
+from isocharge.train.films.muon import muon_and_adam
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fit import contact_stage, threads_and_seed
@@ -175,18 +176,23 @@ def regressor(case: Case, name: str) -> Predict:
 
 
 def draw(rows: dict[str, dict[str, float]], file: Path) -> None:
-    """Draw error over the limit against CPU time, one panel for the position and one for the force."""
+    """Draw the excess over the limit against the CPU time, one panel for the position and one for the force."""
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
+    plain_number = FuncFormatter(lambda value, _: f"{value:g}")
     for axes, quantity in zip(figure.subplots(1, 2), ("position", "force"), strict=True):
         key = f"{quantity}_over_limit"
         for label, marker in (("present", "o-"), ("former", "s-")):
-            points = [(row["cpu_s"], row[key] - 1.0) for name, row in rows.items() if name.startswith(label)]
+            points = [(row["cpu_s"], 100.0 * (row[key] - 1.0)) for name, row in rows.items() if name.startswith(label)]
             axes.loglog(*zip(*points, strict=True), marker, label=f"{label} training")
         for name in REGRESSORS:
             if name in rows:
-                axes.loglog(rows[name]["cpu_s"], rows[name][key] - 1.0, "x", label=name)
+                axes.loglog(rows[name]["cpu_s"], 100.0 * (rows[name][key] - 1.0), "x", label=name)
         axes.set_xlabel("CPU time of the training, s")
-        axes.set_ylabel(f"{quantity} rms over the Bayes limit, minus 1")
+        axes.set_ylabel(f"{quantity} rms above the Bayes limit, %")
+        axes.xaxis.set_major_formatter(plain_number)
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(plain_number)
+        axes.yaxis.set_minor_formatter(NullFormatter())
         axes.grid(visible=True, which="both", alpha=0.3)
     axes.legend(fontsize="small")
     figure.savefig(file, dpi=120)

@@ -1,44 +1,63 @@
 """How well a film is followed: films that changed, and unchanged films that warm fingers touch.
 
     python tests/benchmarks/bench_follow.py [--sensor four-25um-biaxial] [--films 6] [--sessions 1] [--seed 0]
-        [--offsets constant,varying,decaying,none] [--json]
+        [--seconds 10] [--offsets none,constant,varying,decaying] [--json]
 
 Each film is drawn from the prior, with a pretension of 1 MPa, and calibrated by 20 presses. A session is 60 or 120
 touches of unknown place and force, 5 s apart; the follower gets the hardest frame of each that does not make the film
 yield.
 
 Changed films: root-mean-square errors of the contacts after 60 touches, the share of forces within two reported
-standard deviations, and the share of touches with the flag `film`.
+standard deviations, the errors by the calibrated model, and the share of touches with the flag `film`.
 
 Unchanged films: an offset is added to all charges of the session. `held` is the share of the sessions after which the
 followed pretension is within two reported standard deviations of the calibrated one, or the film is flagged. `wrong` is
 the share of the ten next touches, without an offset, that have an error of more than four reported standard deviations
 and no flag.
+
+The benchmark also measures the time of a frame with and without following, for the given number of seconds.
 """
 
 import time
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from shared import arguments, print_results
+from measured_films import measured_presses, with_rig_errors
+from shared import arguments, in_turns, print_results, report_progress
 
 from isocharge.common.contact_errors import position_error
 from isocharge.common.statistics import rms
-from isocharge.serve import Contact, MeasuredPresses, Predictor
+from isocharge.serve import (
+    Chunk,
+    Contact,
+    Frame,
+    Predictor,
+    TouchStream,
+    device_from_table,
+    encode_frame,
+)
+from isocharge.serve.benchmark import Contender
 from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, write_calibration
 from isocharge.train.data.presses import draw_contacts
 
 PRETENSION_MPa = 1.0
-CHANGES_MPa = (0.0, 0.35, -0.35, 0.8)
+CHANGES_MPa = (0.0, 0.35, -0.35, -0.45, 0.8)
+"""Changes of the pretension. A film that is 1 K warmer than its ring loses 0.4 to 0.55 MPa."""
+
 OFFSETS_pC = (3.0, -3.0, 10.0, -10.0, 30.0, -30.0, 100.0, -100.0)
 TOUCH_INTERVAL_s = 5.0
 WARM_FINGER_s = 150.0
 COLD_TOUCHES = 10
 PRESSES = 20
+RATE_Hz = 200.0
+TARE_FRAMES = 110
+TOUCH_FRAMES = 20
+REST_FRAMES = 20
 CONTACTS = 300
 """Contacts by which the errors after a session are measured."""
 
@@ -68,12 +87,7 @@ def calibrated_film(sensor: str, seed: int, folder: Path) -> Film:
         maps[change_MPa] = problem.charges.forward_map(parameters.copy())
     contact = draw_contacts(rng, problem.domain, PRESSES)
     charge = problem.noise.add(maps[0.0].charges(contact), rng)
-    contact[:, 2] *= np.exp(0.01 * rng.standard_normal(PRESSES))
-    contact[:, :2] += 0.1 * rng.standard_normal((PRESSES, 2))
-    position_std_mm = np.full(PRESSES, 0.1)
-    force_std = np.full(PRESSES, 0.01)
-    lines = tuple(range(2, PRESSES + 2))
-    presses = MeasuredPresses(contact, charge, position_std_mm, force_std, problem.electrodes, lines)
+    presses = measured_presses(problem, with_rig_errors(contact, rng), charge)
     write_calibration(calibrate(presses, problem), folder / "mine")
     return Film(problem, Predictor(folder / "mine"), maps)
 
@@ -115,6 +129,7 @@ def changed_film(film: Film, change_MPa: float, seed: list[int]) -> dict[str, fl
     _, charge = film.touches(change_MPa, 60, rng)
     flagged, times = observe(follower, charge)
     contact, charge = film.touches(change_MPa, CONTACTS, rng)
+    calibrated_contact = np.array(film.predictor.predict_batch(charge))[:, :3]
     answer = answers(follower, charge)
     force_error = np.array([one.force_N for one in answer]) - contact[:, 2]
     force_std = np.array([one.force_std_N for one in answer])
@@ -122,6 +137,8 @@ def changed_film(film: Film, change_MPa: float, seed: list[int]) -> dict[str, fl
         "position_mm": rms(position_error(np.array([one[:3] for one in answer]), contact)),
         "force_percent": 100.0 * rms(force_error / contact[:, 2]),
         "force_coverage": float(np.mean(np.abs(force_error) < 2.0 * force_std)),
+        "calibrated_position_mm": rms(position_error(calibrated_contact, contact)),
+        "calibrated_force_percent": 100.0 * rms(calibrated_contact[:, 2] / contact[:, 2] - 1.0),
         "flagged": flagged,
         "touch_ms": 1e3 * float(np.median(times)),
     }
@@ -151,6 +168,50 @@ def warm_session(film: Film, kind: str, size_pC: float, count: int, seed: list[i
     }
 
 
+class Board:
+    """A live stream, and the frames that a board sends to it.
+
+    Attributes:
+        stream: The live stream.
+    """
+
+    def __init__(self, predictor: Predictor, device: dict[str, Any], rng: np.random.Generator) -> None:
+        """Create the stream of a device file, and send frames without a touch until the tare is measured."""
+        self.stream = TouchStream(predictor, device_from_table(device, "bench_follow"))
+        self._rng = rng
+        self._count = 0
+        self.send(np.zeros(len(predictor.metadata.electrodes)), TARE_FRAMES)
+
+    def send(self, charge: np.ndarray, count: int = 1) -> None:
+        """Send frames with the same charges, shape (n_electrode,), pC, and with noise of 1 pC."""
+        for _ in range(count):
+            noisy_charge = charge + self._rng.standard_normal(charge.size)
+            frame = Frame(self._count, int(1e6 * self._count / RATE_Hz), tuple(noisy_charge.tolist()))
+            chunk = Chunk(encode_frame(frame), 1.7e9 + self._count / RATE_Hz, 0)
+            self._count += 1
+            for _record in self.stream.feed(chunk):
+                pass
+
+
+def frame_times(film: Film, seconds: float) -> list[dict[str, Any]]:
+    """Measure the time of a frame of a held contact on the changed film, with and without following.
+
+    Returns:
+        Percentiles of the times, and their ratio to those of a stream without following.
+    """
+    rng = np.random.default_rng(12)
+    _, charge = film.touches(0.35, 30, rng)
+    boards = [Board(film.predictor, device, rng) for device in ({}, {"follow": {"on": True}})]
+    for board in boards:
+        for row in charge:
+            board.send(row, TOUCH_FRAMES)
+            board.send(np.zeros(row.size), REST_FRAMES)
+    held = film.maps[0.35].charges(np.array([[3.0, 2.0, 0.5]]))[0]
+    calls = [partial(board.send, held) for board in boards]
+    contenders = [Contender(name, 1, call) for name, call in zip(("not followed", "followed"), calls, strict=True)]
+    return in_turns(contenders, seconds)
+
+
 def mean(rows: list[dict[str, float]]) -> dict[str, float]:
     """Return the means over films and sessions."""
     return {key: round(float(np.mean([row[key] for row in rows])), 4) for key in rows[0]}
@@ -163,22 +224,30 @@ def main() -> None:
         films=6,
         sessions=1,
         seed=0,
+        seconds=10.0,
         offsets="none,constant,varying,decaying",
         json=False,
     )
     results = {}
+
+    def add(title: str, rows: list[dict[str, float]]) -> None:
+        """Add the mean of rows to the results, and print it."""
+        results[title] = mean(rows)
+        report_progress(title, results[title])
+
     with TemporaryDirectory() as folder:
         films = [calibrated_film(asked.sensor, seed, Path(folder) / str(seed)) for seed in range(asked.films)]
         seeds = [(film, [asked.seed, number, n]) for n, film in enumerate(films) for number in range(asked.sessions)]
         for kind in asked.offsets.split(","):
             if kind == "none":
+                results["frame of a held contact"] = frame_times(films[0], asked.seconds)
                 for change_MPa in CHANGES_MPa:
                     rows = [changed_film(film, change_MPa, seed) for film, seed in seeds]
-                    results[f"changed by {change_MPa:+g} MPa"] = mean(rows)
+                    add(f"changed by {change_MPa:+g} MPa", rows)
             for size_pC in (0.0,) if kind == "none" else OFFSETS_pC:
                 for count in (60, 120):
                     rows = [warm_session(film, kind, size_pC, count, seed) for film, seed in seeds]
-                    results[f"{kind} {size_pC:+g} pC, {count} touches"] = mean(rows)
+                    add(f"{kind} {size_pC:+g} pC, {count} touches", rows)
     print_results("follow", asked, results)
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,17 @@ def print_results(name: str, asked: argparse.Namespace, results: dict[str, Any])
             print(title, *rows, sep="\n    ")
         else:
             print(f"{title}: {rows}")
+
+
+def report_progress(title: str, result: dict[str, float]) -> None:
+    """Print a part of the results to the standard error stream as soon as it is available.
+
+    Args:
+        title: What the result belongs to, such as the number of a film.
+        result: Values by name.
+    """
+    values = ", ".join(f"{key} {value:.4g}" for key, value in result.items())
+    print(f"{title}: {values}", file=sys.stderr, flush=True)
 
 
 def percentiles(values: Any, shares: tuple[float, ...], digits: int = 1) -> dict[str, float]:

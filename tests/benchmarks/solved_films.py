@@ -75,6 +75,14 @@ def solve_charges(sensor: Sensor, probe: Circle, contact: np.ndarray) -> np.ndar
     return np.array(rows)
 
 
+def stored_charges(path: Path, contact: np.ndarray) -> np.ndarray | None:
+    """Return the charges that an earlier run stored for the same contacts, or None if there are none."""
+    if not path.exists():
+        return None
+    with np.load(path) as stored:
+        return stored["charge"] if np.array_equal(stored["contact"], contact) else None
+
+
 def solved_film(
     problem: CalibrationProblem,
     seed: int,
@@ -85,6 +93,8 @@ def solved_film(
 ) -> SolvedFilm:
     """Draw a film and solve its presses, or read them from an earlier run.
 
+    The presses before the change are solved only once for all changes.
+
     Args:
         problem: The films.
         seed: Seed of the film and of the contacts.
@@ -93,19 +103,20 @@ def solved_film(
         folder: Folder in which solved presses are stored.
         pool: Processes that solve the presses.
     """
-    path = folder / f"{problem.sensor.name}-{seed}-{change_MPa:+g}-{counts[0]}-{counts[1]}.npz"
-    if not path.exists():
-        rng = np.random.default_rng([seed, 50])
-        sensor, probe = draw_film(problem, seed)
-        later = replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension + change_MPa))
-        arrays = {}
-        for name, film, count in zip(("", "later_"), (sensor, later), counts, strict=True):
-            contact = draw_contacts(rng, problem.domain, count)
-            contact[:, 2] = np.minimum(contact[:, 2], LARGEST_FORCE_N)
+    rng = np.random.default_rng([seed, 50])
+    sensor, probe = draw_film(problem, seed)
+    later = replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension + change_MPa))
+    arrays = {}
+    for prefix, change, film, count in (("", 0.0, sensor, counts[0]), ("later_", change_MPa, later, counts[1])):
+        contact = draw_contacts(rng, problem.domain, count)
+        contact[:, 2] = np.minimum(contact[:, 2], LARGEST_FORCE_N)
+        path = folder / f"{problem.sensor.name}-{seed}-{change:+g}-{count}.npz"
+        charge = stored_charges(path, contact)
+        if charge is None:
             parts = np.array_split(contact, max(count // 10, 1))
-            arrays[f"{name}contact"] = contact
-            arrays[f"{name}charge"] = np.concatenate(list(pool.map(partial(solve_charges, film, probe), parts)))
-        folder.mkdir(parents=True, exist_ok=True)
-        np.savez(path, **arrays)
-    with np.load(path) as stored:
-        return SolvedFilm(**{name: stored[name] for name in stored.files})
+            charge = np.concatenate(list(pool.map(partial(solve_charges, film, probe), parts)))
+            folder.mkdir(parents=True, exist_ok=True)
+            np.savez(path, contact=contact, charge=charge)
+        arrays[f"{prefix}contact"] = contact
+        arrays[f"{prefix}charge"] = charge
+    return SolvedFilm(**arrays)
