@@ -22,12 +22,18 @@ LONGEST = ("tests/train", "tests/cli", "tests/test_pages", "tests/test_examples"
 """Folders and files with the longest tests, which begin first."""
 
 settings.register_profile("patient", deadline=None)  # an example may take long on a busy machine
-settings.load_profile("patient")
+settings.register_profile("quick", settings.get_profile("patient"), max_examples=50)
 
 gc.disable()  # imports and the collection of the tests create no garbage, so the collector would only cost time
 
 # A shell starts background processes with SIGINT ignored, and the commands that tests start would inherit this.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_configure(config):
+    """Test properties with half of the usual number of random examples if slow tests are not run."""
+    is_quick = config.getoption("markexpr") == "not slow"
+    settings.load_profile("quick" if is_quick else "patient")
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -47,6 +53,17 @@ def pytest_collection_modifyitems(items):
                 item.add_marker(pytest.mark.slow)
     gc.freeze()
     gc.enable()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_check_presses():
+    """Compare each forward map with four direct solves instead of ten when it is built.
+
+    The tests build many maps. The tests of the forward map compare it with further direct solves.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("isocharge.simulate.forward.forward_map.CHECK_COUNT", 4)
+        yield
 
 
 @pytest.fixture

@@ -5,7 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from isocharge.cli.shared.forward_maps import simulated_presses
 from isocharge.serve import Predictor
+from isocharge.simulate import Circle, load_sensor
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
+from isocharge.train import fit, release
 from kept import kept
 from press_faults import FaultStudy, FilmCharges, WholeFilmStudy, nominal_map
 
@@ -55,6 +59,21 @@ def test_shares_of_presses_on_the_whole_film_are_those_of_the_page(model):
         expected = (shares.flagged, shares.unnoticed, shares.mirrored)
         assert page[ring] == pytest.approx(expected, abs=2.0 * TOLERANCE), ring
     assert rings["inside the working area"].flagged < 1.0
+
+
+@pytest.mark.slow
+def test_a_trained_model_with_a_guard_electrode_notices_presses_anywhere_on_the_film(tmp_path):
+    """Without a guard electrode, most presses outside the working area are answered wrongly without a flag."""
+    table = sensor_to_dict(load_sensor("four-25um-biaxial"))
+    table["electrodes"]["G"] = [0.0, 0.0]
+    sensor = sensor_from_dict(table | {"name": "guarded", "roles": {"G": "guard"}})
+    dataset = simulated_presses(sensor, [Circle(1.0)], 8.0, (0.05, 2.0))
+    model = release(fit(dataset), tmp_path / "guarded")
+    rings = WholeFilmStudy(str(model.folder), 500, SEED).rings((8.0, 15.0, 20.0, 30.0, 43.0))
+    assert rings["inside the working area"].flagged < 1.0
+    assert rings["whole film"].unnoticed < 1.0
+    _, share_without_guard, _ = column("distance", "four-25um-biaxial")["whole film"]
+    assert share_without_guard > 70.0
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def stuffed(framing):
         "hdlc": lambda data: data.replace(b"}", b"}]").replace(b"~", b"}^") + b"~",
         "datagram": lambda data: data,
     }
-    return layout.parser, b"".join(escapes[framing](layout.encode(frame)) for frame in FRAMES)
+    return layout.parser, b"".join(escapes[framing](layout.encode_unstuffed(frame)) for frame in FRAMES)
 
 
 def formats():

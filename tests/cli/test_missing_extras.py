@@ -55,15 +55,19 @@ def load(group, path):
             outcomes[" ".join(words)] = ""
 
 
-import torch, scipy.optimize
+import ezdxf, matplotlib.figure, onnx, onnxruntime, rich.markdown, shapely, torch, typer
+import scipy.optimize, scipy.spatial, scipy.stats
+import sklearn.ensemble, sklearn.gaussian_process, sklearn.neighbors
 
 for extra, absent in absent_packages.items():
     if os.fork():
         _, status = os.wait()
         assert status == 0, extra
         continue
+    is_usable = {"sklearn": "scipy" not in absent}  # scikit-learn cannot be imported without SciPy
     for name in [*sys.modules]:
-        if name.partition(".")[0] in absent:
+        package = name.partition(".")[0]
+        if package in absent or not is_usable.get(package, True):
             del sys.modules[name]
     sys.meta_path.insert(0, AbsentPackages())
     import typer
@@ -76,7 +80,7 @@ for extra, absent in absent_packages.items():
 """
 """Loads all commands in one process for each extra, with the packages of this extra absent.
 
-The processes are forked after torch and SciPy are imported, because this import takes longer than everything else.
+The processes are forked after the large packages are imported, because this takes longer than everything else.
 """
 
 

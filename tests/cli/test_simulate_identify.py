@@ -5,7 +5,7 @@ import json
 import pytest
 from matplotlib.image import imread
 
-UNIAXIAL = ("simulate", "identify", "three-25um-uniaxial", "--radius", "3.5", "--force", "1", "1")
+UNIAXIAL = ("simulate", "identify", "three-25um-uniaxial", "--radius", "3.5", "--force", "1", "1", "--workers", "1")
 
 
 def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_path):

@@ -10,9 +10,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.benchmarks.measured_films import measured_presses
 from tests.train.calibration.conftest import (
     coarse,  # noqa: F401  (a fixture of this module, too)
-    presses_of,
+    no_closed_backs,  # noqa: F401
 )
 
 from boards import TcpBoard, until
@@ -24,6 +25,8 @@ from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, WatchRes
 from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration.press_file import open_press_file
+
+pytestmark = pytest.mark.usefixtures("no_closed_backs")
 
 NAMES = ("A", "B", "C", "D")
 RATE_HZ = 200.0
@@ -258,6 +261,7 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk
     assert table["error_left"] == lines[0]["error_left"]
 
 
+@pytest.mark.slow  # in `make test`, a session continues after the end of its port, and its open file is read
 def test_a_killed_session_leaves_whole_lines_and_continues(start_command, command, desk, film, places):
     """The process is killed by SIGKILL after two presses."""
     path = desk / "presses.csv"
@@ -280,7 +284,7 @@ def test_a_killed_session_leaves_whole_lines_and_continues(start_command, comman
 
 def test_presses_of_another_probe_or_sensor_are_not_continued(problem, film, places, tmp_path):
     path = tmp_path / "presses.csv"
-    presses = presses_of(problem, places, film.charges(places))
+    presses = measured_presses(problem, places, film.charges(places))
     stds = {"position_std_mm": 0.1, "force_std": 0.01}
     with open_press_file(path, problem.sensor, Circle(1.0)) as file:
         assert file.read(**stds) is None

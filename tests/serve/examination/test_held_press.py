@@ -87,4 +87,5 @@ def test_proposed_file_has_the_leak_and_the_offset_before_the_press():
     assert device_from_table(report.device, "board").leak.tau_s == pytest.approx(10.0, rel=0.05)
     assert max(abs(channel.offset_pC) for channel in report.channels) < 1.0
     assert report.works
-    assert report.missing == ("[leak] tau_s = 10 in a device file",)
+    assert report.missing == ()
+    assert report.missing_for_held_presses == ("[leak] tau_s = 10 in a device file",)

@@ -52,9 +52,15 @@ def missing(report):
     return " / ".join(report.missing)
 
 
+def missing_for_held_presses(report):
+    """Return all sentences about settings that only held presses need as one text."""
+    return " / ".join(report.missing_for_held_presses)
+
+
 def test_check_of_a_healthy_board():
     report = examine_received(received(charges()), device=AT_REST, electrodes=("A", "B", "C"))
     assert (report.baud, report.format, report.missing) == (115200, "binary frames of isocharge", ())
+    assert report.missing_for_held_presses == ()
     assert (report.good, report.bad, report.lost, report.repeated, report.device_clock) == (400, 0, 0, 0, True)
     assert report.rate_Hz == pytest.approx(200.0)
     assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]
@@ -65,7 +71,9 @@ def test_check_uses_no_stage_that_is_switched_off():
     off = {"gain": {"on": False, "pC_per_unit": 2.0}, "leak": {"on": False, "tau_s": 10.0}}
     report = examine_received(received(charges()), device=device_from_table(off, "test"))
     assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]
-    assert "time constants ([leak] tau_s" in missing(report)
+    assert "time constants ([leak] tau_s" in missing_for_held_presses(report)
+    lines = list(report_lines(report))
+    assert lines[-3:-1] == ["missing to get a touch: nothing", "missing for held presses:"]
 
 
 def test_check_of_a_channel_without_a_number():
@@ -105,7 +113,7 @@ def test_missing_clock_is_reported_only_with_leak():
         examine_received(lines),
         examine_received(received(charges()), device=AT_REST),
     )
-    assert ["a device clock" in missing(report) for report in reports] == [True, False, False]
+    assert ["a device clock" in missing_for_held_presses(report) for report in reports] == [True, False, False]
 
 
 def test_unused_inputs_are_ignored():

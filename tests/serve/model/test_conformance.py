@@ -51,6 +51,13 @@ def test_golden_vectors_are_reproduced(model):
     check_golden(model)
 
 
+def test_metadata_and_card_state_the_unnoticed_presses_outside_the_working_area(model):
+    unnoticed = model.metadata.unnoticed
+    card = (model.folder / "card.md").read_text()
+    assert " ".join(unnoticed.summary.split()) in " ".join(card.split())
+    assert unnoticed.from_mm == pytest.approx(np.hypot(*model.metadata.working_area_mm[0]), rel=0.02)
+
+
 def test_answers_are_finite_and_deviations_positive(model, released):
     """Over all charges a film may give, and some it may not."""
     rng = np.random.default_rng(0)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.benchmarks.measured_films import measured_presses
 
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle, load_sensor
@@ -56,7 +57,9 @@ def calibration_with_discrepancy(sensor: str):
     problem = CalibrationProblem.of(load_sensor(sensor), Circle(1.0))
     truth, presses = rig(problem, 20, seed=41)
     charge = add_discrepancy(presses.contact, presses.charge_pC)
-    return truth, calibrate(presses_of(problem, presses.contact, charge), problem)
+    result = calibrate(measured_presses(problem, presses.contact, charge), problem)
+    assert result.summary  # is computed here, so that it is stored with the result
+    return truth, result
 
 
 @pytest.fixture(scope="module")
@@ -77,20 +80,7 @@ def rig(problem, count, seed, position_std_mm=0.1, force_std=0.01) -> tuple[np.n
     charge = problem.noise.add(problem.charges.charges(parameters, contact), rng)
     contact[:, :2] += position_std_mm * rng.standard_normal((count, 2))
     contact[:, 2] *= np.exp(force_std * rng.standard_normal(count))
-    return parameters, presses_of(problem, contact, charge, position_std_mm, force_std)
-
-
-def presses_of(problem, contact, charge, position_std_mm=0.1, force_std=0.01) -> MeasuredPresses:
-    """Return measured presses, which are on the lines 2, 3, ... of a file."""
-    count = len(contact)
-    return MeasuredPresses(
-        contact=contact,
-        charge_pC=charge,
-        position_std_mm=np.full(count, position_std_mm),
-        force_std=np.full(count, force_std),
-        electrodes=problem.electrodes,
-        lines=tuple(range(2, count + 2)),
-    )
+    return parameters, measured_presses(problem, contact, charge, position_std_mm, force_std)
 
 
 DEGREE_MPa = 0.35
@@ -114,7 +104,7 @@ def calibrated_files(sensor: str, seed: int) -> dict[str, bytes]:
         # The directions of the film need more contacts than the fixture `coarse` sets.
         patch.setattr(contact_error, "N_CONTACTS", 200)
         path = Path(folder) / "mine"
-        write_calibration(calibrate(presses_of(problem, contact, charge), problem), path)
+        write_calibration(calibrate(measured_presses(problem, contact, charge), problem), path)
         return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
 
 

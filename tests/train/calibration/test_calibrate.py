@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
-from tests.train.calibration.conftest import add_discrepancy, presses_of, rig
+from tests.benchmarks.measured_films import measured_presses
+from tests.train.calibration.conftest import add_discrepancy, rig
 
 from isocharge.common.contact_errors import position_error
 from isocharge.common.errors import ModelError, PressError, SceneError
@@ -40,6 +41,7 @@ def fit(problem, presses):
     return fit_film(problem.charges, press_data(problem, presses), problem.before)
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(("count", "seed"), [(4, 11), (6, 2)], ids=["inside", "on a bound"])
 def test_fit_is_the_minimum_over_parameters_and_contacts(count, seed, problem, monkeypatch):
     """SciPy minimises over parameters and contacts together, with finite differences, and finds the same film."""
@@ -95,7 +97,7 @@ def calibrate_changed(problem, change, count, seed):
     """
     truth, presses = rig(problem, count, seed)
     changed_charge = change(presses.contact, presses.charge_pC)
-    return truth, calibrate(presses_of(problem, presses.contact, changed_charge), problem)
+    return truth, calibrate(measured_presses(problem, presses.contact, changed_charge), problem)
 
 
 def unchanged(contact, charge):
@@ -165,12 +167,13 @@ def test_rotated_stage_is_named(problem):
     angle = np.copysign(np.deg2rad(8.0), truth[problem.prior.index("rotation")])
     cos, sin = np.cos(angle), np.sin(angle)
     rotated = presses.contact @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    cautions = calibrate(presses_of(problem, rotated, presses.charge_pC), problem).cautions
+    cautions = calibrate(measured_presses(problem, rotated, presses.charge_pC), problem).cautions
     assert any(
         re.search(r"difference from the sensor file: rotation; .* axes of the stage", message) for message in cautions
     )
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(
     ("change", "caution"),
     [
@@ -205,7 +208,7 @@ def test_random_leak_of_the_charges_is_reported_and_increases_the_force_error(pr
     assert 2.0 < error_percent < 2.5 * result.error_left.force_percent
 
 
-@pytest.mark.first_cases(1)
+@pytest.mark.slow  # in `make test`, the covariance is compared with that of SciPy's fit
 def test_parameters_deviate_as_their_covariance_states(layout):
     """The squared Mahalanobis distances of the true films add up to a value of a chi-squared distribution."""
     total = 0.0
@@ -220,7 +223,7 @@ def test_parameters_deviate_as_their_covariance_states(layout):
     assert chi2.ppf(0.001, count) < total < chi2.ppf(0.999, count)
 
 
-@pytest.mark.first_cases(1)
+@pytest.mark.slow  # in `make test`, wrong presses are found by the tests of cross-validation and of sessions
 @pytest.mark.parametrize("row", [0, 4])
 def test_bad_press_is_left_out_and_hardly_changes_the_film(problem, row):
     _, presses = rig(problem, 10, seed=21)
@@ -233,7 +236,7 @@ def test_bad_press_is_left_out_and_hardly_changes_the_film(problem, row):
     assert np.abs(change / std).max() < 1.2
 
 
-@pytest.mark.first_cases(1)
+@pytest.mark.slow  # in `make test`, errors are compared with a new film by the tests of sessions and of held-out errors
 def test_error_by_the_film_is_near_the_linearised_limit(layout):
     """The ratio to the limit at the true film is at most 1.25 in the median, and at most 2.5 for each film."""
     ratios = []
@@ -275,7 +278,7 @@ def single_press(problem, presses):
 def at_one_place(problem, presses):
     """Return presses of 1 N at one place."""
     contact = np.tile([2.0, 1.0, 1.0], (len(presses), 1))
-    return presses_of(problem, contact, problem.charges.charges(problem.prior.mean, contact))
+    return measured_presses(problem, contact, problem.charges.charges(problem.prior.mean, contact))
 
 
 def without_contacts(problem, presses):
@@ -347,11 +350,12 @@ def drifted(problem):
     return replace(problem, earlier=earlier), truth
 
 
+@pytest.mark.slow  # in `make test`, few presses after an earlier calibration are tested below
 def test_earlier_calibration_reduces_the_error_of_the_next(drifted, problem):
     with_earlier, truth = drifted
     rng = np.random.default_rng(10)
     contact = draw_contacts(rng, problem.domain, 3)
-    presses = presses_of(problem, contact, problem.noise.add(problem.charges.charges(truth, contact), rng))
+    presses = measured_presses(problem, contact, problem.noise.add(problem.charges.charges(truth, contact), rng))
     error_mm = calibrate(presses, problem).error_left.position_mm
     assert calibrate(presses, with_earlier).error_left.position_mm < 0.7 * error_mm
 
@@ -377,7 +381,7 @@ def test_changed_pretension_is_estimated_from_few_presses(drifted, count, x_mm, 
     contact[:, is_known] = stated[is_known]
     charge = problem.noise.add(problem.charges.charges(truth, contact), rng)
     contact[:, ~is_known] = UNKNOWN
-    posterior = calibrate(presses_of(problem, contact, charge), problem).posterior
+    posterior = calibrate(measured_presses(problem, contact, charge), problem).posterior
     std_MPa = np.sqrt(posterior.covariance[PRETENSION, PRETENSION]) * problem.prior.std[PRETENSION]
     assert abs(problem.earlier.parameters[PRETENSION] - truth[PRETENSION]) > 0.25
     assert abs(posterior.parameters[PRETENSION] - truth[PRETENSION]) < min(tolerance_MPa, 3.0 * std_MPa)
@@ -444,7 +448,7 @@ def test_traces_that_are_not_described_are_estimated(problem):
     charge = solved_charges(replace(sensor, electrodes=(traced_a, b, traced_c, d)), probe, contact)
     calibrated, test = np.split(np.arange(22), [16])
     noisy_charge = problem.noise.add(charge[calibrated], rng)
-    result = calibrate(presses_of(problem, contact[calibrated], noisy_charge), problem)
+    result = calibrate(measured_presses(problem, contact[calibrated], noisy_charge), problem)
     widths = problem.charges.trace_widths(result.posterior.unknowns, result.posterior.joint)
     for (width, std), true_width in zip(widths.values(), (0.5, 0.0, 0.3, 0.0), strict=True):
         assert abs(width - true_width) < min(3.0 * std, 0.2)

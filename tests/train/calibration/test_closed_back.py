@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.train.calibration.conftest import presses_of
+from tests.benchmarks.measured_films import measured_presses
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses
@@ -18,14 +18,16 @@ CAVITY = 15.0 * np.pi * 45.0**2
 """Volume of a cavity of 15 mm behind the film, mm^3."""
 
 
-def presses_with(problem: CalibrationProblem, back_volume: float | None, pretension: float) -> MeasuredPresses:
-    """Return eight noisy presses of a film of this pretension (MPa) and back volume (mm^3)."""
+def presses_with(
+    problem: CalibrationProblem, back_volume: float | None, pretension: float, count: int = 8
+) -> MeasuredPresses:
+    """Return noisy presses of a film of this pretension (MPa) and back volume (mm^3)."""
     rng = np.random.default_rng(7)
-    contact = draw_contacts(rng, problem.domain.within(7.5), 8)
+    contact = draw_contacts(rng, problem.domain.within(7.5), count)
     film = replace(problem.sensor.film, pretension=pretension, back_volume=back_volume)
     sensor = replace(problem.sensor, film=film)
     exact_charge = kept(solved_charges, sensor, contact.tolist())
-    return presses_of(problem, contact, problem.noise.add(exact_charge, rng))
+    return measured_presses(problem, contact, problem.noise.add(exact_charge, rng))
 
 
 def solved_charges(sensor, contacts):
@@ -36,9 +38,10 @@ def solved_charges(sensor, contacts):
 @pytest.mark.first_cases(1)
 @pytest.mark.parametrize("pretension", [0.3])
 def test_closed_back_is_recognised(layout, pretension):
-    assert has_closed_back(presses_with(layout, CAVITY, pretension), layout.charges)
+    assert has_closed_back(presses_with(layout, CAVITY, pretension, count=5), layout.charges)
 
 
+@pytest.mark.first_cases(2)
 @pytest.mark.parametrize("pretension", [0.0, 1.6])
 def test_vented_back_is_not_taken_for_a_closed_back(layout, pretension):
     assert not has_closed_back(presses_with(layout, None, pretension), layout.charges)

@@ -4,7 +4,8 @@ import re
 
 import numpy as np
 import pytest
-from tests.train.calibration.conftest import presses_of, rig
+from tests.benchmarks.measured_films import measured_presses
+from tests.train.calibration.conftest import rig
 
 from isocharge.common.errors import PressError
 from isocharge.train import calibrate
@@ -45,7 +46,7 @@ def test_mistake_in_the_presses_is_found(problem, name):
     _, presses = rig(problem, 12, seed=7)
     assert find_mistakes(presses, problem.charges) == []
     contact, charge = make_mistake(presses.contact, presses.charge_pC)
-    mistakes = find_mistakes(presses_of(problem, contact, charge), problem.charges)
+    mistakes = find_mistakes(measured_presses(problem, contact, charge), problem.charges)
     assert re.search(message, "; ".join(mistakes))
 
 
@@ -54,7 +55,7 @@ def test_misfit_of_a_common_factor_is_the_square_of_its_logarithm(problem):
     film = problem.prior.mean.copy()
     film[problem.prior.index("pretension")] = min(PRETENSIONS) * problem.prior.spread.pretension
     contact = draw_contacts(np.random.default_rng(3), problem.domain.within(6.0), 10)
-    presses = presses_of(problem, contact, 3.0 * problem.charges.charges(film, contact))
+    presses = measured_presses(problem, contact, 3.0 * problem.charges.charges(film, contact))
     assert misfit(presses, problem.charges) == pytest.approx((np.log(3.0) / OFFSET_STD) ** 2)
 
 
@@ -66,4 +67,4 @@ def test_impossible_presses_are_refused_with_the_reason(problem, name):
     _, presses = rig(problem, 12, seed=7)
     contact, charge = make_mistake(presses.contact, presses.charge_pC)
     with pytest.raises(PressError, match=message):
-        calibrate(presses_of(problem, contact, charge), problem)
+        calibrate(measured_presses(problem, contact, charge), problem)

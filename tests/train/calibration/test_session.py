@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.train.calibration.conftest import presses_of
+from tests.benchmarks.measured_films import measured_presses
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses
@@ -29,7 +29,7 @@ class SimulatedRig:
         self.parameters = problem.prior.draw(self.rng, 1)[0]
         self.saved: list[MeasuredPresses] = []
         contact = np.array([press.contact for press in plan[:count]])
-        presses = presses_of(problem, contact, np.array([self.charge(row) for row in contact])) if count else None
+        presses = measured_presses(problem, contact, np.array([self.charge(row) for row in contact])) if count else None
         self.session = PressSession(problem, save=self.saved.append, presses=presses, **options)
 
     def charge(self, contact):

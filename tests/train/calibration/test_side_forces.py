@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.train.calibration.conftest import presses_of
+from tests.benchmarks.measured_films import measured_presses
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Domain, press, touch_charge
@@ -130,7 +130,7 @@ def test_calibration_finds_the_coefficient_of_friction_of_solved_presses(problem
     read = contact.copy()
     read[:, :2] += 0.1 * rng.standard_normal((20, 2))
     read[:, 2] *= np.exp(0.01 * rng.standard_normal(20))
-    presses = presses_of(problem, read, problem.noise.add(charge, rng))
+    presses = measured_presses(problem, read, problem.noise.add(charge, rng))
 
     result = calibrate(presses, replace(problem, friction=COEFFICIENT))
     friction = result.posterior.nuisances["friction"]

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.train.calibration.conftest import presses_of
+from tests.benchmarks.measured_films import measured_presses
 
 from isocharge.common.errors import PressError
 from isocharge.common.json_values import plain_values
@@ -54,7 +54,7 @@ def solved_charges(contacts, pretensions):
     return np.array(solved)
 
 
-def measured_presses(problem, seed, temperature_C):
+def presses_at_temperatures(problem, seed, temperature_C):
     """Return presses of a simulated rig on the film at different temperatures, shape (n,), degrees Celsius."""
     rng = np.random.default_rng(seed)
     count = len(temperature_C)
@@ -63,13 +63,13 @@ def measured_presses(problem, seed, temperature_C):
     charge = problem.noise.add(kept(solved_charges, contact, pretensions), rng)
     contact[:, :2] += 0.1 * rng.standard_normal((count, 2))
     contact[:, 2] *= np.exp(0.01 * rng.standard_normal(count))
-    return replace(presses_of(problem, contact, charge), temperature_C=temperature_C)
+    return replace(measured_presses(problem, contact, charge), temperature_C=temperature_C)
 
 
 @pytest.fixture(scope="module")
 def calibration(problem):
     """A calibration by presses at temperatures from 20 to 23 degrees Celsius."""
-    return calibrate(measured_presses(problem, 5, TEMPERATURES_C), problem)
+    return calibrate(presses_at_temperatures(problem, 5, TEMPERATURES_C), problem)
 
 
 def write_result(result, folder):
@@ -96,7 +96,9 @@ def test_pretension_per_kelvin_of_the_film_above_its_ring_is_estimated(problem):
     charge = problem.noise.add(kept(solved_charges, contact, MEAN_PRETENSION_MPa - per_film_K * excess_K), rng)
     ring_C = np.full(12, 21.0)
     presses = replace(
-        presses_of(problem, contact, charge, 0.02, 0.003), temperature_C=ring_C, film_temperature_C=ring_C + excess_K
+        measured_presses(problem, contact, charge, 0.02, 0.003),
+        temperature_C=ring_C,
+        film_temperature_C=ring_C + excess_K,
     )
     result = calibrate(presses, problem)
     estimate = result.posterior.nuisances["pretension_per_film_K"]
@@ -108,7 +110,7 @@ def test_pretension_per_kelvin_of_the_film_above_its_ring_is_estimated(problem):
 
 def test_film_temperature_is_written_and_read_and_refused_without_the_ring_temperature(problem, tmp_path):
     presses = replace(
-        measured_presses(problem, 5, TEMPERATURES_C)[:3],
+        presses_at_temperatures(problem, 5, TEMPERATURES_C)[:3],
         temperature_C=np.array([20.0, 20.1, 20.2]),
         film_temperature_C=np.array([20.5, np.nan, 21.0]),
     )
@@ -172,7 +174,7 @@ def test_film_is_not_moved_by_an_uncertain_change_or_to_an_impossible_pretension
 def test_presses_at_another_temperature_improve_the_change_per_kelvin(calibration, tmp_path, problem):
     """The film after three presses at 23.5 degrees Celsius is given at the temperature of these presses."""
     earlier = read_earlier(write_result(calibration, tmp_path), problem, knows_temperature=True)
-    warm_presses = measured_presses(problem, 6, np.full(3, 23.5))
+    warm_presses = presses_at_temperatures(problem, 6, np.full(3, 23.5))
     later = calibrate(warm_presses, replace(problem, earlier=earlier)).posterior
     assert later.warming.at_C == pytest.approx(23.5)
     assert later.warming.std < calibration.posterior.warming.std
@@ -181,7 +183,7 @@ def test_presses_at_another_temperature_improve_the_change_per_kelvin(calibratio
 
 def test_missing_temperatures_of_a_file_are_interpolated_and_impossible_ones_are_refused(tmp_path, problem):
     temperature_C = np.array([20.0, np.nan, 22.0, np.nan])
-    presses = replace(measured_presses(problem, 5, TEMPERATURES_C)[:4], temperature_C=temperature_C)
+    presses = replace(presses_at_temperatures(problem, 5, TEMPERATURES_C)[:4], temperature_C=temperature_C)
     write_presses(tmp_path / "presses.csv", presses)
     read = read_presses(tmp_path / "presses.csv", problem.electrodes)
     assert read == presses
@@ -196,6 +198,6 @@ def test_presses_at_another_temperature_fit_the_moved_model_only(calibration, pr
     write_calibration(calibration, tmp_path / "day")
     assert command(*CALIBRATE, "--from", tmp_path / "day", "--temperature", "20.5", "-o", tmp_path / "cold")[0] == 0
     assert "-biaxial`, moved from 21.5 C, day/1, to 20.5 C by the" in (tmp_path / "cold" / "card.md").read_text()
-    cold_presses = replace(measured_presses(problem, 7, np.full(10, 20.5)), temperature_C=None)
+    cold_presses = replace(presses_at_temperatures(problem, 7, np.full(10, 20.5)), temperature_C=None)
     assert not check_presses(Predictor(tmp_path / "day"), cold_presses).fits
     assert check_presses(Predictor(tmp_path / "cold"), cold_presses).fits

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
-from isocharge.train.data.misfit_charges import PAIR_EXPONENTS, combined_charge, draw_outside_examples
+from isocharge.train.data.misfit_charges import PAIR_EXPONENTS, ExampleOptions, combined_charge, draw_outside_examples
 from kept import kept
 from membrane_solver import Membrane, Touch, solve_touches
 
@@ -69,7 +69,9 @@ def test_examples_of_presses_outside_the_working_area_have_the_exact_misfit():
             return slopes
 
     outside = np.array([[100.0, 100.0, 900.0]])
-    charge, residual = draw_outside_examples(outside, ProportionalMap(), NOISE, 400, 1, candidates=64)
+    charge, residual = draw_outside_examples(
+        outside, ProportionalMap(), NOISE, 400, 1, options=ExampleOptions(candidates=64)
+    )
     assert np.all(np.abs(charge / outside - 1.0) < 0.12)
     nearest_charge = charge - residual * NOISE.sigma(charge)
     np.testing.assert_allclose(nearest_charge, nearest_charge[:, :1] * np.ones(3), rtol=1e-3)

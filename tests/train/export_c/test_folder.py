@@ -47,7 +47,12 @@ def test_command_writes_the_folder_once(command, refused, tmp_path):
     words = ("train", "export-c", "three-25um-biaxial", "--device", tmp_path / "board.toml", "-o", tmp_path / "c")
     code, out, err = command(*words)
     assert (code, out, "isocharge_model.c" in err) == (0, "", True)
-    assert "#define ISOCHARGE_LEAK_TAU_S {10.0, 10.0, 10.0}" in (tmp_path / "c" / "isocharge_device.h").read_text()
+    header = (tmp_path / "c" / "isocharge_device.h").read_text()
+    assert "#define ISOCHARGE_LEAK_TAU_S {10.0, 10.0, 10.0}" in header
+    assert header.startswith('/* The numbers of the signal chain, from the device file "bench board". Written by')
+    assert 'the numbers of the signal chain, from the device file "bench board" |' in (
+        (tmp_path / "c" / "README.md").read_text()
+    )
     assert "Written by `isocharge train export-c three-25um-biaxial --" in (tmp_path / "c" / "README.md").read_text()
     refused(*words, message="is already there and is not overwritten", code=1)
 
@@ -59,14 +64,28 @@ def test_no_folder_is_left_of_what_cannot_be_written(refused, tmp_path):
     data[2000] ^= 1
     (damaged / "model.onnx").write_bytes(data)
     (tmp_path / "board.toml").write_text("[leak]\ntau_s = {X = 1.0}\n")
+    fields = ", ".join(f'{{name = "{name}", type = "i16"}}' for name in ("x", "y", "z"))
+    described = f'[frames]\nformat = "described"\nsync = "55"\nlength = 7\nfields = [{fields}]\n'
+    (tmp_path / "described.toml").write_text(described + '[channels]\nA = "x"\nB = "y"\nC = "z"\n')
+    (tmp_path / "unnamed.toml").write_text("[channels]\nA = '1'\nB = '2'\nC = '3'\n[gain]\npC_per_unit = 0.5\n")
     for words, message in [
         ((damaged,), "expected sha256"),
         (("no-such-model",), "no model 'no-such-model'"),
         (("three-25um-biaxial", "--device", tmp_path / "board.toml"), "one for each of the electrodes"),
         (("three-25um-biaxial", "--device", tmp_path / "missing.toml"), "cannot be read"),
+        (("four-25um-biaxial", "--device", tmp_path / "described.toml"), 'D = "D": no channel is called that'),
+        (
+            ("four-25um-biaxial", "--device", tmp_path / "unnamed.toml"),
+            "[channels] D: model four-25um-biaxial/1 expects a channel for each of the electrodes",
+        ),
     ]:
         refused("train", "export-c", *words, "-o", tmp_path / "c", message=message)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["board.toml", "damaged"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "board.toml",
+        "damaged",
+        "described.toml",
+        "unnamed.toml",
+    ]
 
 
 def test_the_readme_says_what_works(exports, run_commands, installed, tmp_path, compile_c):
@@ -85,6 +104,7 @@ def test_the_readme_says_what_works(exports, run_commands, installed, tmp_path, 
     assert subprocess.run([program], check=False).returncode == 0
     for path in exports[0].iterdir():
         assert path.stem in text or path.name == "README.md"
+    assert "| the numbers of the signal chain, the defaults, because no device file was given |" in text
 
 
 @pytest.fixture(scope="module")

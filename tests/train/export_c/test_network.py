@@ -39,7 +39,8 @@ def check_agreement(given, expected, tolerance=1e-5):
     assert np.all(np.abs(given - expected) <= tolerance * scale)
 
 
-@pytest.mark.parametrize("model", ["three-25um-biaxial", "four-25um-biaxial"])
+@pytest.mark.first_cases(1)
+@pytest.mark.parametrize("model", ["four-25um-biaxial", "three-25um-biaxial"])
 def test_ten_thousand_noisy_presses_agree_with_onnxruntime(model, build, film):
     rng = np.random.default_rng(0)
     model_film = replace(film, sensor=load_sensor(model))

@@ -109,6 +109,6 @@ def test_good_presses_have_up_to_eight_times_the_noise_and_ten_times_the_weight(
 def test_charges_that_are_not_positive_are_refused(films):
     prior = FilmPrior(replace(films.prior.sensor, piezo=Piezo(8.0, -60.0)), films.prior.probe)
     with pytest.raises(
-        DatasetError, match=r"of the presses give an electrode no positive charge, expected at most 20%"
+        DatasetError, match=r"of the presses have an electrode whose charge is zero or negative, expected at most 20%"
     ):
         draw_film_presses(prior, films.family, films.domain, 2, 30, seed=2)

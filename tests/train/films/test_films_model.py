@@ -110,6 +110,7 @@ def test_the_network_of_a_film_is_the_conditional_network(random_films, sensor):
             np.testing.assert_allclose(answer, expected, rtol=1e-5, atol=2e-5)
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(
     "factor",
     [None, lambda contact: 0.5 * np.exp(0.02 * contact[:, :2] @ [[1.0, -1.0, 0.5, 0.0], [0.0, 1.0, 0.5, -1.0]])],

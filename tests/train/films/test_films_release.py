@@ -74,16 +74,14 @@ def test_the_error_of_a_missing_file_names_the_command_that_writes_it(tmp_path):
 
 
 def test_a_small_file_that_unpacks_to_very_much_is_refused_before_it_is_unpacked():
-    zeros = np.zeros(1 << 26, np.uint8)
-    bomb = _npz({"mean": zeros, "whitening": zeros, "contact": zeros})
-    del zeros
+    bomb = _npz({"mean": np.zeros(100 << 20, np.uint8)})
     tracemalloc.start()
     with pytest.raises(ModelError, match=r"films\.npz: damaged \(.*unpack to more than"):
         films_from_bytes(bomb, "films.npz")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert len(bomb) < 1 << 16
-    assert peak < 3 << 26
+    assert len(bomb) < 1 << 18
+    assert peak < 50 << 20
 
 
 def altered(data, **changes):
@@ -165,9 +163,14 @@ def test_a_short_training_gives_a_model_that_is_served(films, tmp_path):
     card = (released.folder / "card.md").read_text()
     assert "`model.onnx` is the model of the film" in card
     assert f"| position, rms | {model.metadata.made_with['films']['position_rms_mm']:g} mm |" in card
+    unnoticed = model.metadata.unnoticed
+    assert unnoticed.from_mm == 8.0
+    assert 0.5 < unnoticed.total_share < 1.0  # the electrodes lie on one circle
+    assert "## Presses outside the working area" in card
 
 
 @pytest.mark.usefixtures("solved")
+@pytest.mark.slow  # in `make test`, a training of a model for one film is stopped, by the same code
 def test_a_stopped_training_continues_with_the_same_weights(films, tmp_path, monkeypatch):
     monkeypatch.setattr(descent, "SAVE_EVERY_S", 0.0)
     monkeypatch.setattr(descent, "REPORT_EVERY", 10)

@@ -358,7 +358,7 @@ def test_misfit_network_is_wider_for_more_than_four_electrodes():
     assert [default.misfit_widths(count) for count in (3, 4, 5, 8)] == [(64, 64), (64, 64), (96, 96), (96, 96)]
     assert NetworkConfig(hidden=(32, 32), misfit_hidden=(24, 16)).misfit_widths(8) == (24, 16)
     sizes = [FitConfig().for_electrodes(count) for count in (3, 4, 5, 8)]
-    assert [config.network.hidden for config in sizes] == [(96,) * 3, (96,) * 3, (128,) * 3, (128,) * 3]
+    assert [config.network.hidden for config in sizes] == [(96,) * 3, (96,) * 3, (128,) * 4, (128,) * 4]
     assert [config.training.steps for config in sizes] == [2_000, 2_000, 6_000, 6_000]
 
 
