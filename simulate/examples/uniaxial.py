@@ -7,16 +7,22 @@ charge of an electrode is nearly the same for presses in different directions at
 the charges differ strongly. The command ``python simulate/examples/paper -o paper`` draws all figures of the paper.
 """
 
+from dataclasses import replace
+
 import matplotlib.pyplot as plt
 import numpy as np
 
 from isocharge.simulate import ForwardMap, Polygon, load_sensor
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
 
+# The piezoelectric coefficients do not change the stress, so both sensors use the same solved presses.
+biaxial_map = ForwardMap.build(
+    load_sensor("three-25um-biaxial"), Polygon.triangle(4.0), radius=12.0, force_range=(0.9, 1.1)
+)
 figure, pair = plt.subplots(1, 2, figsize=(11.0, 4.4), layout="constrained", sharey=True)
 for axes, kind in zip(pair, ("biaxial", "uniaxial"), strict=True):
     sensor = load_sensor(f"three-25um-{kind}")
-    forward_map = ForwardMap.build(sensor, Polygon.triangle(4.0), radius=12.0, force_range=(0.9, 1.1))
+    forward_map = replace(biaxial_map, sensor=sensor)
     lines = Mapping.lines(sensor, "A", angles=np.deg2rad((35.0, 90.0)), length=12.0)
     curves = Curves.of(forward_map, lines, force=1.0)
     apart = np.ptp(curves.own_charge, axis=0) / curves.own_charge.mean(axis=0)

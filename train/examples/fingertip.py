@@ -14,15 +14,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from isocharge.serve import Predictor
-from isocharge.simulate import Finger, Sweep, load_sensor, noise_model, read_dataset, run_sweep
+from isocharge.simulate import Finger, ForwardMap, Sweep, load_sensor, noise_model, read_dataset
+from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train import FitConfig, TrainingConfig, fit, release
 
 sensor = load_sensor("four-25um-biaxial")
-finger = Finger(6.0)
+film = ForwardMap.build(sensor, Finger(6.0))
 with tempfile.TemporaryDirectory() as temporary:
     folder = Path(temporary)
-    training_presses = read_dataset(run_sweep(folder / "presses", sensor, (finger,), Sweep(samples=6000)))
-    fresh_presses = read_dataset(run_sweep(folder / "fresh", sensor, (finger,), Sweep(samples=2000, seed=1)))
+    training_presses = read_dataset(write_sweep(folder / "presses", (film,), Sweep(samples=6000)))
+    fresh_presses = read_dataset(write_sweep(folder / "fresh", (film,), Sweep(samples=2000, seed=1)))
     settings = FitConfig(training=TrainingConfig(steps=1500, misfit_steps=200, misfit_charges=4000))
     finger_model = release(fit(training_presses, settings), folder / "models" / "fingers")
     predictors = {
