@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import zlib
 from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +19,16 @@ from isocharge.common.extras import PACKAGES
 
 ROOT = Path(__file__).parents[1]
 
-LONGEST = ("tests/train", "tests/cli", "tests/test_pages", "tests/test_examples", "tests/test_flags", "tests/test_pip")
+LONGEST = (
+    "tests/train",
+    "tests/cli",
+    "tests/serve/test_pages",
+    "tests/serve/viewer",
+    "tests/test_pages",
+    "tests/test_examples",
+    "tests/test_flags",
+    "tests/test_pip",
+)
 """Folders and files with the longest tests, which begin first."""
 
 settings.register_profile("patient", deadline=None)  # an example may take long on a busy machine
@@ -41,9 +51,10 @@ def pytest_collection_modifyitems(items):
     """Mark all but the first n cases of a test with `first_cases(n)` as slow, before slow tests are deselected.
 
     The files that take longest begin first. Otherwise, one worker could still run such a file when all other workers
-    have finished.
+    have finished. The other files are shuffled, because files that wait for a clock or a process are neighbours: if all
+    workers waited at the same time, the processors would be idle. The order is the same in every run.
     """
-    items.sort(key=lambda item: not item.path.relative_to(ROOT).as_posix().startswith(LONGEST))
+    items.sort(key=_starting_order)
     seen = Counter()
     for item in items:
         if marker := item.get_closest_marker("first_cases"):
@@ -53,6 +64,13 @@ def pytest_collection_modifyitems(items):
                 item.add_marker(pytest.mark.slow)
     gc.freeze()
     gc.enable()
+
+
+def _starting_order(item):
+    """Return the key by which the tests are sorted, which is equal for all tests of a file."""
+    path = item.path.relative_to(ROOT).as_posix()
+    starts_late = not path.startswith(LONGEST)
+    return starts_late, zlib.crc32(path.encode()), path
 
 
 @pytest.fixture(scope="session", autouse=True)
