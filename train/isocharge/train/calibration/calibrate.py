@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-import scipy  # loads a part when it is used
 from threadpoolctl import threadpool_limits
 
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import MeasuredPresses, row_words
 from isocharge.simulate import SideForceMap
+from isocharge.train.calibration import chi_square
 from isocharge.train.calibration.closed_back import CLOSED_BACK_CAUTION, has_closed_back, refuse_closed_back
 from isocharge.train.calibration.diagnosis import (
     FAR_FROM_ALL_FILMS,
@@ -205,7 +205,7 @@ def _scaled_by_scatter(posterior: FilmPosterior) -> tuple[FilmPosterior, list[st
     chi2, degrees_of_freedom = posterior.total
     if degrees_of_freedom == 0.0:
         return posterior, []
-    probability_of_chance = scipy.stats.chi2.sf(chi2, degrees_of_freedom)
+    probability_of_chance = chi_square.probability_above(chi2, degrees_of_freedom)
     if probability_of_chance >= UNCERTAIN_PROBABILITY:
         return posterior, []
     variance_ratio = chi2 / degrees_of_freedom
@@ -242,13 +242,13 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
     is_unexplained = (
         degrees_of_freedom > 0.0
         and chi2 / degrees_of_freedom > UNEXPLAINED_CHI2
-        and scipy.stats.chi2.sf(chi2, degrees_of_freedom) < UNEXPLAINED_PROBABILITY
+        and chi_square.probability_above(chi2, degrees_of_freedom) < UNEXPLAINED_PROBABILITY
     )
 
     # Squared Mahalanobis distance of the estimated film from the film that was expected before the presses.
     deviation = (posterior.parameters - problem.before.parameters) / problem.prior.std
     squared_distance = float(deviation @ np.linalg.solve(problem.before.covariance, deviation))
-    film_probability = scipy.stats.chi2.sf(squared_distance, deviation.size)
+    film_probability = chi_square.probability_above(squared_distance, deviation.size)
     is_improbable = film_probability < STRAINED_PROBABILITY
 
     is_unusual = posterior.imperfect or posterior.bad.any() or film_probability < ODD_PROBABILITY

@@ -8,10 +8,10 @@ change the film. Presses whose residuals are still too large are then left out a
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.sensor.film_prior import FilmPrior
+from isocharge.train.calibration import chi_square
 from isocharge.train.calibration.contacts import with_force
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.fit_problem import BAD_PROBABILITY, FitProblem, SettledFit, SolvedFilm
@@ -231,10 +231,10 @@ def _is_suspicious(chi2: Array, degrees_of_freedom: Array) -> bool:
         chi2: Sum of squared residuals of each press, shape (n,).
         degrees_of_freedom: Number of redundant measurements of each press, shape (n,).
     """
-    press_probability = scipy.stats.chi2.sf(chi2, np.maximum(degrees_of_freedom, 1.0))
+    press_probability = chi_square.probability_above(chi2, np.maximum(degrees_of_freedom, 1.0))
     # The smallest of n probabilities is multiplied by n, because the worst press is selected among n (Bonferroni).
     worst_press_probability = press_probability.min() * len(chi2)
-    total_probability = scipy.stats.chi2.sf(chi2.sum(), max(degrees_of_freedom.sum(), 1.0))
+    total_probability = chi_square.probability_above(chi2.sum(), max(degrees_of_freedom.sum(), 1.0))
     return bool(min(worst_press_probability, total_probability) < SUSPICIOUS_PROBABILITY)
 
 
@@ -267,9 +267,9 @@ def _agreeing_presses(
     degrees_of_freedom = np.maximum(degrees_of_freedom, 1.0)
     # The residuals of all presses may be larger than expected. The limit for bad presses is then increased by the same
     # factor.
-    expected_median = np.maximum(scipy.stats.chi2.median(degrees_of_freedom), 0.1)
+    expected_median = np.maximum(chi_square.value_exceeded_with(0.5, degrees_of_freedom), 0.1)
     typical_ratio = max(1.0, float(np.median(chi2 / expected_median)))
-    limit = scipy.stats.chi2.isf(BAD_PROBABILITY / len(data), degrees_of_freedom) * typical_ratio
+    limit = chi_square.value_exceeded_with(BAD_PROBABILITY / len(data), degrees_of_freedom) * typical_ratio
     is_good = chi2 <= limit
     if np.mean(~is_good) > MAX_BAD_SHARE:  # no film explains most presses: leave out none of them
         is_good = np.ones_like(is_good)

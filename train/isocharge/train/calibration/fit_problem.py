@@ -13,10 +13,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # loads a part when it is used
 from scipy.optimize import least_squares
 
 from isocharge.common.arrays import Array, Booleans
+from isocharge.train.calibration import chi_square
 from isocharge.train.calibration.contacts import (
     AdjustedContacts,
     adjust_contacts,
@@ -316,7 +316,7 @@ class FitProblem:
         covariance = np.eye(residual_count) + jacobian @ mixture.covariance @ jacobian.swapaxes(1, 2)
         weighted_residual = np.linalg.solve(covariance, residual[:, :, None])[:, :, 0]
         chi2 = (residual * weighted_residual).sum(axis=1)
-        limit = scipy.stats.chi2.isf(BAD_PROBABILITY / len(data), np.maximum(degrees_of_freedom, 1.0))
+        limit = chi_square.value_exceeded_with(BAD_PROBABILITY / len(data), np.maximum(degrees_of_freedom, 1.0))
         return np.asarray(chi2 <= limit)
 
     def mixture(self, data: PressData, solved: SolvedFilm) -> Mixture:

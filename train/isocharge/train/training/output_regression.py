@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 
 import numpy as np
-from scipy.stats import norm
 
 from isocharge.common.arrays import Array
 from isocharge.common.perceptron import Layer, Perceptron, evaluate, evaluate_hidden_layers
@@ -132,8 +132,9 @@ def fit_std(network: FoldedNetwork, charge: Array, contact: Array) -> FoldedNetw
     log_contact = np.column_stack([contact[:, :2], np.log(contact[:, 2])])
     # Mean square of a standard normal variable that is limited to plus or minus `CORE_ERROR`: the integral of the
     # square within the limits, plus the squared limit times the probability beyond them.
-    probability_within = norm.cdf(CORE_ERROR) - norm.cdf(-CORE_ERROR)
-    square_within = probability_within - 2.0 * CORE_ERROR * norm.pdf(CORE_ERROR)
+    normal = NormalDist()
+    probability_within = normal.cdf(CORE_ERROR) - normal.cdf(-CORE_ERROR)
+    square_within = probability_within - 2.0 * CORE_ERROR * normal.pdf(CORE_ERROR)
     limited_mean_square = square_within + CORE_ERROR**2 * (1.0 - probability_within)
 
     def std_targets(outputs: Array) -> Array:
