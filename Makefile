@@ -53,13 +53,15 @@ bench: $(VENV)/installed
 soak: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_soak.py
 
+LONGER := --config train/configs/release.toml
+
 # The released models, trained again; fails if one is already there.
 release: $(VENV)/installed
-	$(BIN)/isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
-	$(BIN)/isocharge train fit --sensor four-25um-biaxial --radius auto -o models/four-25um-biaxial
-	$(BIN)/isocharge train fit --sensor four-25um-uniaxial --radius auto -o models/four-25um-uniaxial
-	$(BIN)/isocharge train fit --sensor four-25um-biaxial-15mm --radius 15 -o models/four-25um-biaxial-15mm
-	$(BIN)/isocharge train fit --sensor three-25um-biaxial-12mm --radius 12 -o models/three-25um-biaxial-12mm
+	$(BIN)/isocharge train fit --sensor three-25um-biaxial $(LONGER) -o models/three-25um-biaxial
+	$(BIN)/isocharge train fit --sensor four-25um-biaxial --radius auto $(LONGER) -o models/four-25um-biaxial
+	$(BIN)/isocharge train fit --sensor four-25um-uniaxial --radius auto $(LONGER) -o models/four-25um-uniaxial
+	$(BIN)/isocharge train fit --sensor four-25um-biaxial-15mm --radius 15 $(LONGER) -o models/four-25um-biaxial-15mm
+	$(BIN)/isocharge train fit --sensor three-25um-biaxial-12mm --radius 12 $(LONGER) -o models/three-25um-biaxial-12mm
 	$(BIN)/isocharge train fit --sensor eight-25um-biaxial --radius 15 -o models/eight-25um-biaxial
 	$(BIN)/isocharge train fit --sensor six-25um-biaxial-30mm --radius 30 -o models/six-25um-biaxial-30mm
 	$(BIN)/isocharge train fit --sensor eight-25um-biaxial-36mm --radius 36 -o models/eight-25um-biaxial-36mm

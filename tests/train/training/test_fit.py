@@ -351,6 +351,8 @@ def test_keys_left_out_keep_their_defaults(tmp_path):
     config = load_config(write(tmp_path, "[training]\nsteps = 7\n"))
     assert config == FitConfig(network=NetworkConfig(), training=TrainingConfig(steps=7))
     assert load_config(CONFIGS / "quick.toml").network == NetworkConfig()
+    released = TrainingConfig(steps=2_000, misfit_steps=3_000, misfit_charges=80_000)
+    assert load_config(CONFIGS / "release.toml").training == released
 
 
 def test_misfit_network_is_wider_for_more_than_four_electrodes():
@@ -359,7 +361,9 @@ def test_misfit_network_is_wider_for_more_than_four_electrodes():
     assert NetworkConfig(hidden=(32, 32), misfit_hidden=(24, 16)).misfit_widths(8) == (24, 16)
     sizes = [FitConfig().for_electrodes(count) for count in (3, 4, 5, 8)]
     assert [config.network.hidden for config in sizes] == [(96,) * 3, (96,) * 3, (128,) * 4, (128,) * 4]
-    assert [config.training.steps for config in sizes] == [2_000, 2_000, 6_000, 6_000]
+    assert [config.training.steps for config in sizes] == [1_200, 1_200, 6_000, 6_000]
+    assert [config.training.misfit_steps for config in sizes] == [1_500, 1_500, 3_000, 3_000]
+    assert [config.training.misfit_charges for config in sizes] == [40_000, 40_000, 80_000, 80_000]
 
 
 def test_focused_distance_is_a_mean_with_smaller_weights_for_long_targets():

@@ -27,7 +27,7 @@ COARSE_ERROR = 0.05
 The error is below 0.5 % up to two thirds of the film radius.
 """
 
-COARSE_RESOLUTION = Resolution(order=5, around=8, rings=6, rim=2)
+COARSE_RESOLUTION = Resolution(order=4, around=8, rings=10, rim=2)
 """Mesh of the solves."""
 
 RIM_GAP = 1.2
@@ -36,10 +36,10 @@ RIM_GAP = 1.2
 The mesh does not resolve narrower gaps.
 """
 
-DISTANCES = 12
+DISTANCES = 10
 """Number of distances from the centre at which presses are solved."""
 
-FORCES = 4
+FORCES = 3
 """Number of forces at which presses are solved."""
 
 
@@ -51,7 +51,7 @@ def outermost_distance(film: Film, probe: Probe) -> float:
 def whole_film_map(
     sensor: Sensor, probe: Probe, force_range: tuple[float, float], *, executor: Executor | None = None
 ) -> ForwardMap:
-    """Solve a coarse forward map of nearly the whole film, which takes about 5 s of CPU time.
+    """Solve a coarse forward map of nearly the whole film, which takes about 3 s of CPU time.
 
     Args:
         sensor: Sensor with an axisymmetric film.

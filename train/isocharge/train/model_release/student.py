@@ -31,7 +31,7 @@ def student_config(weights: Literal["float32", "int8"] = "float32") -> FitConfig
     """
     return FitConfig(
         network=NetworkConfig(hidden=(30, 30), misfit_hidden=(34, 34), weights=weights),
-        training=TrainingConfig(steps=16_000, misfit_steps=24_000),
+        training=TrainingConfig(steps=16_000, misfit_steps=24_000, misfit_charges=80_000),
     )
 
 

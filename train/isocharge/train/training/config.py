@@ -24,6 +24,8 @@ class DefaultSizes(NamedTuple):
         misfit_width: Width of the hidden layers of the misfit network.
         layers: Number of hidden layers of each network.
         steps: Number of optimiser steps of the contact network.
+        misfit_steps: Number of optimiser steps of the misfit network.
+        misfit_charges: Number of sets of charges from which the misfit network learns.
         rate_factor: Factor on the learning rate of the contact network. With more electrodes, the loss of a training
             with the whole rate increases at times.
     """
@@ -32,6 +34,8 @@ class DefaultSizes(NamedTuple):
     misfit_width: int
     layers: int
     steps: int
+    misfit_steps: int
+    misfit_charges: int
     rate_factor: float
 
     @classmethod
@@ -40,10 +44,14 @@ class DefaultSizes(NamedTuple):
         return FEW_ELECTRODE_SIZES if n_electrode <= FEW_ELECTRODES else MANY_ELECTRODE_SIZES
 
 
-FEW_ELECTRODE_SIZES = DefaultSizes(width=96, misfit_width=64, layers=3, steps=2_000, rate_factor=1.0)
+FEW_ELECTRODE_SIZES = DefaultSizes(
+    width=96, misfit_width=64, layers=3, steps=1_200, misfit_steps=1_500, misfit_charges=40_000, rate_factor=1.0
+)
 """Default sizes for at most `FEW_ELECTRODES` electrodes."""
 
-MANY_ELECTRODE_SIZES = DefaultSizes(width=128, misfit_width=96, layers=4, steps=6_000, rate_factor=0.5)
+MANY_ELECTRODE_SIZES = DefaultSizes(
+    width=128, misfit_width=96, layers=4, steps=6_000, misfit_steps=3_000, misfit_charges=80_000, rate_factor=0.5
+)
 """Default sizes for more electrodes, whose working areas are larger and whose charges have more dimensions."""
 
 Width = Annotated[int, Meta(ge=1, le=4096)]
@@ -116,8 +124,9 @@ class TrainingConfig(Settings, frozen=True):
 
     Attributes:
         steps: Number of optimiser steps of the contact network; None for the number in `DefaultSizes`.
-        misfit_steps: Number of optimiser steps of the misfit network.
-        misfit_charges: Number of charges from which the misfit network learns.
+        misfit_steps: Number of optimiser steps of the misfit network; None for the number in `DefaultSizes`.
+        misfit_charges: Number of sets of charges from which the misfit network learns; None for the number in
+            `DefaultSizes`.
         batch: Number of samples in a batch.
         learning_rate: Largest learning rate of the optimiser SOAP.
         patience: Number of steps without a better validation score after which the training stops. The network then
@@ -131,8 +140,8 @@ class TrainingConfig(Settings, frozen=True):
     """
 
     steps: Count | None = None
-    misfit_steps: Count = 3_000
-    misfit_charges: Annotated[int, Meta(ge=1_000, le=10_000_000)] = 80_000
+    misfit_steps: Count | None = None
+    misfit_charges: Annotated[int, Meta(ge=1_000, le=10_000_000)] | None = None
     batch: Annotated[int, Meta(ge=1, le=1_000_000)] = 512
     learning_rate: Annotated[float, Meta(gt=0.0, lt=1.0, description="a number between 0 and 1")] = 2e-2
     patience: Count = 3_000
@@ -141,9 +150,17 @@ class TrainingConfig(Settings, frozen=True):
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
     threads: Annotated[int, Meta(ge=1, le=64)] = 1
 
-    def contact_steps(self, n_electrode: int) -> int:
+    def contact_step_count(self, n_electrode: int) -> int:
         """Return the number of optimiser steps of the contact network for a number of electrodes."""
         return self.steps if self.steps is not None else DefaultSizes.of(n_electrode).steps
+
+    def misfit_step_count(self, n_electrode: int) -> int:
+        """Return the number of optimiser steps of the misfit network for a number of electrodes."""
+        return self.misfit_steps if self.misfit_steps is not None else DefaultSizes.of(n_electrode).misfit_steps
+
+    def misfit_charge_count(self, n_electrode: int) -> int:
+        """Return the number of sets of charges from which the misfit network learns, for a number of electrodes."""
+        return self.misfit_charges if self.misfit_charges is not None else DefaultSizes.of(n_electrode).misfit_charges
 
     @property
     def noise_model(self) -> NoiseModel:
@@ -163,12 +180,18 @@ class FitConfig(Settings, frozen=True):
 
     def for_electrodes(self, n_electrode: int) -> "FitConfig":
         """Return the settings with numbers instead of the default sizes, which depend on the number of electrodes."""
-        contact_widths = self.network.contact_widths(n_electrode)
-        misfit_widths = self.network.misfit_widths(n_electrode)
-        return FitConfig(
-            network=replace(self.network, hidden=contact_widths, misfit_hidden=misfit_widths),
-            training=replace(self.training, steps=self.training.contact_steps(n_electrode)),
+        network = replace(
+            self.network,
+            hidden=self.network.contact_widths(n_electrode),
+            misfit_hidden=self.network.misfit_widths(n_electrode),
         )
+        training = replace(
+            self.training,
+            steps=self.training.contact_step_count(n_electrode),
+            misfit_steps=self.training.misfit_step_count(n_electrode),
+            misfit_charges=self.training.misfit_charge_count(n_electrode),
+        )
+        return FitConfig(network, training)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as tables for JSON."""

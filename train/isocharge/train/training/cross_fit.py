@@ -38,7 +38,7 @@ from isocharge.train.data.presses import (
     folds_by_place,
     presses_sha256,
 )
-from isocharge.train.training.config import FitConfig, TrainingConfig
+from isocharge.train.training.config import MANY_ELECTRODE_SIZES, FitConfig, TrainingConfig
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fit import contact_stage, threads_and_seed, train_perceptron
@@ -54,6 +54,9 @@ N_FOLDS = 5
 
 CHANNELS = (3, 8)
 """Smallest and largest number of channels."""
+
+DEFAULT_LARGEST_STEPS = 2_000
+"""Default of the largest number of steps, unless the default for simulated presses is larger."""
 
 FIRST_STEPS = 1_200
 """Number of steps that is tried first. It is doubled as long as the validation score improves, because networks soon
@@ -108,7 +111,7 @@ def fit_presses(
         TrainingError: If the loss is not finite.
     """
     settings = (config or FitConfig()).checked()
-    training = settings.training
+    training = _with_defaults_for_measured(settings.training, presses.charge_pC.shape[1])
     usable = usable_presses(presses)
     labelled = LabelledPresses(usable.contact, usable.charge_pC, measured=True)
     domain = PressedArea.of(labelled.contact)
@@ -239,6 +242,24 @@ def _std_factor(deviation: Array) -> float:
     return float(np.sqrt(one_std * two_std / TWO_STD_LIMIT))
 
 
+def _with_defaults_for_measured(config: TrainingConfig, n_electrode: int) -> TrainingConfig:
+    """Return the settings with a default for each number of steps or charges that is not given.
+
+    The defaults are larger than for simulated presses of a few electrodes, because measured presses are few and noisy.
+
+    Args:
+        config: Settings of the training.
+        n_electrode: Number of electrodes.
+    """
+    default_steps = max(config.contact_step_count(n_electrode), DEFAULT_LARGEST_STEPS)
+    return structs.replace(
+        config,
+        steps=config.steps or default_steps,
+        misfit_steps=config.misfit_steps or MANY_ELECTRODE_SIZES.misfit_steps,
+        misfit_charges=config.misfit_charges or MANY_ELECTRODE_SIZES.misfit_charges,
+    )
+
+
 def _train_members(
     members: list[InverseNetwork],
     presses: LabelledPresses,
@@ -288,7 +309,7 @@ def _train_members(
         return descent
 
     first_member = members[0]
-    largest_steps = config.contact_steps(first_member.n_electrode)
+    largest_steps = config.contact_step_count(first_member.n_electrode)
     steps = _train_with_best_steps(first_member.contact, partial(train, 0), largest_steps)
     for fold_index in range(1, len(members)):
         train(fold_index, steps)
@@ -398,7 +419,7 @@ def _distillation_stage(
         network.contact,
         loss,
         score,
-        max(config.contact_steps(network.n_electrode) // 2, 1),
+        max(config.contact_step_count(network.n_electrode) // 2, 1),
         slow_parameters=(network.contact.skip.weight,),
     )
 
@@ -417,11 +438,11 @@ def _misfit_examples(
         config: Number of charges and seed.
 
     Returns:
-        Charges, pC, and residuals in standard deviations of the noise, shape (2, misfit_charges, n_electrode).
+        Charges, pC, and residuals in standard deviations of the noise, shape (2, n, n_electrode).
     """
     rng = np.random.default_rng(config.seed)
     planes = LocalPlanes.through(domain.to_unit(presses.contact), noise.level(presses.charge))
-    chosen_rows = rng.integers(len(presses), size=config.misfit_charges)
+    chosen_rows = rng.integers(len(presses), size=config.misfit_charge_count(presses.charge.shape[1]))
     _, charge = draw_charges(rng, presses.charge[chosen_rows], presses.charge, noise)
     residual = planes.residuals(noise.level(charge))
     return np.stack([charge, residual])

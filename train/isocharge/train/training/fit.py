@@ -58,7 +58,7 @@ WARM_UP_FRACTION = 0.15
 ROUNDED_FRACTION = 0.25
 """Number of steps after the hidden weights are rounded, relative to the number of steps before, dimensionless."""
 
-N_STD_PRESSES = 60_000
+N_STD_PRESSES = 30_000
 """Number of presses with noise to which the standard deviations of a trained network are fitted."""
 
 
@@ -299,7 +299,7 @@ def contact_stage(
         teacher: Model whose answers are learned; None to learn the contacts of the presses.
     """
     domain = network.domain
-    steps = config.contact_steps(network.n_electrode)
+    steps = config.contact_step_count(network.n_electrode)
     warm_up_steps = round(WARM_UP_FRACTION * steps)
     charge = as_tensor(train.charge)
     target = as_tensor(domain.to_unit(train.contact))

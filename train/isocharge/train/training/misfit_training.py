@@ -86,7 +86,7 @@ class MisfitExamples:
             self.split.train,
             self.split.field,
             self._noise(),
-            self.config.misfit_charges,
+            self._charge_count,
             self.config.seed,
             options=self._options,
         )
@@ -106,7 +106,7 @@ class MisfitExamples:
             return inner_examples
         seed = self.config.seed
         outside_share = MANY_OUTSIDE_SHARE if self._has_many_electrodes else OUTSIDE_SHARE
-        n_outside = round(outside_share * self.config.misfit_charges)
+        n_outside = round(outside_share * self._charge_count)
         draw = partial(
             draw_outside_examples,
             outside.draw(N_OUTSIDE_PRESSES, seed).charge,
@@ -121,6 +121,11 @@ class MisfitExamples:
         # Arrays of examples have the shape (2, n, n_electrode). The second axis is shuffled for the validation.
         examples = np.concatenate([inner_examples[:, n_outside:], outside_examples], axis=1)
         return np.random.default_rng(seed).permutation(examples, axis=1)
+
+    @property
+    def _charge_count(self) -> int:
+        """Number of examples."""
+        return self.config.misfit_charge_count(self.features.charge_features.n_electrode)
 
     @property
     def _has_many_electrodes(self) -> bool:
@@ -192,6 +197,5 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
         validation_loss = distance(slice(n_train, None)).item()
         return validation_loss, f"{validation_loss:.4f} on watched charges"
 
-    return TrainingStage(
-        "misfit", network.misfit_vector, loss, score, config.misfit_steps, rate_factor=MISFIT_RATE_FACTOR
-    )
+    steps = config.misfit_step_count(network.n_electrode)
+    return TrainingStage("misfit", network.misfit_vector, loss, score, steps, rate_factor=MISFIT_RATE_FACTOR)
