@@ -50,7 +50,7 @@ class Regressor(Protocol):
         """Fit the method to presses.
 
         Args:
-            charge: Shape (n, n_electrode), pC.
+            charge: Charges, shape (n, n_electrode), pC.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Raises:
@@ -131,7 +131,7 @@ class ComparedMethod:
         """Return the inputs of the method.
 
         Args:
-            charge: Shape (n, n_electrode), pC.
+            charge: Charges, shape (n, n_electrode), pC.
             force: True forces, shape (n,), N.
 
         Returns:

@@ -138,7 +138,7 @@ class ReleasedModel(GivenMethod):
         """Estimate contacts with all outputs.
 
         Args:
-            charge: Shape (n, n_electrode), pC.
+            charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
             Contact (x, y, F), shape (n, 3), mm and N; its standard deviations, shape (n, 3); misfit, shape (n, 1).

@@ -95,7 +95,7 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         """Fit ln(Q / F) of the presses with small forces by Chebyshev polynomials of x and y, and tabulate the slopes.
 
         Args:
-            charge: Shape (n, n_electrode), pC.
+            charge: Charges, shape (n, n_electrode), pC.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
@@ -172,7 +172,7 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
             position: Positions relative to the radius, shape (n, 2).
 
         Returns:
-            Shape (n, n_term).
+            Products, shape (n, n_term).
         """
         # All products, in the order of their degrees in x and then in y; those above the total degree are removed.
         products = chebyshev.chebvander2d(position[:, 0], position[:, 1], [self.degree, self.degree])

@@ -362,7 +362,7 @@ class Posterior:
             log_force: Logarithms of the forces, shape (n,).
 
         Returns:
-            Shape (n,), 1/mm.
+            Inverse standard deviations, shape (n,), 1/mm.
         """
         force_weights = self.charges.force_weights(log_force)
         gradients = self.charges.scaled_gradients(onto_disk(cells.centre, self.radius))
@@ -381,7 +381,7 @@ class Posterior:
         The integral at each position is computed by Gauss-Legendre quadrature.
 
         Args:
-            position: Shape (n, 2), mm.
+            position: Positions, shape (n, 2), mm.
             charge: Charges with noise, shape (n, n_electrode), pC.
 
         Returns:
@@ -416,7 +416,7 @@ def _moments(press: Integers, position: Array, log_force: Array, log_weight: Arr
 
     Args:
         press: Number of the press of each position, ascending, shape (n_position,).
-        position: Shape (n_position, 2), mm.
+        position: Positions, shape (n_position, 2), mm.
         log_force: Logarithms of the forces at each position, shape (n_position, n_node).
         log_weight: Logarithms of the weights of these contacts, shape (n_position, n_node).
 

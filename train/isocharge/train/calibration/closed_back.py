@@ -117,7 +117,7 @@ def _closed_charges(charges: FilmCharges, pretension_share: float, contact: Arra
         contact: Presses (x, y, F), shape (n, 3), mm and N.
 
     Returns:
-        Shape (n, n_electrode), pC.
+        Charges, shape (n, n_electrode), pC.
     """
     prior = charges.prior
     parameters = prior.mean.copy()

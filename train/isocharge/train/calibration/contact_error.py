@@ -156,7 +156,7 @@ class ContactSensitivity:
         alone causes, so that the mean is dimensionless.
 
         Returns:
-            Shape (n_unknown, n_unknown).
+            Matrix S, shape (n_unknown, n_unknown).
         """
         unit = self.noise_error
         units = np.array([unit.position_mm, unit.position_mm, 0.01 * unit.force_percent])
@@ -235,7 +235,7 @@ def _information_roots(
     arguments are those of `information_of`.
 
     Returns:
-        Shape (n, n_electrode + 3, n_unknown).
+        Matrices R, shape (n, n_electrode + 3, n_unknown).
     """
     contact_slopes, film_slopes = _whitened_slopes(problem, parameters, contact)
 

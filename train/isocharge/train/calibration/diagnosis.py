@@ -195,7 +195,7 @@ def _charge_ratios(charge: Array) -> Array:
         charge: Charges, shape (n, n_electrode), pC; NaN where none was measured.
 
     Returns:
-        Shape (n_electrode,).
+        Ratios, shape (n_electrode,).
     """
     typical = np.nanmedian(np.abs(charge), axis=0)
     typical_of_others = [np.median(np.delete(typical, channel)) for channel in range(typical.size)]

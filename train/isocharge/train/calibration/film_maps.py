@@ -110,7 +110,7 @@ class FilmMaps:
             force_derivative: Derivatives of the charges with respect to ln F, shape (n, n_electrode), pC.
 
         Returns:
-            Shape (n, n_electrode, n_parameter), pC per unit of the parameter.
+            Derivatives, shape (n, n_electrode, n_parameter), pC per unit of the parameter.
         """
         pretension = parameters[self.prior.index("pretension")]
         derivatives = {name: self.difference(name, parameters, contact, charge) for name in STEPPED}
@@ -146,7 +146,7 @@ class FilmMaps:
             charge: Charges of these contacts, shape (n, n_electrode), pC.
 
         Returns:
-            Shape (n, n_electrode), pC per unit of the parameter.
+            Derivatives, shape (n, n_electrode), pC per unit of the parameter.
         """
         index = self.prior.index(name)
         _, upper_bounds = self.prior.bounds
@@ -171,7 +171,7 @@ def log_force_derivative(film: ForwardMap, contact: Array) -> Array:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
     Returns:
-        Shape (n, n_electrode), pC.
+        Derivatives, shape (n, n_electrode), pC.
     """
     _, _, log_force_step = CONTACT_STEPS
     force_factor = np.array([1.0, 1.0, np.exp(log_force_step)])  # changes only the force of (x, y, F)

@@ -384,7 +384,7 @@ class FitProblem:
                 They are zero otherwise.
 
         Returns:
-            Shape (n, n_electrode + 3, n_unknown).
+            Derivatives, shape (n, n_electrode + 3, n_unknown).
         """
         layout = self.layout
         film_unknowns = layout.film if with_coefficients else layout.parameters

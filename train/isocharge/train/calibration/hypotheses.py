@@ -67,7 +67,7 @@ class Hypothesis:
             layout: Layout of the unknowns.
 
         Returns:
-            Shape (n_unknown, n_unknown). It is zero for the parameters of the film.
+            Covariance, shape (n_unknown, n_unknown). The entries of the parameters of the film are zero.
         """
         # Modes, traces and nuisances are independent.
         variance = np.zeros(layout.count)

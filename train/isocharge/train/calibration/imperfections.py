@@ -155,7 +155,7 @@ def log_unevenness(log_tension_derivative: Array) -> Array:
         log_tension_derivative: d ln Q / d ln T, shape (n, n_electrode).
 
     Returns:
-        Shape (n, n_electrode), dimensionless.
+        Derivatives, shape (n, n_electrode), dimensionless.
     """
     x = -log_tension_derivative
     return np.asarray(x * (1.0 - np.clip(1.0 - 0.5 * x, 0.0, 1.0) ** SLACKENING))

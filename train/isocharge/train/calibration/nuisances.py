@@ -194,7 +194,7 @@ def nuisance_derivatives(data: PressData, pretension_derivative: Array) -> Array
             1/MPa.
 
     Returns:
-        Shape (n, n_electrode + 3, n_nuisance).
+        Derivatives, shape (n, n_electrode + 3, n_nuisance).
     """
     rig_derivative = np.zeros((len(data), 3))  # nuisances do not change the contact that the rig measured
     derivatives = []

@@ -117,7 +117,7 @@ class PressData:
         Only the last residual of each press, which is that of the force, depends on the measured force.
 
         Returns:
-            Shape (n, n_electrode + 3).
+            Derivatives, shape (n, n_electrode + 3).
         """
         _, _, force_weight = self.contact_weight.T
         derivative = np.zeros(self.measured.shape)
@@ -163,7 +163,7 @@ class PressData:
             charge_slopes: Derivatives of the charges with respect to the contact, shape (n, n_electrode, 3).
 
         Returns:
-            Shape (n, n_electrode + 3, 3).
+            Derivatives, shape (n, n_electrode + 3, 3).
         """
         rig_slopes = self.contact_weight[:, :, None] * np.eye(3)
         return np.concatenate([self.weight[:, :, None] * charge_slopes, rig_slopes], axis=1)

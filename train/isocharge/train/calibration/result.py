@@ -141,7 +141,7 @@ class CalibrationResult:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Shape (n, n_electrode), dimensionless. They contain half of the friction of the presses; see `SideForces`.
+            Factors, shape (n, n_electrode). They contain half of the friction of the presses; see `SideForces`.
         """
         factor = self.problem.charges.factor(unknowns, contact)
         if self.side_forces is None:

@@ -162,7 +162,7 @@ def _outer(charge_gain: Array, charge_error: Array) -> Array:
         charge_error: One standard deviation of the error, shape (n, n_electrode), pC.
 
     Returns:
-        Shape (n, 3, 3).
+        Covariances of (x, y, ln F), shape (n, 3, 3).
     """
     shift = np.einsum("nie,ne->ni", charge_gain, charge_error)
     return np.asarray(shift[:, :, None] * shift[:, None, :])

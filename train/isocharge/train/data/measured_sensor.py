@@ -106,7 +106,7 @@ class PressedArea(Domain):
             contact: Contacts (x, y, F), shape (n, 3), mm and N. Contacts with NaN do not count as outside.
 
         Returns:
-            Shape (n,).
+            Whether each contact is outside, shape (n,).
         """
         is_known = ~np.isnan(contact).any(axis=1)
         return np.asarray(is_known & ~self.contains(contact))
@@ -118,7 +118,7 @@ class PressedArea(Domain):
             contact: Contacts (x, y, F), shape (n, 3), mm and N. Contacts with NaN do not lie in the domain.
 
         Returns:
-            Shape (n,).
+            Whether each contact lies in the domain, shape (n,).
         """
         has_force = Domain(np.inf, self.force_range).contains(contact)
         return has_force & inside_polygon(contact[:, 0], contact[:, 1], np.array(self.corners))

@@ -40,7 +40,7 @@ class LabelledPresses:
 
     Attributes:
         contact: (x, y, F), shape (n, 3), mm and N.
-        charge: Shape (n, n_electrode), pC.
+        charge: Charges, shape (n, n_electrode), pC.
         measured: Whether the charges were measured, so that they have noise of their own.
     """
 
@@ -262,7 +262,7 @@ def _count_before(contact: Array) -> Integers:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
     Returns:
-        Shape (n,).
+        Numbers of presses, shape (n,).
     """
     rounded_position = np.round(contact[:, :2], 3) + 0.0  # the addition converts -0.0 into 0.0
     positions, position_of_press, presses_at_position = np.unique(

@@ -80,11 +80,11 @@ class FilmInputs:
         """Compute the inputs of the network.
 
         Args:
-            charge: Shape (n_film, n, n_electrode), pC.
+            charge: Charges, shape (n_film, n, n_electrode), pC.
             parameters: Parameters of the films, shape (n_film, n_parameter).
 
         Returns:
-            Shape (n_film, n, n_electrode).
+            Inputs, shape (n_film, n, n_electrode).
         """
         shift = as_tensor(self.scaling.log_charge_scale(parameters) + self.mean)
         logarithms = evaluate_features(self.charge_features, charge)
@@ -157,7 +157,7 @@ class ConditionalPerceptron(nn.Module):
             context: Contexts of the films, shape (n_film, n_context).
 
         Returns:
-            Shape (n_film, n, n_output).
+            Outputs, shape (n_film, n, n_output).
         """
         return evaluate(self.definition(context), inputs)
 

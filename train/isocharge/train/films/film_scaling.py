@@ -48,10 +48,10 @@ class FilmScaling:
         """Compute the logarithms of the exact factors of the charges, which are 1 for the described film.
 
         Args:
-            parameters: Shape (..., n_parameter).
+            parameters: Parameters of the films, shape (..., n_parameter).
 
         Returns:
-            Shape (..., n_electrode).
+            Logarithms of the factors, shape (..., n_electrode).
         """
         mean_piezo = 0.5 * (_shared(parameters, "d31") + _shared(parameters, "d32"))
         common = _shared(parameters, "young") + mean_piezo
@@ -61,10 +61,10 @@ class FilmScaling:
         """Compute the matrix T of `to_film`, the rotation of the electrodes.
 
         Args:
-            parameters: Shape (..., n_parameter).
+            parameters: Parameters of the films, shape (..., n_parameter).
 
         Returns:
-            Shape (..., 3, 3).
+            Matrices T, shape (..., 3, 3).
         """
         rotation = np.zeros((*parameters.shape[:-1], 3, 3))
         rotation[..., :2, :2] = _rotation(_shared(parameters, "rotation"))
@@ -78,10 +78,10 @@ class FilmScaling:
         The third component is the logarithm of the stiffness.
 
         Args:
-            parameters: Shape (..., n_parameter).
+            parameters: Parameters of the films, shape (..., n_parameter).
 
         Returns:
-            Shape (..., 3).
+            Vectors o, shape (..., 3).
         """
         # A point p moves with the electrodes to R (p - s) + s + ds, where s is the shift in the sensor file and ds the
         # additional shift of the film. The part that does not depend on p is s + ds - R s.
@@ -99,11 +99,11 @@ class FilmScaling:
         The position moves with the electrodes, and the force is proportional to the stiffness.
 
         Args:
-            parameters: Shape (..., n_parameter).
+            parameters: Parameters of the films, shape (..., n_parameter).
             unit: Unit coordinates u with the scales divided out, shape (..., 3).
 
         Returns:
-            Shape (..., 3).
+            Unit coordinates on the other film, shape (..., 3).
         """
         rotated = (self.rotation(parameters) @ unit[..., None])[..., 0]
         return np.asarray(rotated + self.offset(parameters))
@@ -112,10 +112,10 @@ class FilmScaling:
         """Compute the context of films, standardised over the prior.
 
         Args:
-            parameters: Shape (..., n_parameter).
+            parameters: Parameters of the films, shape (..., n_parameter).
 
         Returns:
-            Shape (..., n_context), where n_context is 9 + n_electrode.
+            Contexts, shape (..., n_context), where n_context is 9 + n_electrode.
         """
         return np.asarray((self._raw_context(parameters) - self.statistics.mean) / self.statistics.std)
 

@@ -149,7 +149,7 @@ def _compare(
     Args:
         session: The graph.
         exact: The outputs of the network in double precision.
-        charge: Shape (n, n_electrode), pC.
+        charge: Charges, shape (n, n_electrode), pC.
         floors: Values of x, y and the force below which differences count as absolute differences.
         tolerance_factor: Factor on the tolerances.
 

@@ -56,11 +56,11 @@ def is_flagged(about: ModelMetadata, contact: Array, std: Array, misfit: Array) 
     Args:
         about: Metadata of the model.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        std: Their standard deviations, shape (n, 3).
+        std: Standard deviations of the contacts, shape (n, 3), mm, mm and N.
         misfit: Misfits, shape (n, 1).
 
     Returns:
-        Shape (n,).
+        Whether each answer carries such a flag, shape (n,).
     """
     correlation = np.full_like(std, np.nan)
     columns = np.concatenate([contact, std, misfit, correlation], axis=1).T
