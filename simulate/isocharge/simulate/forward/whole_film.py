@@ -39,7 +39,7 @@ The mesh does not resolve narrower gaps.
 DISTANCES = 10
 """Number of distances from the centre at which presses are solved."""
 
-FORCES = 3
+FORCES = 4
 """Number of forces at which presses are solved."""
 
 
