@@ -46,6 +46,9 @@ POSITION_GRID_MM = 0.5
 FORCE_GRID_N = 0.05
 """Grid to which the forces of proposed presses are rounded, N."""
 
+MIN_LOG_FORCE_RANGE = 0.1
+"""Smallest width of the prior of ln F, so that its standard deviation is not zero for a single force."""
+
 AVOIDED_DISTANCE_MM = 1.0
 """Distance from an avoided position within which no press is proposed, mm."""
 
@@ -67,7 +70,8 @@ class ContactError:
     @classmethod
     def of(cls, covariance: Array) -> "ContactError":
         """Compute the errors of contacts from the covariances of (x, y, ln F), shape (n, 3, 3)."""
-        x_variance, y_variance, log_force_variance = np.einsum("nii->in", covariance)
+        variances = np.diagonal(covariance, axis1=1, axis2=2)  # of x, y and ln F, shape (n, 3)
+        x_variance, y_variance, log_force_variance = variances.T
         position_variance = x_variance + y_variance
         return cls(
             position_mm=float(np.sqrt(position_variance.mean())),
@@ -118,8 +122,10 @@ class ContactSensitivity:
         # Covariance of a contact by noise, from the information of the charges and of the prior. The prior of ln F is
         # uniform, so its standard deviation is its width divided by the root of 12.
         min_force, max_force = domain.force_range
-        log_force_std = max(np.log(max_force / min_force), 0.1) / np.sqrt(12.0)
+        log_force_range = max(np.log(max_force / min_force), MIN_LOG_FORCE_RANGE)
+        log_force_std = log_force_range / np.sqrt(12.0)
         prior_std = np.array([0.5 * domain.radius, 0.5 * domain.radius, log_force_std])
+        # J' J of each contact n: sums over the electrodes k, for each pair of coordinates i and j
         charge_information = np.einsum("nki,nkj->nij", contact_slopes, contact_slopes)
         noise_covariance = np.linalg.inv(charge_information + np.diag(prior_std**-2))
 
@@ -158,10 +164,12 @@ class ContactSensitivity:
         Returns:
             Matrix S, shape (n_unknown, n_unknown).
         """
-        unit = self.noise_error
-        units = np.array([unit.position_mm, unit.position_mm, 0.01 * unit.force_percent])
-        scaled_jacobian = self.contact_jacobian / units[:, None]
-        return np.asarray(np.einsum("nip,niq->pq", scaled_jacobian, scaled_jacobian) / len(scaled_jacobian))
+        noise_error = self.noise_error
+        noise_std = np.array([noise_error.position_mm, noise_error.position_mm, 0.01 * noise_error.force_percent])
+        scaled_jacobian = self.contact_jacobian / noise_std[:, None]
+        # Sum over the contacts n and the components i of the error, for each pair of unknowns p and q
+        sum_of_products = np.einsum("nip,niq->pq", scaled_jacobian, scaled_jacobian)
+        return np.asarray(sum_of_products / len(scaled_jacobian))
 
 
 def spread_contacts(domain: Domain, count: int) -> Array:
@@ -308,7 +316,7 @@ def next_presses(
     # R of each candidate, shape (n_candidate, n_residual, n_unknown)
     information_roots = _information_roots(problem, film.unknowns, candidates, position_std_mm, force_std)
     error_weights = sensitivity.error_weights()
-    covariance = film.unknown_covariance
+    covariance = film.unknown_covariance  # after each round, the covariance that is expected after the chosen presses
     proposed = []
     for _ in range(count):
         best, covariance = _best_candidate(information_roots, covariance, error_weights)
@@ -338,6 +346,7 @@ def _best_candidate(information_roots: Array, covariance: Array, error_weights: 
     weighted_projection = projection @ error_weights @ projection.swapaxes(1, 2)  # R C S C R'
     error_reduction = np.einsum("nij,nji->n", np.linalg.inv(innovation), weighted_projection)  # traces of products
     best = int(np.argmax(error_reduction))
+    # (R C)' (1 + R C R')^-1 (R C) of the best candidate
     covariance_reduction = projection[best].T @ np.linalg.solve(innovation[best], projection[best])
     return best, covariance - covariance_reduction
 

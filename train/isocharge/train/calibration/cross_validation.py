@@ -25,7 +25,7 @@ FOLD_COUNT = 5
 """Number of folds."""
 
 MAX_FITTED_PRESSES = 250
-"""Largest number of presses to which a film is fitted again. More presses would take longer and hardly change it."""
+"""Largest number of presses to which a film is fitted again. More presses take longer and hardly change the film."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,9 @@ def cross_validate(
         at_C: Temperature of the film, degrees Celsius; None if the temperatures of the presses are unknown.
 
     Returns:
-        The presses that can be judged and their answers; None if there are fewer than `FEWEST_MEASURED` of them. A
-        press can be judged if its place, force and charges are known, and if it lies in the domain of the networks.
+        The presses that can be judged, and their answers; None if fewer than `FEWEST_MEASURED` presses can be judged.
+        A press can be judged if its place, force and charges are known, if it was not left out as bad, and if it lies
+        in the domain of the networks.
     """
     is_judged = complete(presses) & ~posterior.bad & ~problem.domain.is_outside(presses.contact)
     if is_judged.sum() < FEWEST_MEASURED:

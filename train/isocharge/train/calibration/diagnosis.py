@@ -25,6 +25,9 @@ The limit is smaller for channels on which films have smaller charges."""
 MIN_REVERSED_RATIO = 0.3
 """Ratio of the median charge of a channel to that of the other channels, above which its sign is checked."""
 
+MIN_TYPICAL_CHARGE_pC = 1e-9
+"""Smallest median charge by which the median charge of another channel is divided, pC."""
+
 MAX_NEGATIVE_FRACTION = 0.8
 """Fraction of negative charges above which a channel counts as reversed."""
 
@@ -77,7 +80,7 @@ OFFSET_STD = 0.6
 The piezoelectric coefficients cause such an offset."""
 
 MIN_CHARGE_pC = 1e-3
-"""Smaller charges, which have no useful logarithm, are set to this value in comparisons of logarithms, pC."""
+"""Lower limit to which charges are raised in comparisons of their logarithms, pC."""
 
 MAX_SQUARED_DEVIATION = 4.0
 """Limit of the squared deviation of a logarithm of charges, which bounds the effect of outliers."""
@@ -86,10 +89,10 @@ MAX_OUTSIDE_FRACTION = 0.2
 """Largest fraction of presses outside the domain for which a misfit is computed."""
 
 CLEARER = 0.25
-"""Ratio of the misfit with the correction of a mistake to that without it, below which the mistake is named."""
+"""Ratio of the misfits with and without the correction of a mistake, below which the mistake is named."""
 
 MAX_MISFIT_RATIO = 2.0
-"""Largest ratio of the misfit of a further mistake to the smallest one at which the further mistake is named, too."""
+"""Largest ratio of the misfit of a mistake to the smallest misfit for which the mistake is named as well."""
 
 AXES = (
     ("they are turned by 90 degrees", np.array([[0.0, -1.0], [1.0, 0.0]])),
@@ -189,7 +192,9 @@ def _check_channel(name: str, charge: Array, ratio: float, smallest_film_ratio: 
 
 
 def _charge_ratios(charge: Array) -> Array:
-    """Return the median charge of each channel divided by the median charge of the other channels.
+    """Return the typical charge of each channel divided by the typical charge of the other channels.
+
+    The typical charge of a channel is the median of the magnitudes of its charges.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC; NaN where none was measured.
@@ -197,9 +202,12 @@ def _charge_ratios(charge: Array) -> Array:
     Returns:
         Ratios, shape (n_electrode,).
     """
-    typical = np.nanmedian(np.abs(charge), axis=0)
-    typical_of_others = [np.median(np.delete(typical, channel)) for channel in range(typical.size)]
-    return np.asarray(typical / np.maximum(typical_of_others, 1e-9))
+    typical_charge = np.nanmedian(np.abs(charge), axis=0)  # shape (n_electrode,)
+    typical_of_others = []
+    for channel in range(typical_charge.size):
+        other_channels = np.delete(typical_charge, channel)
+        typical_of_others.append(np.median(other_channels))
+    return np.asarray(typical_charge / np.maximum(typical_of_others, MIN_TYPICAL_CHARGE_pC))
 
 
 def expected_charges(charges: FilmCharges, contact: Array) -> Array:

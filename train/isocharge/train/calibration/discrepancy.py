@@ -1,8 +1,8 @@
 """Discrepancy of a film: a smooth factor on the charges of each electrode that no parameter describes.
 
-A real film has properties that no parameter describes. Their effects are modelled as a Gaussian process
-for each electrode (Kennedy and O'Hagan 2001) of finite rank, with products of Chebyshev polynomials in the place and
-the logarithm l of the force:
+A real film has properties that no parameter describes. The effects of these properties are modelled as a Gaussian
+process of finite rank for each electrode (Kennedy and O'Hagan 2001). The process is a sum of products of Chebyshev
+polynomials in the place and in the logarithm l of the force:
 
     ln Q_e = ln Q_e(map) + sum c_eijm T_i(x / r) T_j(y / r) T_m(l),    i + j + m <= degree, m <= 2.
 
@@ -30,7 +30,7 @@ FADING = 0.5
 """Ratio of the standard deviations of terms of successive degrees. It is below 1 because the discrepancy is smooth."""
 
 COMMON = 1.0
-"""Ratio of the standard deviation of the part that all electrodes share to that of the part of each electrode.
+"""Standard deviation of the part that all electrodes share, relative to that of the part of each electrode.
 
 Both parts are of similar size in full simulations of imperfect films. The shared part causes errors of the force."""
 
@@ -57,7 +57,7 @@ def terms(contact: Array, domain: Domain) -> Array:
     # Scaled contacts in the unit disk times [-1, 1], to which contacts outside the domain are moved.
     unit_contact = domain.to_unit(contact)
     distance = np.hypot(unit_contact[:, 0], unit_contact[:, 1])
-    unit_contact[:, :2] /= np.maximum(distance, 1.0)[:, None]
+    unit_contact[:, :2] /= np.maximum(distance, 1.0)[:, None]  # changes only positions outside the unit disk
     unit_contact[:, 2] = np.clip(unit_contact[:, 2], -1.0, 1.0)
 
     # Polynomials of each coordinate, shape (n, DEGREE + 1), from which the products are selected by their degrees

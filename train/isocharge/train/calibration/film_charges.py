@@ -48,7 +48,7 @@ class FilmCharges(FilmMaps):
 
     @cached_property
     def modes(self) -> tuple[str, ...]:
-        """Names of the modes of these films. The names are empty if no modes of the family were solved."""
+        """Names of the modes of these films. The tuple is empty if no modes of the family were solved."""
         return tuple(MODES) if self.family.imperfections else ()
 
     @cached_property
@@ -119,8 +119,7 @@ class FilmCharges(FilmMaps):
         Args:
             unknowns: Parameters and coefficients, as in `film`.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            charge: Charges without modes, traces and discrepancy, shape (n, n_electrode), pC. They are computed if
-                absent.
+            charge: Charges without modes, traces and discrepancy, shape (n, n_electrode), pC; None to compute them.
 
         Returns:
             Factors, shape (n, n_electrode), dimensionless.
@@ -134,7 +133,8 @@ class FilmCharges(FilmMaps):
 
         term_coefficients = unknowns[layout.terms]
         if term_coefficients.any():
-            log_factor = terms(contact, self.domain) @ term_coefficients.reshape(term_count(), -1)
+            coefficients_by_term = term_coefficients.reshape(term_count(), -1)  # shape (n_term, n_electrode)
+            log_factor = terms(contact, self.domain) @ coefficients_by_term
             factor = factor * np.exp(log_factor)
         return factor
 
@@ -194,8 +194,9 @@ class FilmCharges(FilmMaps):
         cached = self._cached_modes.get(key)
         if cached is not None and cached.sensor == sensor and np.array_equal(cached.contact, contact):
             return cached
-        modes = cached.modes if cached is not None else None
-        if modes is None:
+        if cached is not None and cached.modes is not None:
+            modes = cached.modes
+        else:
             modes = self.family.imperfections.mode_map(forward_map, self.modes)
         computed = self._computed_mode_charges(modes, forward_map, parameters, contact, charge)
 
@@ -230,6 +231,7 @@ class FilmCharges(FilmMaps):
 
     @cached_property
     def _cached_modes(self) -> dict[tuple[Film, Probe], ModeCharges]:
+        """Cache of `_mode_charges`, by film and probe. The first entry is the oldest one."""
         return {}
 
     def _unevenness(self, pretension: float, mode_coefficients: Array) -> tuple[float, Array]:
@@ -312,6 +314,7 @@ class FilmCharges(FilmMaps):
                 film_jacobian[:, :, layout.parameter(name)] += charge * log_derivative
         film_jacobian *= factor
 
+        # Modes add charge, and an uneven tension multiplies the charge by exp(unevenness * log_unevenness).
         modes = self._mode_charges(parameters, contact, charge)
         _, unevenness_slopes = self._unevenness(self._pretension(parameters), unknowns[layout.modes])
         log_unevenness_charge = (charge * modes.log_unevenness)[:, :, None]
@@ -322,9 +325,12 @@ class FilmCharges(FilmMaps):
         film_jacobian[:, :, young] -= mode_jacobian @ tension_coefficients * self.prior.std[young]
 
         trace_jacobian = trace_charges(film, self._trace_lines, contact)
+        # A coefficient of the discrepancy changes only the charge of its own electrode, so a diagonal matrix is used.
         own_charge = factor * charge[:, :, None] * np.eye(charge.shape[1])  # shape (n, n_electrode, n_electrode)
-        term_jacobian = own_charge[:, :, None, :] * terms(contact, self.domain)[:, None, :, None]
-        term_jacobian = term_jacobian.reshape(*charge.shape, -1)
+        term_values = terms(contact, self.domain)  # shape (n, n_term)
+        # Shape (n, n_electrode, n_term, n_electrode of the coefficient), whose last two axes are joined
+        term_products = own_charge[:, :, None, :] * term_values[:, None, :, None]
+        term_jacobian = term_products.reshape(*charge.shape, -1)
         return np.concatenate([film_jacobian, mode_jacobian, trace_jacobian, term_jacobian], axis=2)
 
     def _without_terms(self, unknowns: Array) -> Array:

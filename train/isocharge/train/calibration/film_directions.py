@@ -18,28 +18,30 @@ from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.data.charge_field import fit_series
 
 DEGREES = ((5, 3), (3, 1), (1, 1))
-"""Degrees of the series in x and y and in ln F. The first ones with `CONTACTS_PER_TERM` are used."""
+"""Degrees of the series in the position and in ln F. The first pair for which there are enough contacts is used."""
 
 CONTACTS_PER_TERM = 2.0
 """Least number of contacts for each coefficient of a series."""
 
 LEAST_MISFIT = 0.5
-"""Root mean square of the misfit by one standard deviation of a direction, over the noise, below which the direction is
-left out. The misfits of a trained network have errors of this size, which smaller directions would explain."""
+"""Effect of a direction on the misfit below which the direction is left out, in units of the noise.
+
+The effect is the root mean square of the misfit that one standard deviation of the direction causes. The misfits of a
+trained network have errors of this size, and directions with a smaller effect would explain these errors."""
 
 MAX_DIRECTIONS = 16
 """Largest number of directions; it limits the time that a touch takes."""
 
 LEAST_VARIANCE = 1e-12
-"""Share of the largest variance of an unknown below which a combination of unknowns counts as known exactly."""
+"""Variance of a combination of unknowns, relative to the largest one, below which it counts as known exactly."""
 
 
 def film_directions(result: CalibrationResult) -> FilmDirections:
     """Compute the directions in which a calibrated film is uncertain when it is used.
 
     A direction is a combination of the unknowns of the film, with a standard deviation of 1. The directions are sorted
-    by the misfit that they cause, and those that cause only a small misfit are left out. The pretension has its own
-    estimate in the service, so the directions are uncorrelated with it.
+    by the misfit that they cause, and directions that cause only a small misfit are left out. The directions are
+    uncorrelated with the pretension, because the service estimates the pretension separately.
 
     Args:
         result: The calibration of the film.
@@ -57,9 +59,11 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
     sensitivity = result.sensitivity
     unknowns = slice(0, n_unknown)
     misfit = sensitivity.misfit_jacobian[:, :, unknowns]
-    _, sizes, combinations = np.linalg.svd(misfit.reshape(-1, n_unknown) @ root, full_matrices=False)
-    is_visible = sizes > LEAST_MISFIT * np.sqrt(len(misfit))
-    visible = combinations[is_visible][:MAX_DIRECTIONS]  # shape (n_direction, n_unknown)
+    misfit_of_root = misfit.reshape(-1, n_unknown) @ root  # M R, one row for each misfit of each contact
+    _, misfit_norms, combinations = np.linalg.svd(misfit_of_root, full_matrices=False)
+    # The norm over all contacts is the root mean square misfit of a contact times the root of their number.
+    is_visible = misfit_norms > LEAST_MISFIT * np.sqrt(len(misfit))
+    visible = combinations[is_visible][:MAX_DIRECTIONS]  # shape (n_direction, n_column of the root)
 
     # Sum over the unknowns u, for each contact n, direction k and electrode e
     log_changes = np.einsum("neu,ku->nke", sensitivity.log_charge_jacobian[:, :, unknowns], visible @ root.T)

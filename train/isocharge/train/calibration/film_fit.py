@@ -155,8 +155,9 @@ def fit_film(
     problem = FitProblem.of(charges, initial, knows_temperature=at_C is not None, friction=friction)
     degrees_of_freedom = _degrees_of_freedom(data)
     every_press = np.ones(len(data), dtype=bool)
-    is_kept = every_press
     no_effects = Hypothesis()
+
+    is_kept = every_press
     solved = problem.solve(data, is_kept, problem.mean, no_effects)
     can_be_judged = len(data) >= MIN_PRESSES_TO_JUDGE
     if can_be_judged and _is_suspicious(solved.contacts.chi2, degrees_of_freedom):
@@ -186,9 +187,9 @@ def refit_film(
     *,
     friction: float = 0.0,
 ) -> FilmPosterior:
-    """Estimate the film again, starting from a previous estimate that was made from similar presses.
+    """Estimate the film from presses, with a search that begins at an estimate from similar presses.
 
-    The search begins at the previous estimate with its most probable hypothesis, so it takes less time than
+    The search also begins with the most probable hypothesis of the previous estimate. It takes less time than
     `fit_film`.
 
     Args:
@@ -277,14 +278,16 @@ def _agreeing_presses(
 
 
 def _log_density_of_mistakes(data: PressData, is_mistake: Booleans) -> float:
-    """Return the logarithm of the probability density of a press that was recorded incorrectly.
+    """Return the logarithm of the probability density of presses that were recorded wrongly.
 
     Args:
-        data: The presses.
-        is_mistake: Which of them were recorded wrongly, shape (n,).
+        data: All presses.
+        is_mistake: Which presses were recorded wrongly, shape (n,).
     """
     charge_count = data.has_charge[is_mistake].sum()
-    return float(LOG_DENSITY_OF_MISTAKE * charge_count + is_mistake.sum() * np.log(MISTAKE_PROBABILITY))
+    log_density_of_charges = LOG_DENSITY_OF_MISTAKE * charge_count
+    log_probability_of_mistakes = is_mistake.sum() * np.log(MISTAKE_PROBABILITY)
+    return float(log_density_of_charges + log_probability_of_mistakes)
 
 
 def _posterior(

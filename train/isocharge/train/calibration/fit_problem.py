@@ -56,7 +56,7 @@ MAX_STEPS = 25
 """Largest number of steps of a fit. A fit that begins at the mean of the prior takes about eight."""
 
 MAX_ROUNDS = 3
-"""Largest number of fits, each with the most probable hypothesis of the one before."""
+"""Largest number of fits. Each fit uses the most probable hypothesis of the previous fit."""
 
 MEAN_OVER_STD = 1.7
 """Mean of an effect that only lowers charges at random, such as a leak, over its standard deviation.
@@ -66,7 +66,7 @@ an effect from a gain.
 """
 
 MAX_LINEAR_STEP = 0.2
-"""Largest change of a parameter, in standard deviations of its prior, after which the derivatives are still used."""
+"""Largest step of a parameter, in prior standard deviations, for which the derivatives are not computed again."""
 
 SMALLEST_DERIVATIVE = 1e-12
 """Smallest length by which the derivatives of the residuals with respect to the force are divided."""
@@ -82,8 +82,8 @@ class SolvedFilm(NamedTuple):
     """The film that explains presses best.
 
     Attributes:
-        unknowns: Its unknowns, parameters in units of their prior standard deviations, shape (n_unknown,).
-        contacts: The contacts adjusted to it.
+        unknowns: Unknowns of the film, shape (n_unknown,). Parameters are in units of their prior standard deviations.
+        contacts: Contacts of the presses, adjusted to the film.
     """
 
     unknowns: Array
@@ -95,8 +95,8 @@ class SettledFit(NamedTuple):
 
     Attributes:
         is_kept: Which presses are kept, shape (n,).
-        solved: The film.
-        mixture: The estimate over all hypotheses.
+        solved: The film that explains the kept presses best.
+        mixture: Estimate of the unknowns, averaged over all hypotheses.
     """
 
     is_kept: Booleans
@@ -192,12 +192,16 @@ class FitProblem:
             hypothesis: Effects that the session may have. Unknowns that the hypothesis excludes stay at their mean.
         """
         data = data.with_force_scatter(hypothesis.force_scatter)
+        root_weight = np.sqrt(weight)  # the residuals are multiplied by the root, because their squares are weighted
+
+        # Only unknowns with a variance are active, that is, changed by the fit.
         covariance = self._prior_covariance(hypothesis)
-        root_weight = np.sqrt(weight)
         active = np.diag(covariance) > 0.0
+        active_covariance = covariance[np.ix_(active, active)]
         has_coefficients = bool(active[self.layout.coefficients].any())
-        whitening = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(active, active)]))
         lower, upper = (bound[active] for bound in self.bounds)
+        # The whitening matrix converts deviations from the prior mean into residuals with the variance 1.
+        whitening = np.linalg.inv(np.linalg.cholesky(active_covariance))
         latest: tuple[Array, SolvedFilm] | None = None
 
         def film_at(active_unknowns: Array) -> SolvedFilm:
@@ -236,11 +240,12 @@ class FitProblem:
             press_rows = derivatives[:, :, active] * root_weight[:, None, None]
             return np.concatenate([press_rows.reshape(-1, active_unknowns.size), whitening])
 
+        start_inside = np.clip(start[active], lower + BOUND_MARGIN, upper - BOUND_MARGIN)
         result = least_squares(
             residual,
-            np.clip(start[active], lower + BOUND_MARGIN, upper - BOUND_MARGIN),
+            start_inside,
             jacobian,
-            (lower, upper),
+            bounds=(lower, upper),
             x_scale=1.0,
             ftol=TOLERANCE,
             xtol=TOLERANCE,

@@ -138,14 +138,16 @@ def _nodes(calibrated: float, lower: float, upper: float) -> Array:
     low = max(lower, calibrated - MAX_PRETENSION_CHANGE_MPa)
     high = min(upper, calibrated + MAX_PRETENSION_CHANGE_MPa)
     angle = np.pi * (np.arange(N_NODES) + 0.5) / N_NODES
-    nodes = 0.5 * (low + high) - 0.5 * (high - low) * np.cos(angle) / np.cos(angle[0])
+    centre = 0.5 * (low + high)
+    half_width = 0.5 * (high - low)
+    nodes = centre - half_width * np.cos(angle) / np.cos(angle[0])  # the division stretches the nodes to both ends
     closest_node = np.abs(nodes - calibrated).argmin()
     nodes[closest_node] = calibrated
     return np.asarray(nodes)
 
 
 def _with_correlations_of(network: FoldedNetwork, other: FoldedNetwork) -> FoldedNetwork:
-    """Replace the correlations of a network by those of the model, because they hardly change with the pretension.
+    """Return a network with the correlations of the model, because correlations hardly change with the pretension.
 
     Args:
         network: Network of the model.

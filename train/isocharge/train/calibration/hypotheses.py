@@ -46,8 +46,8 @@ class Hypothesis:
     Attributes:
         modes: Size of the modes relative to those of typical films, dimensionless.
         discrepancy: Relative size of the discrepancy of the charges, dimensionless.
-        nuisance_stds: Standard deviation of each nuisance before the presses, in its unit, in the order of `NUISANCES`,
-            without the part that known temperatures add.
+        nuisance_stds: Standard deviation of each nuisance before the presses, in the unit of the nuisance and in the
+            order of `NUISANCES`. The part that known temperatures add is not included.
         force_scatter: Relative standard deviation of the forces in addition to that of the rig.
         prior_probability: Probability before the presses.
         traces: Size of the traces that are not described, relative to those of typical films, dimensionless.
@@ -175,11 +175,12 @@ class LinearModel(NamedTuple):
         Args:
             jacobian: Derivatives of the residuals along the directions, shape (n_direction, n_unknown).
             residual: Residuals along the directions, shape (n_direction,).
-            deviation: As in `of`, shape (n_unknown,).
+            deviation: Difference of the unknowns from their mean before the presses, as in `of`, shape (n_unknown,).
             noise_variance: Variance of the additional noise along each direction, shape (n_direction,).
         """
-        removed_share = np.sqrt(noise_variance / (1.0 + noise_variance))
-        removed = LinearModel.of(removed_share[:, None] * jacobian, removed_share * residual, deviation)
+        # The noise removes the share v / (1 + v) of each squared residual. The root scales the residual itself.
+        root_share = np.sqrt(noise_variance / (1.0 + noise_variance))
+        removed = LinearModel.of(root_share[:, None] * jacobian, root_share * residual, deviation)
         log_determinant = float(np.log1p(noise_variance).sum())
         return LinearModel(
             normal=self.normal - removed.normal,
@@ -199,7 +200,7 @@ class LinearModel(NamedTuple):
         return float(-0.5 * (self.square - explained_square) - half_log_determinant)
 
     def posterior(self, prior_covariance: Array) -> tuple[Array, Array]:
-        """Return mean and covariance of the unknowns after the presses.
+        """Return the mean and the covariance of the unknowns after the presses.
 
         Args:
             prior_covariance: Covariance of the unknowns before the presses, shape (n_unknown, n_unknown).
@@ -241,10 +242,12 @@ class _Solution(NamedTuple):
 
     Attributes:
         active: Which unknowns have a variance before the presses, shape (n_unknown,).
-        prior_root: Cholesky factor of the covariance of these unknowns before the presses.
-        precision_factor: Cholesky factor of the inverse of their covariance after the presses.
-        moment: Half the gradient of the sum of squares, in these units.
-        step: Inverse of the precision times `moment`; the mean after the presses is at minus this step.
+        prior_root: Cholesky factor of the covariance of the active unknowns before the presses. It is the unit of the
+            active unknowns in the attributes below.
+        precision_factor: Cholesky factor of the inverse of the covariance of the active unknowns after the presses.
+        moment: Half the gradient of the sum of squares with respect to the active unknowns, shape (n_active,).
+        step: Inverse of the precision times `moment`, shape (n_active,). The presses change the mean by minus this
+            step.
     """
 
     active: Booleans
@@ -261,7 +264,7 @@ class Mixture(NamedTuple):
         mean: Change of the mean by the presses, shape (n_unknown,).
         covariance: Covariance after the presses, shape (n_unknown, n_unknown).
         probabilities: Probability of each hypothesis after the presses.
-        log_evidence: Logarithm of the evidence of the presses, except for a constant.
+        log_evidence: Logarithm of the evidence of the presses, up to a constant.
     """
 
     mean: Array

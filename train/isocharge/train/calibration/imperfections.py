@@ -152,10 +152,11 @@ def log_unevenness(log_tension_derivative: Array) -> Array:
     if the press itself stretches the film.
 
     Args:
-        log_tension_derivative: d ln Q / d ln T, shape (n, n_electrode).
+        log_tension_derivative: Derivatives d ln Q / d ln T, shape (n, n_electrode), dimensionless.
 
     Returns:
         Derivatives, shape (n, n_electrode), dimensionless.
     """
     x = -log_tension_derivative
-    return np.asarray(x * (1.0 - np.clip(1.0 - 0.5 * x, 0.0, 1.0) ** SLACKENING))
+    base = np.clip(1.0 - 0.5 * x, 0.0, 1.0)
+    return np.asarray(x * (1.0 - base**SLACKENING))

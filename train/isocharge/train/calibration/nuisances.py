@@ -19,7 +19,12 @@ from isocharge.train.calibration.press_data import PressData
 
 
 class NuisanceEstimate(NamedTuple):
-    """Value and standard deviation of a nuisance, in its unit."""
+    """Estimate of a nuisance.
+
+    Attributes:
+        value: Estimated value, in the unit of the nuisance.
+        std: Standard deviation of the value, in the same unit.
+    """
 
     value: float
     std: float
@@ -33,7 +38,7 @@ class Nuisance:
         name: Name of the nuisance.
         unit: Unit of the nuisance.
         probabilities: Considered standard deviations before the presses, each with its prior probability. The presses
-            determine which of them is probable (`hypotheses`). Only zero for a nuisance without such hypotheses.
+            determine which of these hypotheses is probable (`hypotheses`). By default, only zero is considered.
         std_with_temperatures: Standard deviation before the presses if the temperatures of the presses are known; zero
             for a nuisance that does not depend on temperature.
     """

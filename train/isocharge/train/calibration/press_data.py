@@ -84,6 +84,7 @@ class PressData:
         )
 
     def __getitem__(self, rows: Integers | Booleans) -> "PressData":
+        """Return the data of some presses. Every attribute has one row for each press."""
         return PressData(**{name: column[rows] for name, column in vars(self).items()})
 
     def __len__(self) -> int:
@@ -105,11 +106,13 @@ class PressData:
         """Return the presses with a larger uncertainty of their forces.
 
         Args:
-            share: Relative standard deviation that is added to that of the rig.
+            share: Standard deviation of the scatter, relative to the force. It is added in quadrature to that of the
+                rig.
         """
         x_weight, y_weight, force_weight = self.contact_weight.T
-        scattered_weight = 1.0 / np.hypot(1.0 / force_weight, share)
-        return replace(self, contact_weight=np.column_stack([x_weight, y_weight, scattered_weight]))
+        rig_std = 1.0 / force_weight
+        total_std = np.hypot(rig_std, share)  # the variances of independent errors are added
+        return replace(self, contact_weight=np.column_stack([x_weight, y_weight, 1.0 / total_std]))
 
     def force_derivative(self) -> Array:
         """Return the derivatives of the residuals with respect to the logarithm of the measured force.
@@ -140,7 +143,7 @@ class PressData:
         press_pretensions = np.clip(pretension + self.tension_change, *bounds)
         low = float(press_pretensions.min(initial=np.inf))
         high = float(press_pretensions.max(initial=-np.inf))
-        if high <= low:
+        if high <= low:  # all presses have the same pretension, or there are no presses
             return np.array([low]), np.ones((len(self), 1))
         node_count = 2 + int(np.ceil((high - low) / NODE_DISTANCE_MPa))
         nodes = chebyshev_nodes(node_count, low, high)
@@ -165,8 +168,10 @@ class PressData:
         Returns:
             Derivatives, shape (n, n_electrode + 3, 3).
         """
-        rig_slopes = self.contact_weight[:, :, None] * np.eye(3)
-        return np.concatenate([self.weight[:, :, None] * charge_slopes, rig_slopes], axis=1)
+        charge_residual_slopes = self.weight[:, :, None] * charge_slopes
+        # Each residual of the rig depends only on its own coordinate: a diagonal matrix for each press.
+        rig_residual_slopes = self.contact_weight[:, :, None] * np.eye(3)
+        return np.concatenate([charge_residual_slopes, rig_residual_slopes], axis=1)
 
 
 def temperatures(presses: MeasuredPresses) -> Array:

@@ -90,7 +90,7 @@ class SideForces:
         side_force_map: Effect of side forces on the charges of the film.
         domain: Contacts that the model answers.
         friction: Coefficient of friction of the presses, with its standard deviation.
-        share: Largest further side force over the force, in any direction.
+        share: Largest further side force, which may have any direction, relative to the force.
     """
 
     side_force_map: SideForceMap
@@ -144,25 +144,29 @@ class SideForces:
             # case has the probability 0.5, and the model assumes f / 2. The mean squared difference is
             # 0.5 ((1/2)^2 + e^2) f^2 + 0.5 (1/2)^2 f^2 = (0.25 + 0.5 e^2) f^2.
             relative_std = float(np.sqrt(0.25 + 0.5 * (self.friction.std / self._coefficient) ** 2))
-            covariance += _outer(sensitivity.charge_gain, relative_std * friction_charge)
+            covariance += _covariance_of_charge_error(sensitivity.charge_gain, relative_std * friction_charge)
         if self.share > 0.0:
             # A force in an unknown direction has half of its variance along each of the two axes.
             side_force_std = self.share * contact[:, 2, None] / np.sqrt(2.0)  # shape (n, 1), N
             charge_per_newton = self.side_force_map.jacobian(contact)  # last axis: along x and along y
             for axis in range(2):
-                covariance += _outer(sensitivity.charge_gain, side_force_std * charge_per_newton[:, :, axis])
+                charge_std = side_force_std * charge_per_newton[:, :, axis]
+                covariance += _covariance_of_charge_error(sensitivity.charge_gain, charge_std)
         return covariance
 
 
-def _outer(charge_gain: Array, charge_error: Array) -> Array:
+def _covariance_of_charge_error(charge_gain: Array, charge_error: Array) -> Array:
     """Compute the covariances of contacts that an error of their charges causes.
 
+    The errors of all charges of a contact are fully correlated, because they have one common cause.
+
     Args:
-        charge_gain: Derivatives of (x, y, ln F) with respect to the charges, shape (n, 3, n_electrode), 1/pC.
+        charge_gain: Derivatives of (x, y, ln F) with respect to the charges, shape (n, 3, n_electrode), mm/pC, mm/pC
+            and 1/pC.
         charge_error: One standard deviation of the error, shape (n, n_electrode), pC.
 
     Returns:
         Covariances of (x, y, ln F), shape (n, 3, 3).
     """
-    shift = np.einsum("nie,ne->ni", charge_gain, charge_error)
-    return np.asarray(shift[:, :, None] * shift[:, None, :])
+    contact_error = np.einsum("nie,ne->ni", charge_gain, charge_error)  # sums over the electrodes e, shape (n, 3)
+    return np.asarray(contact_error[:, :, None] * contact_error[:, None, :])  # outer products
