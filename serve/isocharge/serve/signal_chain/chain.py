@@ -2,13 +2,15 @@
 
 `Chain` contains the settings of all stages. `SignalChain` has the requested stages in the following order.
 
-- `Gain` converts the unit of the device to pC, with the offset, the sign and the gain of each channel. - `Limit` marks
-  frames with a charge at the limit of the converter. - `HumStage` estimates and subtracts mains hum. - `TareStage`
-  measures the mean and the noise of quiet frames, and subtracts the mean from all later frames. - `LeakStage` corrects
-  the leak of the amplifiers, and estimates their inflow. If the settings have a memory, `MemoryStage` takes the place
-  of this stage, and also corrects creep, the thermoelastic step and the warmth of the film. - `TouchStage` detects
-  touches with hysteresis. - `PressFlags` flags saturated presses, and charges below zero. - `Warming` estimates the
-  common charge of a warming film with the model, and subtracts it.
+- `Gain` converts the unit of the device to pC, with the offset, the sign and the gain of each channel.
+- `Limit` marks frames with a charge at the limit of the converter.
+- `HumStage` estimates and subtracts mains hum.
+- `TareStage` measures the mean and the noise of quiet frames, and subtracts the mean from all later frames.
+- `LeakStage` corrects the leak of the amplifiers, and estimates their inflow. If the settings have a memory,
+  `MemoryStage` replaces this stage, and also corrects creep, the thermoelastic step and the warmth of the film.
+- `TouchStage` detects touches with hysteresis.
+- `PressFlags` flags saturated presses, and charges below zero.
+- `Warming` estimates the common charge of a warming film with the model, and subtracts it.
 
 A frame with a value that cannot be a charge is not processed by the stages. The time of such a frame is added to the
 time of the next frame.
@@ -79,8 +81,8 @@ class Chain:
     largest: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        steepest_pC = 1.0 if self.gain_pC is None else float(np.abs(self.gain_pC).max())
-        object.__setattr__(self, "largest", LARGEST_PC / steepest_pC)
+        largest_gain_pC = 1.0 if self.gain_pC is None else float(np.abs(self.gain_pC).max())
+        object.__setattr__(self, "largest", LARGEST_PC / largest_gain_pC)  # the dataclass is frozen
 
 
 class Reading(NamedTuple):

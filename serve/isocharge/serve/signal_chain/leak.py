@@ -9,11 +9,11 @@ where i is the innovation and b is the inflow (pC/s), the current that flows in 
 warming. The inflow is estimated from the innovation. An estimate from the output v would diverge. The inflow is
 estimated only out of contact, where the innovation consists of b dt and noise.
 
-Three rules keep the frames of a touch from changing the inflow. Each innovation is clipped. A touch uses the inflow
-that was estimated `look_back_s` before. After a release, the estimate pauses for `hold_off_s`.
+Three rules keep the frames of a touch from changing the inflow. Each innovation is clipped. During a touch, the inflow
+that was estimated `look_back_s` before the touch is used. After a release, the estimate pauses for `hold_off_s`.
 
-While nothing touches the film, the computed touch charge is reduced exponentially to zero. A charge that is not zero
-then is an error, or comes from a slow warming of the film.
+While nothing touches the film, the computed touch charge decays exponentially to zero. Any charge at that time is an
+error, or comes from a slow warming of the film.
 """
 
 import math
@@ -32,8 +32,8 @@ class LeakRule(Rule, frozen=True, kw_only=True):
         learn: Whether the inflow b is estimated.
         settle_s: Time constant of the estimate, s.
         hold_off_s: Pause of the estimate after a release, s.
-        clip_sigmas: Limit to which an innovation is clipped, in its standard deviations at rest.
-        clip_pC: Smallest value of that limit, pC.
+        clip_sigmas: Limit to which an innovation is clipped, in standard deviations of an innovation at rest.
+        clip_pC: Smallest limit to which an innovation is clipped, pC.
         relax_s: Time constant with which the charge decays to zero out of contact, s.
         look_back_s: Age of the inflow with which a touch begins, s. The inflow may be up to twice as old.
     """

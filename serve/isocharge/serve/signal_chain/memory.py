@@ -41,6 +41,8 @@ from isocharge.serve.signal_chain.memory_state import (
     SLOPE_ROW,
     WARMTH_ROW,
     WARMTH_ROWS,
+    Film,
+    ScaleVariances,
     state_propagation,
 )
 from isocharge.serve.signal_chain.rule import Rule, Share, TimeConstant
@@ -52,7 +54,10 @@ MAX_CREEP = 0.2
 """Upper bound of the creep in a decade. With a larger creep, a charge would vanish within some days."""
 
 RELEASE_S = 0.1
-"""Time after a release in which the finger still leaves the film, s. The charges of this time are not warmth."""
+"""Time after the detection of a release until the finger has left the film, s.
+
+The charges during this time are not warmth.
+"""
 
 WARMTH_CHANGE_PC = 1.0
 """Standard deviation of the change of the warmth of an electrode in one second, pC."""
@@ -61,19 +66,22 @@ CREEP_LAW_DEVIATION = 0.05
 """Relative deviation of real creep from the logarithmic law."""
 
 OUTLIER_SIGMAS = 4.0
-"""Largest charge after a release that is explained by creep, in standard deviations.
+"""Largest charge after a release that errors of creep explain, in standard deviations.
 
-A larger charge is caused by a hand that warms the film.
+A larger charge is assumed to come from a hand that warms the film.
 """
 
 CALM_PC_PER_S = 2.0
-"""Slope of the warmth above which the inflow of the amplifiers is not updated, because warmth is temporary, pC/s."""
+"""Slope of the warmth above which the inflow of the amplifiers is not updated, pC/s.
+
+The charge of warmth is temporary, and must not be mistaken for inflow.
+"""
 
 MIN_STEP_S = 1e-9
-"""Smallest time between two frames by which the filter divides, s."""
+"""Smallest divisor if the filter divides by the time between two frames, s."""
 
 MIN_CREEP_PC = 1e-9
-"""Total charge of creep and step below which nothing can be learned from a release, pC."""
+"""Predicted charge of creep and step below which the scale factors are not updated after a release, pC."""
 
 
 class MemoryRule(Rule, frozen=True, kw_only=True):
@@ -84,8 +92,8 @@ class MemoryRule(Rule, frozen=True, kw_only=True):
         thermoelastic: Share by which the charges of a touch are larger at first, before the film has reached its
             temperature again.
         warmth_s: Time constant with which the film follows the temperature of the air, s.
-        known: Relative standard deviation of `creep` and `thermoelastic`. It increases the standard deviations of
-            contacts.
+        known: Relative standard deviation of `creep` and `thermoelastic`. A larger value increases the reported
+            standard deviations of contacts.
         settle_s: Time constant with which warmth is estimated out of contact, s.
     """
 
@@ -94,40 +102,6 @@ class MemoryRule(Rule, frozen=True, kw_only=True):
     warmth_s: TimeConstant = 2.5
     known: Share = 0.2
     settle_s: TimeConstant = 0.1
-
-
-class ScaleVariances(NamedTuple):
-    """Variances of the scale factors of creep and thermoelastic step, and their covariance, dimensionless."""
-
-    creep: float
-    step: float
-    covariance: float
-
-
-class Film(NamedTuple):
-    """Properties of a film.
-
-    Attributes:
-        creep: Estimated share of a charge that is lost in each decade of time.
-        thermoelastic: Estimated share by which the charges of a touch are larger at first.
-        response: Contribution of each row of the state to the charge of the film, shape (rows,), dimensionless.
-        step_response: Charge of the film directly after a step of the touch charge by 1, which is h(0).
-        variances: Variances of the scale factors of creep and step.
-    """
-
-    creep: float
-    thermoelastic: float
-    response: Array
-    step_response: float
-    variances: ScaleVariances
-
-    @classmethod
-    def of(cls, creep: float, thermoelastic: float, variances: ScaleVariances) -> "Film":
-        """Return the description of a film with this creep and this thermoelastic step."""
-        response = creep * SCALE_RESPONSE[0] + thermoelastic * SCALE_RESPONSE[1]
-        response[WARMTH_ROW] = 1.0
-        response[CHARGE_ROW] += 1.0
-        return cls(creep, thermoelastic, response, float(response[CHARGE_ROW]), variances)
 
 
 class Memory(NamedTuple):
@@ -177,7 +151,7 @@ class Memory(NamedTuple):
         rows_pC = np.zeros((len(INITIAL_PROPAGATION), output_pC.size))
         scale_variance = rule.known**2
         variances = ScaleVariances(creep=scale_variance, step=scale_variance, covariance=0.0)
-        film = Film.of(rule.creep, rule.thermoelastic, variances)
+        film = Film.with_memory(rule.creep, rule.thermoelastic, variances)
         leak = Leak.start(output_pC)._replace(charge_pC=output_pC / film.step_response)
         warmth_pC = rows_pC[WARMTH_ROWS]
         return cls(
@@ -220,11 +194,14 @@ def undo_memory(
     """
     film = memory.film
     leak = memory.leak
+
+    # The surplus is the charge that the film has added since the previous frame.
     if tau_s is None:
         surplus_pC = output_pC - leak.output_pC
         film_pC = output_pC
     else:
-        surplus_pC = output_pC - np.exp(-dt_s / tau_s) * leak.output_pC - leak.inflow_pC_per_s * dt_s
+        decayed_output_pC = np.exp(-dt_s / tau_s) * leak.output_pC
+        surplus_pC = output_pC - decayed_output_pC - leak.inflow_pC_per_s * dt_s
         film_pC = memory.film_pC + surplus_pC
 
     # Solve the equation of the film for the touch charge.
@@ -286,26 +263,39 @@ def undo_memory(
     )
     if is_learning and leak.hold_s <= 0.0:
         after = _learn_film(after, dt_s)
-    if after.candidate_s >= leak_rule.look_back_s:
-        after = after._replace(
-            trusted_pC=after.candidate_pC,
-            trusted_s=after.candidate_s,
-            candidate_pC=after.rows_pC[WARMTH_ROWS],
-            candidate_s=0.0,
-        )
-    return after
+    return _replace_trusted_warmth(after, leak_rule.look_back_s)
+
+
+def _replace_trusted_warmth(memory: Memory, look_back_s: float) -> Memory:
+    """Return the state whose trusted warmth is the candidate, if the candidate is old enough.
+
+    The present warmth is then the next candidate.
+
+    Args:
+        memory: State of this frame.
+        look_back_s: Age at which the candidate becomes the trusted warmth, s.
+    """
+    if memory.candidate_s < look_back_s:
+        return memory
+    return memory._replace(
+        trusted_pC=memory.candidate_pC,
+        trusted_s=memory.candidate_s,
+        candidate_pC=memory.rows_pC[WARMTH_ROWS],
+        candidate_s=0.0,
+    )
 
 
 class RemainingCharge(NamedTuple):
-    """Component of the charge after a release along the predicted charges.
+    """Charge that remains after a release, as a scalar measurement of the errors of creep and thermoelastic step.
 
-    The charges of all electrodes are projected onto the sum of the predicted charges of creep and thermoelastic step.
+    The charges of all electrodes form a vector, which is projected onto the direction of the predicted charges. The
+    predicted charges are the sum of the charges of creep and thermoelastic step.
 
     Attributes:
         creep_pC: Projection of the predicted charge of creep.
         step_pC: Projection of the predicted charge of the thermoelastic step.
         charge_pC: Projection of the remaining charge minus its prediction.
-        variance_pC2: Variance of the remaining charge, which warmth and deviations from the law of creep cause.
+        variance_pC2: Variance of the remaining charge due to warmth and to deviations from the law of creep.
     """
 
     creep_pC: float
@@ -315,30 +305,32 @@ class RemainingCharge(NamedTuple):
 
 
 def _remaining_charge(memory: Memory, creep_pC: Array, step_pC: Array) -> RemainingCharge | None:
-    """Measure the charge that remains after a release. The result is its component along the predicted charges.
+    """Project the charge that remains after a release onto the direction of the predicted charges.
 
     Args:
         memory: State of this frame.
-        creep_pC: Predicted charge of creep, shape (electrodes,).
-        step_pC: Predicted charge of the thermoelastic step, shape (electrodes,).
+        creep_pC: Predicted charge of creep, shape (electrodes,), pC.
+        step_pC: Predicted charge of the thermoelastic step, shape (electrodes,), pC.
 
     Returns:
-        The measurement; None if the predicted charges are too small for a direction.
+        The measurement; None if the predicted charges are too small to define a direction.
     """
     predicted_pC = creep_pC + step_pC
     size_pC = math.sqrt(float(predicted_pC @ predicted_pC))
     if size_pC < MIN_CREEP_PC:
         return None
+
     expected_warmth_pC, _expected_slope = memory.expected_pC
     remaining_pC = memory.rows_pC[WARMTH_ROW] - expected_warmth_pC
 
     # The warmth may have changed during the touch, when it could not be observed.
     warmth_pC2 = WARMTH_CHANGE_PC**2 * len(predicted_pC) * memory.unseen_s
+    creep_law_pC2 = (CREEP_LAW_DEVIATION * size_pC) ** 2
     return RemainingCharge(
         creep_pC=float(creep_pC @ predicted_pC) / size_pC,
         step_pC=float(step_pC @ predicted_pC) / size_pC,
         charge_pC=float(remaining_pC @ predicted_pC) / size_pC,
-        variance_pC2=warmth_pC2 + (CREEP_LAW_DEVIATION * size_pC) ** 2,
+        variance_pC2=warmth_pC2 + creep_law_pC2,
     )
 
 
@@ -356,7 +348,7 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
         The state with the updated film. If creep cannot explain the remaining charge, the film is not updated until
         the next release.
     """
-    # Charges that creep and step should have left, shape (electrodes,), and the charge that actually remains
+    # Compare the charges that creep and step are predicted to leave, shape (electrodes,), with the remaining charge.
     film = memory.film
     unit_creep_pC, unit_step_pC = SCALE_RESPONSE.dot(memory.rows_pC)
     creep_pC = film.creep * unit_creep_pC
@@ -374,28 +366,28 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
     if not is_explained:
         return memory._replace(learn_s=0.0)
 
-    # The Kalman update. The scale factors were 1 before the measurement.
+    # The Kalman update. The scale factors are relative to the properties of `film`, so that they are 1 at first.
     total_pC2 = prior_pC2 + measured.variance_pC2 * LEARN_S / max(dt_s, MIN_STEP_S)
     creep_scale = 1.0 + creep_covariance / total_pC2 * measured.charge_pC
     step_scale = 1.0 + step_covariance / total_pC2 * measured.charge_pC
-    updated = ScaleVariances(
-        variances.creep - creep_covariance**2 / total_pC2,
-        variances.step - step_covariance**2 / total_pC2,
-        variances.covariance - creep_covariance * step_covariance / total_pC2,
+    updated_variances = ScaleVariances(
+        creep=variances.creep - creep_covariance**2 / total_pC2,
+        step=variances.step - step_covariance**2 / total_pC2,
+        covariance=variances.covariance - creep_covariance * step_covariance / total_pC2,
     )
 
-    # The charge that creep and step now explain is removed from the warmth.
+    # The charge that the scale factors explain in addition is removed from the warmth.
     rows_pC = memory.rows_pC.copy()
     rows_pC[WARMTH_ROW] -= (creep_scale - 1.0) * creep_pC + (step_scale - 1.0) * step_pC
-    learned = Film.of(film.creep * creep_scale, film.thermoelastic * step_scale, updated)
-    return memory._replace(film=learned, rows_pC=rows_pC)
+    updated_film = Film.with_memory(film.creep * creep_scale, film.thermoelastic * step_scale, updated_variances)
+    return memory._replace(film=updated_film, rows_pC=rows_pC)
 
 
 def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
     """Return the state at the first frame of a touch.
 
-    The touch may have changed the latest estimate of the warmth before it was detected. The warmth is therefore
-    predicted from its trusted value, which was estimated at least `look_back_s` ago.
+    Before its detection, the touch may have changed the latest estimate of the warmth. The warmth is therefore
+    predicted from the trusted estimate, whose age is at least `look_back_s`.
 
     Args:
         rule: Memory of the film.
@@ -411,10 +403,15 @@ def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
     rows_pC[CHARGE_ROW] = 0.0
     charge_pC = (memory.film_pC - film.response.dot(rows_pC)) / film.step_response
     rows_pC[CHARGE_ROW] = charge_pC
+
+    # Shortly after a previous touch, the warmth has not been observed since that touch began.
+    unseen_s = age_s
+    if memory.is_recently_touched:
+        unseen_s = max(memory.unseen_s, age_s)
     return memory._replace(
         leak=memory.leak._replace(charge_pC=charge_pC),
         rows_pC=rows_pC,
-        unseen_s=max(memory.unseen_s, age_s) if memory.is_recently_touched else age_s,
+        unseen_s=unseen_s,
         learn_s=LEARN_S + RELEASE_S,
     )
 

@@ -1,9 +1,10 @@
 """State of the memory of a film (see `memory`).
 
-The module defines the rows of the state and their propagation in time.
+The module defines the rows of the state, the properties of a film, and the propagation of the state in time.
 """
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,29 +30,68 @@ INITIAL_PROPAGATION = np.diag([*np.ones(len(DECADES_S) + 3), 0.0])
 The row of the touch charge is 0, because the touch charge of the next frame is not known yet.
 """
 
-SCALE_RESPONSE = np.array(
-    [
-        [*-np.ones(len(DECADES_S)), 0.0, 0.0, 0.0, -np.expm1(-1.0 / DECADES_S).sum()],
-        [*np.zeros(len(DECADES_S)), -1.0, 0.0, 0.0, 1.0],
-    ]
-)
-"""Contribution of each row of the state to the charge of the film, shape (2, rows).
+CREEP_RESPONSE = np.array([*-np.ones(len(DECADES_S)), 0.0, 0.0, 0.0, -np.expm1(-1.0 / DECADES_S).sum()])
+"""Contribution of each row of the state to the charge of a film with `creep = 1`, shape (rows,)."""
 
-The first line is for `creep = 1`, and the second line for `thermoelastic = 1`.
-"""
+STEP_RESPONSE = np.array([*np.zeros(len(DECADES_S)), -1.0, 0.0, 0.0, 1.0])
+"""Contribution of each row of the state to the charge of a film with `thermoelastic = 1`, shape (rows,)."""
+
+SCALE_RESPONSE = np.stack([CREEP_RESPONSE, STEP_RESPONSE])
+"""`CREEP_RESPONSE` and `STEP_RESPONSE` in one matrix, shape (2, rows)."""
+
+
+class ScaleVariances(NamedTuple):
+    """Variances of the scale factors of creep and thermoelastic step, and their covariance, dimensionless."""
+
+    creep: float
+    step: float
+    covariance: float
+
+
+class Film(NamedTuple):
+    """Properties of a film.
+
+    Attributes:
+        creep: Estimated share of a charge that is lost in each decade of time.
+        thermoelastic: Estimated share by which the charges of a touch are larger at first.
+        response: Contribution of each row of the state to the charge of the film, shape (rows,), dimensionless.
+        step_response: Charge of the film directly after a step of the touch charge by 1; h(0) in the module docstring.
+        variances: Variances of the scale factors of creep and step.
+    """
+
+    creep: float
+    thermoelastic: float
+    response: Array
+    step_response: float
+    variances: ScaleVariances
+
+    @classmethod
+    def with_memory(cls, creep: float, thermoelastic: float, variances: ScaleVariances) -> "Film":
+        """Return the properties of a film with a given creep and thermoelastic step.
+
+        Args:
+            creep: Share of a charge that is lost in each decade of time.
+            thermoelastic: Share by which the charges of a touch are larger at first.
+            variances: Variances of the scale factors of creep and step.
+        """
+        response = creep * CREEP_RESPONSE + thermoelastic * STEP_RESPONSE
+        response[WARMTH_ROW] = 1.0
+        response[CHARGE_ROW] += 1.0
+        step_response = float(response[CHARGE_ROW])
+        return cls(creep, thermoelastic, response, step_response, variances)
 
 
 @lru_cache(maxsize=8)
 def _relaxation(warmth_s: float) -> tuple[Array, Array]:
-    """Return two matrices, from which the propagation of the state over any time is computed.
+    """Return the time constants and the steady state, from which the propagation over any time is computed.
 
     Args:
         warmth_s: Time constant with which the film follows the temperature of the air, s.
 
     Returns:
         Time constant of each row of the state, shape (rows, 1), s; and the propagation over a very long time, shape
-        (rows, rows). After such a time, the creep terms and the thermoelastic term equal the touch charge, and the
-        slope of the warmth has changed the warmth by `warmth_s` times the slope.
+        (rows, rows). After such a time, the creep terms and the thermoelastic term equal the touch charge. The slope of
+        the warmth has decayed to zero, and has changed the warmth by `warmth_s` multiplied by the slope.
     """
     steady_state = np.zeros_like(INITIAL_PROPAGATION)
     steady_state[:WARMTH_ROW, CHARGE_ROW] = 1.0
@@ -64,7 +104,12 @@ def _relaxation(warmth_s: float) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=256)
 def state_propagation(warmth_s: float, dt_s: float) -> Array:
-    """Return the matrix that advances the state by a time dt_s, shape (rows, rows)."""
+    """Return the matrix that advances the state by a time, shape (rows, rows).
+
+    Args:
+        warmth_s: Time constant with which the film follows the temperature of the air, s.
+        dt_s: The time, s.
+    """
     time_constants_s, steady_state = _relaxation(warmth_s)
     decay = np.exp(-dt_s / time_constants_s)
     return np.asarray(steady_state + decay * (INITIAL_PROPAGATION - steady_state))

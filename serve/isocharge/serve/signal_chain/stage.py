@@ -22,12 +22,12 @@ class ChainFrame:
         was_contact: Whether something touched in the previous frame.
         flags: Flags of `isocharge.serve.flags`, in the order in which the stages add them.
         raw_pC: Charges as the device sent them, shape (electrodes,), pC.
-        charge_pC: The same charges after the stages so far, shape (electrodes,), pC.
+        charge_pC: Charges after the stages that have processed the frame, shape (electrodes,), pC.
         tare: The tare that was subtracted; None while there is none.
-        is_finished: Whether the later stages do not process the frame, because there is no tare yet.
+        is_finished: Whether the later stages skip the frame, because there is no tare.
         charge_scale_std: Relative standard deviation that all charges have in common, because the film's memory is not
             known exactly.
-        touch: Whether something touches, after the touch stage.
+        touch: State of the touch detection after this frame. The touch stage sets it.
         base_relax_s: Time constant with which the charge out of contact decays to zero, s.
         is_base_held: Whether a finger that is leaving the film keeps the charge out of contact from decaying.
         is_saturated: Whether an amplifier was at its limit at any time in this press.

@@ -382,6 +382,8 @@ class Warming(Stage):
             self._rule, self._drift, frame.charge_pC, self._misfit, frame.dt_s, self._ratios, self._warmth_s
         )
         self._drift = drift
+
+        # The properties of the film are not learned after a touch with a large warming.
         is_large = abs(drift.charge_pC) >= self._rule.tell_pC
         if drift.charge_pC != previous_pC:
             change_pC = (drift.charge_pC - previous_pC) * self._ratios

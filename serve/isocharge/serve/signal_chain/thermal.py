@@ -27,6 +27,7 @@ from isocharge.serve.signal_chain.rule import Rule, Setting
 TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
 """Changes of the common charge at which the misfit is evaluated, pC. A parabola is fitted to the squared misfits."""
 
+# Pseudo-inverse for a least-squares fit: the product with the squared misfits gives the coefficients of the parabola.
 _PARABOLA_FIT = np.linalg.pinv(np.column_stack([np.ones(5), TRIED_PC, TRIED_PC**2]))
 
 Misfit = Callable[[Array], Reals]
@@ -104,13 +105,13 @@ def track_thermal_drift(
     waited_s = state.waited_s + dt_s
     if waited_s < rule.every_s:
         return state._replace(waited_s=waited_s, rate_pC_per_s=0.0)
-    predicted_pC2, covariance, rate_variance = _predicted_variances(rule, state, waited_s, warmth_s)
+    predicted_pC2, predicted_covariance, predicted_rate_variance = _predicted_variances(rule, state, waited_s, warmth_s)
 
     # Fit: squared misfit = constant + slope * p + curvature * p^2, where p is the trial value that is subtracted.
     trial_charges_pC = charge_pC - TRIED_PC[:, np.newaxis] * ratios  # shape (trials, electrodes)
     squared_misfits = np.square(misfit(trial_charges_pC), dtype=float)
     _constant, slope, curvature = (_PARABOLA_FIT @ squared_misfits).tolist()
-    estimate_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
+    estimate_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf  # variance of the estimate
     if estimate_pC2 > rule.blind_pC**2:
         return state._replace(waited_s=0.0, blind=True, rate_pC_per_s=0.0)
 
@@ -119,14 +120,15 @@ def track_thermal_drift(
     change_pC = min(max(minimum_pC, float(TRIED_PC[0])), float(TRIED_PC[-1]))
 
     # Kalman update of p and of its rate of change
-    charge_gain = predicted_pC2 / (predicted_pC2 + estimate_pC2)
-    rate_gain = covariance / (predicted_pC2 + estimate_pC2)
+    innovation_pC2 = predicted_pC2 + estimate_pC2
+    charge_gain = predicted_pC2 / innovation_pC2
+    rate_gain = predicted_covariance / innovation_pC2
     return ThermalDrift(
         charge_pC=state.charge_pC + charge_gain * change_pC,
         variance_pC2=(1.0 - charge_gain) * predicted_pC2,
         rate_pC_per_s=rate_gain * change_pC,
-        covariance=(1.0 - charge_gain) * covariance,
-        rate_variance=rate_variance - rate_gain * covariance,
+        covariance=(1.0 - charge_gain) * predicted_covariance,
+        rate_variance=predicted_rate_variance - rate_gain * predicted_covariance,
     )
 
 
@@ -148,7 +150,9 @@ def _predicted_variances(
         Variance of p, covariance of p and its rate, and variance of the rate.
     """
     if warmth_s is None:
-        return state.variance_pC2 + rule.wander_pC**2 * waited_s, 0.0, 0.0
+        random_walk_pC2 = state.variance_pC2 + rule.wander_pC**2 * waited_s
+        return random_walk_pC2, 0.0, 0.0
+
     # The process noise of the rate adds the variance rate_noise * waited_s^2 / 3 to p. With the factor of 3, p changes
     # by `wander_pC` in one second.
     rate_noise = 3.0 * rule.wander_pC**2 * waited_s

@@ -200,6 +200,9 @@ class ContactMixture:
         Components with large variances are placed on a spiral that covers the film, and are then updated with the
         charges.
 
+        Args:
+            measurement: Charges of this step.
+
         Returns:
             The components that explain the charges; None if there are none.
         """
@@ -282,8 +285,8 @@ class ContactMixture:
         linearised = linearise_update(self.charges, state, prior, measurement)
         for _ in range(iterations):
             transposed = linearised.cross_covariance.swapaxes(1, 2)
-            state_correction = (transposed @ linearised.weighted_innovation)[:, :, 0]
-            step = prior.mean + state_correction - state
+            change_from_prior = (transposed @ linearised.weighted_innovation)[:, :, 0]
+            step = prior.mean + change_from_prior - state
             state = state + limit_iteration_step(step)
             linearised = linearise_update(self.charges, state, prior, measurement)
         return state, linearised
@@ -306,11 +309,13 @@ class ContactMixture:
 
         # Likelihood p of each component: -2 ln p = squared misfit + squared change of the state + ln det(covariance).
         # All squares have the shape (n_component,).
-        weighted = linearised.weighted_innovation
-        squared_misfit = ((measurement.charge_pC - linearised.charge_pC) ** 2 / measurement.variance).sum(axis=1)
-        squared_state_change = (weighted.swapaxes(1, 2) @ linearised.charge_covariance @ weighted)[:, 0, 0]
+        residual_pC = measurement.charge_pC - linearised.charge_pC
+        squared_misfit = (residual_pC**2 / measurement.variance).sum(axis=1)
+        column = linearised.weighted_innovation
+        row = column.swapaxes(1, 2)
+        squared_state_change = (row @ linearised.charge_covariance @ column)[:, 0, 0]
         square = squared_misfit + squared_state_change
-        _, log_determinant = np.linalg.slogdet(linearised.innovation_covariance)
+        _sign, log_determinant = np.linalg.slogdet(linearised.innovation_covariance)
         log_weight = prior.log_weight - 0.5 * (square + log_determinant)
 
         is_outside_film = np.hypot(state[:, X], state[:, Y]) > MAX_RELATIVE_RADIUS * self.charges.radius_mm
@@ -328,19 +333,23 @@ class ContactMixture:
     def _split_at_fold(self, components: Components) -> Components:
         """Add a component towards each side of a fold if the most probable component extends across the fold.
 
+        Args:
+            components: Components after the update with the charges of this step.
+
         Returns:
             The components, with two additional components if there is a fold.
         """
         best = components.best
         mean = components.mean[best]
         covariance = components.covariance[best]
-        variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])  # in ascending order of the variances
-        longest = variances.size - 1
-        std_mm = math.sqrt(max(variances[longest], 0.0))
-        if std_mm < MIN_SPLIT_STD_mm or len(components.mean) > MAX_COMPONENTS - 2:
+        has_space_for_two = len(components.mean) <= MAX_COMPONENTS - 2
+        variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])
+        longest = int(variances.argmax())
+        std_mm = math.sqrt(max(variances[longest], 0.0))  # rounding errors may make the variance negative
+        if std_mm < MIN_SPLIT_STD_mm or not has_space_for_two:
             return components
 
-        # Change of the state if the position changes by one standard deviation along the longest axis.
+        # Expected change of the whole state if the position changes by one standard deviation along the longest axis.
         direction = covariance[:, POSITION] @ axes[:, longest] / std_mm
         sides = np.array([1.0, -1.0])
         states_on_both_sides = mean + FOLD_DISTANCE * np.outer(sides, direction)
@@ -351,13 +360,15 @@ class ContactMixture:
         removed_share = 1.0 - SPLIT_STD_RATIO**2
         narrow_covariance = covariance - removed_share * np.outer(direction, direction)
         log_weight = components.log_weight[best] - 0.5 * SPLIT_DISTANCE**2
-        split = components
-        for added_mean in mean + SPLIT_DISTANCE * np.outer(sides, direction):
-            split = split.with_component(added_mean, narrow_covariance, log_weight)
-        return split
+        added_means = mean + SPLIT_DISTANCE * np.outer(sides, direction)
+        for added_mean in added_means:
+            components = components.with_component(added_mean, narrow_covariance, log_weight)
+        return components
 
     def _is_across_fold(self, state: Array, other_states: Array) -> Booleans:
-        """Return whether the orientation of the map from contacts to charges differs between two states.
+        """Return whether a fold of the map from contacts to charges lies between a state and each of other states.
+
+        At a fold, the orientation of the map changes, and the determinant of its Jacobian changes its sign.
 
         Args:
             state: A state, shape (6 + n_electrode,).
@@ -367,15 +378,22 @@ class ContactMixture:
             Whether an odd number of folds lies in between, shape (n,).
         """
         states = np.vstack([state, other_states])
-        _, jacobian = self.charges.linearised(states[:, CONTACT])
-        orientation = np.linalg.det(jacobian[0].T @ jacobian[1:])
-        return np.asarray(orientation < 0.0)
+        _charges, jacobians = self.charges.linearised(states[:, CONTACT])
+        state_jacobian = jacobians[0]  # shape (n_electrode, 3)
+        other_jacobians = jacobians[1:]
+
+        # With more than three electrodes, the Jacobians are not square, but this product of two Jacobians is.
+        relative_orientation = np.linalg.det(state_jacobian.T @ other_jacobians)
+        return np.asarray(relative_orientation < 0.0)
 
     def _group(self, components: Components) -> list[ContactHypothesis]:
         """Combine the components that describe the same contact.
 
-        The most probable remaining component and all components of the same contact form one group, until no component
-        remains.
+        The most probable component and all components of the same contact form a group. The components that remain are
+        grouped in the same way.
+
+        Args:
+            components: Components after the update with the charges of this step.
 
         Returns:
             The contacts, in descending order of their probability.
@@ -384,10 +402,11 @@ class ContactMixture:
         probability /= probability.sum()
         remaining = np.argsort(-probability, kind="stable")  # rows of the components, the most probable first
         hypotheses = []
-        while remaining.size:
+        while remaining.size > 0:
             is_same = self._is_same_contact(components, remaining)
             group = remaining[is_same]
-            hypotheses.append(combine_components(components.select(group), probability[group]))
+            hypothesis = combine_components(components.select(group), probability[group])
+            hypotheses.append(hypothesis)
             remaining = remaining[~is_same]
         return sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)
 
@@ -419,9 +438,11 @@ def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:
     """
     number = np.arange(N_INITIAL_COMPONENTS)
     angle = GOLDEN_ANGLE * number
-    relative_radius = np.sqrt((number + 0.5) / N_INITIAL_COMPONENTS)
-    x_mm, y_mm = charges.radius_mm * relative_radius * np.array([np.cos(angle), np.sin(angle)])
-    log_force = np.full(N_INITIAL_COMPONENTS, np.log(charges.force_N).mean())
+    radius_mm = charges.radius_mm * np.sqrt((number + 0.5) / N_INITIAL_COMPONENTS)
+    x_mm = radius_mm * np.cos(angle)
+    y_mm = radius_mm * np.sin(angle)
+    medium_log_force = np.log(charges.force_N).mean()
+    log_force = np.full(N_INITIAL_COMPONENTS, medium_log_force)
     return np.column_stack([x_mm, y_mm, log_force])
 
 

@@ -26,6 +26,7 @@ from isocharge.common.arrays import Array
 from isocharge.serve.model.film_directions import FilmDirections
 from isocharge.serve.model.pretensions import Pretensions
 from isocharge.serve.tracking.film_unknowns import UnknownsLayout
+from isocharge.serve.tracking.film_update import kalman_update, multiply_stacks
 from isocharge.serve.tracking.pretension_grid import (
     GRID_STEP_MPa,
     evenly_spaced,
@@ -84,6 +85,11 @@ NO_OFFSET_PROBABILITY = 0.9
 LEVEL_CHANGE_PROBABILITY = 0.0003
 """Probability that the level of the offsets changes between two touches."""
 
+SECONDS_PER_HOUR = 3600.0
+
+PROBABILITY_COLUMN = 0
+"""Index of the probability on the last axis of the weighted moments."""
+
 
 class TouchResiduals(NamedTuple):
     """Squared misfits of a touch after the touch is corrected with the most likely offset level.
@@ -100,22 +106,6 @@ class TouchResiduals(NamedTuple):
     filtered: Array
     without_gains: Array
     offset_variance: float
-
-
-class KalmanUpdate(NamedTuple):
-    """Changes of the estimates of the linear unknowns by a good touch.
-
-    There is one estimate for each level and each pretension.
-
-    Attributes:
-        mean_change: Change of the mean, shape (n_level, n_pretension, n_unknown).
-        covariance_reduction: Reduction of the covariance, shape (n_level, n_pretension, n_unknown, n_unknown).
-        density: Probability density of the misfit vector without its constant factor, shape (n_level, n_pretension).
-    """
-
-    mean_change: Array
-    covariance_reduction: Array
-    density: Array
 
 
 class FilmFilter:
@@ -176,7 +166,7 @@ class FilmFilter:
         self._mean = np.zeros((*shape, size))
         self._mean[..., self._layout.directions] = np.outer(change_MPa, self._directions.by_pretension)
         self._covariance = np.zeros((*shape, size, size))
-        self._covariance[:] = self._stationary_covariance()[:, None]
+        self._covariance[:] = self._stationary_covariance()[:, None]  # the same at every pretension
         self._last_touch_s: float | None = None
         self._pending_variance = 0.0
 
@@ -235,7 +225,10 @@ class FilmFilter:
         return np.array([np.interp(pretension_MPa, self.grid_MPa, direction_mean) for direction_mean in grid_means.T])
 
     def _stationary_covariance(self) -> Array:
-        """Return the covariance of the linear unknowns before any touch, shape (n_level, n_unknown, n_unknown)."""
+        """Return the covariance of the linear unknowns before any touch, shape (n_level, n_unknown, n_unknown).
+
+        The unknowns are independent. Gains and directions are in units of their standard deviations.
+        """
         layout = self._layout
         covariance = np.tile(np.eye(layout.size), (self._level_std.size, 1, 1))
         covariance[:, layout.offset, layout.offset] = self._level_std**2
@@ -267,7 +260,7 @@ class FilmFilter:
         decay[layout.offset] = math.exp(-elapsed_s / OFFSET_TIME_CONSTANT_s)
         decay[layout.directions] = 1.0
         decay_of_products = np.outer(decay, decay)
-        stationary = self._stationary_covariance()[:, None]
+        stationary = self._stationary_covariance()[:, None]  # the same at every pretension
         self._mean = decay * self._mean
         self._covariance = decay_of_products * self._covariance + (1.0 - decay_of_products) * stationary
 
@@ -280,29 +273,40 @@ class FilmFilter:
         level_count = self._level_std.size
         if level_count == 1:
             return
-        offset = self._layout.offset
-        pretension_probability = self.probability
+        changed_mean, changed_covariance = self._moments_after_level_change()
+
+        # If the level changes, all levels are equally likely.
         unchanged_probability = (1.0 - LEVEL_CHANGE_PROBABILITY) * self._probability
-        changed_probability = LEVEL_CHANGE_PROBABILITY / level_count * pretension_probability
-
-        # After a change of the level, the offset is new, and the other unknowns are averaged over the previous levels.
-        # The mean then has the shape (n_pretension, n_unknown). The covariance depends on the new level.
-        level_weight = self._probability / pretension_probability
-        changed_mean = (level_weight[..., None] * self._mean).sum(axis=0)
-        changed_mean[:, offset] = 0.0
-        average_covariance = (level_weight[..., None, None] * self._covariance).sum(axis=0)
-        changed_covariance = np.repeat(average_covariance[None], level_count, 0)
-        changed_covariance[:, :, offset, :] = 0.0
-        changed_covariance[:, :, :, offset] = 0.0
-        changed_covariance[:, :, offset, offset] = self._level_std[:, None] ** 2
-
+        changed_probability = LEVEL_CHANGE_PROBABILITY / level_count * self.probability
         self._probability = unchanged_probability + changed_probability
+
         # The probability of a change is broadcast over the axis of the mean and over the two axes of the covariance.
         changed_weight = changed_probability / self._probability
         mean_weight = changed_weight[..., None]
         self._mean = (1.0 - mean_weight) * self._mean + mean_weight * changed_mean
         covariance_weight = changed_weight[..., None, None]
         self._covariance = (1.0 - covariance_weight) * self._covariance + covariance_weight * changed_covariance
+
+    def _moments_after_level_change(self) -> tuple[Array, Array]:
+        """Return the mean and the covariance of the linear unknowns if the offset level has just changed.
+
+        The offset is distributed as before any touch. The other unknowns are averaged over the previous levels.
+
+        Returns:
+            Mean, which is equal at all new levels, shape (n_pretension, n_unknown), and covariance at each new level,
+            shape (n_level, n_pretension, n_unknown, n_unknown).
+        """
+        offset = self._layout.offset
+        level_weight = self._probability / self.probability
+        mean = (level_weight[..., None] * self._mean).sum(axis=0)
+        mean[:, offset] = 0.0
+
+        average_covariance = (level_weight[..., None, None] * self._covariance).sum(axis=0)
+        covariance = np.repeat(average_covariance[None], self._level_std.size, axis=0)
+        covariance[:, :, offset, :] = 0.0
+        covariance[:, :, :, offset] = 0.0
+        covariance[:, :, offset, offset] = self._level_std[:, None] ** 2
+        return mean, covariance
 
     def _change_pretension(self, elapsed_s: float) -> None:
         """Account for a drift of the pretension, and for a jump to any pretension, which has a small probability.
@@ -313,31 +317,42 @@ class FilmFilter:
         Args:
             elapsed_s: Time since the previous touch, s.
         """
-        self._pending_variance += self._drift**2 * elapsed_s / 3600.0
-        level_count, grid_size = self._probability.shape
-        size = self._layout.size
-
-        # The probability, the mean and the covariance of each state are one row of `moments`. The mean and the
-        # covariance are multiplied by the probability, so that a weighted average is a sum of rows.
-        moments = np.concatenate(
-            [
-                np.ones((level_count, grid_size, 1)),
-                self._mean,
-                self._covariance.reshape(level_count, grid_size, size * size),
-            ],
-            axis=2,
-        )
-        moments *= self._probability[..., None]
+        self._pending_variance += self._drift**2 * elapsed_s / SECONDS_PER_HOUR
+        moments = self._weighted_moments()
 
         # The grid cannot represent a drift that is smaller than its step. Such a drift is added to the next one.
         drift_std = math.sqrt(self._pending_variance)
         if drift_std >= GRID_STEP_MPa:
             moments = smooth_moments(moments, drift_std)
             self._pending_variance = 0.0
-        moments /= moments[..., 0].sum()
-        moments = (1.0 - JUMP_PROBABILITY) * moments + JUMP_PROBABILITY * moments.mean(axis=1, keepdims=True)
+        moments /= moments[..., PROBABILITY_COLUMN].sum()
 
-        self._probability = moments[..., 0]
+        # After a jump, the film may have come from any pretension with equal probability.
+        moments_after_jump = moments.mean(axis=1, keepdims=True)
+        moments = (1.0 - JUMP_PROBABILITY) * moments + JUMP_PROBABILITY * moments_after_jump
+        self._set_weighted_moments(moments)
+
+    def _weighted_moments(self) -> Array:
+        """Return the probability, the mean and the covariance of each level and pretension in one array.
+
+        The mean and the covariance are multiplied by the probability. The weighted average over several pretensions is
+        therefore a sum.
+
+        Returns:
+            Moments, shape (n_level, n_pretension, 1 + n_unknown + n_unknown^2).
+        """
+        level_count, grid_size = self._probability.shape
+        size = self._layout.size
+        flat_covariance = self._covariance.reshape(level_count, grid_size, size * size)
+        moments = np.concatenate([np.ones((level_count, grid_size, 1)), self._mean, flat_covariance], axis=2)
+        moments *= self._probability[..., None]
+        return moments
+
+    def _set_weighted_moments(self, moments: Array) -> None:
+        """Set the probabilities, the means and the covariances from the result of `_weighted_moments`."""
+        level_count, grid_size = self._probability.shape
+        size = self._layout.size
+        self._probability = moments[..., PROBABILITY_COLUMN]
         normalised = moments / self._probability[..., None]
         mean_columns = slice(1, 1 + size)
         covariance_columns = slice(1 + size, None)
@@ -360,47 +375,19 @@ class FilmFilter:
         """
         misfit, jacobian = self._linearise(charge_pC, log_changes)
         noise_covariance = self._noise_covariance(jacobian)
-        kalman = self._kalman_update(misfit, jacobian, noise_covariance)
+        kalman = kalman_update(misfit, jacobian, noise_covariance, self._mean, self._covariance)
 
-        # Probability that the touch is not an outlier, at each level and pretension
+        # Probability that the touch is not an outlier, shape (n_level, n_pretension).
         good_density = (1.0 - OUTLIER_PROBABILITY) * kalman.density
         total_density = good_density + OUTLIER_PROBABILITY * OUTLIER_DENSITY
         good_probability = good_density / total_density
         self._mean = self._mean + good_probability[..., None] * kalman.mean_change
         self._covariance = self._covariance - good_probability[..., None, None] * kalman.covariance_reduction
-        posterior = self._probability * total_density
-        self._probability = posterior / posterior.sum()
+
+        # Bayes' theorem for the levels and pretensions.
+        unnormalised_probability = self._probability * total_density
+        self._probability = unnormalised_probability / unnormalised_probability.sum()
         return self._residuals(misfit, jacobian, noise_covariance)
-
-    def _kalman_update(self, misfit: Array, jacobian: Array, noise_covariance: Array) -> KalmanUpdate:
-        """Compute how a touch changes the estimates of the linear unknowns.
-
-        There is one estimate for each level and each pretension.
-
-        Args:
-            misfit: Misfit vectors of the touch, shape (n_pretension, n_electrode).
-            jacobian: Jacobian of the misfit vectors for the linear unknowns, shape (n_level, n_pretension, n_electrode,
-                n_unknown).
-            noise_covariance: Result of `_noise_covariance`.
-        """
-        # The first two axes of all arrays are level and pretension.
-        cross_covariance = jacobian @ self._covariance
-        transposed = cross_covariance.swapaxes(-1, -2)
-        innovation_covariance = noise_covariance + cross_covariance @ jacobian.swapaxes(-1, -2)
-        predicted_misfit = (jacobian @ self._mean[..., None])[..., 0]
-        innovation = (misfit - predicted_misfit)[..., None]  # as a column
-
-        # One call solves the systems for the innovation and for the columns of the cross covariance.
-        right_sides = np.concatenate([innovation, cross_covariance], axis=-1)
-        solutions = np.linalg.solve(innovation_covariance, right_sides)
-        weighted_innovation = solutions[..., :1]
-        weighted_covariance = solutions[..., 1:]
-        squared_distance = (innovation * weighted_innovation).sum(axis=(-1, -2))
-        return KalmanUpdate(
-            mean_change=(transposed @ weighted_innovation)[..., 0],
-            covariance_reduction=transposed @ weighted_covariance,
-            density=np.exp(-0.5 * squared_distance) / np.sqrt(np.linalg.det(innovation_covariance)),
-        )
 
     def _noise_covariance(self, jacobian: Array) -> Array:
         """Return the covariance of the misfit vector of a touch, if the linear unknowns are known.
@@ -412,22 +399,25 @@ class FilmFilter:
             jacobian: Jacobian of the misfit vector, as `_linearise` returns it.
 
         Returns:
-            Shape (n_level, n_pretension, n_electrode, n_electrode).
+            Covariance, shape (n_level, n_pretension, n_electrode, n_electrode), in units of the mean squared misfit of
+            good touches.
         """
-        offset_jacobian = jacobian[..., self._layout.offset]
+        offset_jacobian = jacobian[..., self._layout.offset]  # shape (n_level, n_pretension, n_electrode)
+        outer_product = offset_jacobian[..., :, None] * offset_jacobian[..., None, :]
         scatter_variance = self._scatter_std[:, None, None, None] ** 2
-        scatter = scatter_variance * (offset_jacobian[..., :, None] * offset_jacobian[..., None, :])
-        return np.asarray(np.eye(self._layout.electrodes) + scatter)
+        scatter_covariance = scatter_variance * outer_product
+        return np.asarray(np.eye(self._layout.electrodes) + scatter_covariance)
 
     def _linearise(self, charge_pC: Array, log_changes: Array) -> tuple[Array, Array]:
         """Compute the misfit vector of a touch at each pretension, and the Jacobian for the linear unknowns.
 
-        The derivatives are finite differences. The finite step of the offset is the estimated mean offset of the level.
-        The misfit vector without this offset is therefore exact.
+        The derivatives are finite differences. The step of the offset is the estimated mean offset of the level, so
+        that the linearised misfit vector without this offset is exact.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
-            log_changes: As in `update`.
+            log_changes: Changes of the logarithms of the charges by one unit of each direction at the contact, shape
+                (n_direction, n_electrode).
 
         Returns:
             Misfit vectors, shape (n_pretension, n_electrode), and their Jacobian, shape (n_level, n_pretension,
@@ -436,20 +426,21 @@ class FilmFilter:
         layout = self._layout
         offset_step_pC = self._offset_steps()
 
-        # The network evaluates the charges of the touch and all changed charges at once. The groups have the shapes
-        # (1, n_electrode), (n_electrode, n_electrode), (n_level, n_electrode) and (n_direction, n_electrode).
+        # The network evaluates the charges of the touch and all changed charges at once.
         changed_charges = [
-            charge_pC[None],
-            charge_pC + GAIN_STD * np.diag(charge_pC),
-            charge_pC - np.outer(offset_step_pC, self._offset_ratio),
-            charge_pC * np.exp(log_changes),
+            charge_pC[None],  # shape (1, n_electrode)
+            charge_pC + GAIN_STD * np.diag(charge_pC),  # shape (n_electrode, n_electrode)
+            charge_pC - np.outer(offset_step_pC, self._offset_ratio),  # shape (n_level, n_electrode)
+            charge_pC * np.exp(log_changes),  # shape (n_direction, n_electrode)
         ]
         vectors = self._network.vectors(np.concatenate(changed_charges), self.grid_MPa) / self._pretensions.misfit_rms
+
+        # Divide the misfit vectors, shape (n_charges, n_pretension, n_electrode), into the same four groups.
         group_ends = np.cumsum([len(group) for group in changed_charges])
         (misfit,), with_gain, without_offset, with_direction = np.split(vectors, group_ends[:-1])
 
-        # The derivatives have the shape (n_unknown, n_pretension, n_electrode). The unknowns become the last axis.
-        # Only the derivative with respect to the offset depends on the level.
+        # The first axis of each difference is the unknown. It becomes the last axis of the Jacobian. Only the
+        # derivative with respect to the offset depends on the level.
         jacobian = np.empty((*self._probability.shape, layout.electrodes, layout.size))
         jacobian[..., layout.gains] = np.moveaxis(with_gain - misfit, 0, 2)
         jacobian[..., layout.offset] = (misfit - without_offset) / offset_step_pC[:, None, None]
@@ -461,8 +452,8 @@ class FilmFilter:
 
         The step is the mean offset of the level, or `SMALLEST_OFFSET_STEP_pC` if the mean offset is smaller.
         """
-        weight = self._probability / self._probability.sum(axis=1, keepdims=True)
-        mean_offset_pC = (weight * self._mean[..., self._layout.offset]).sum(axis=1)
+        pretension_weight = self._probability / self._probability.sum(axis=1, keepdims=True)
+        mean_offset_pC = (pretension_weight * self._mean[..., self._layout.offset]).sum(axis=1)
         is_small = np.abs(mean_offset_pC) < SMALLEST_OFFSET_STEP_pC
         return np.where(is_small, SMALLEST_OFFSET_STEP_pC, mean_offset_pC)
 
@@ -481,8 +472,8 @@ class FilmFilter:
         mean = self._mean[level]
         mean_without_gains = mean.copy()
         mean_without_gains[:, self._layout.gains] = 0.0
-        residual = misfit - (level_jacobian @ mean[:, :, None])[:, :, 0]
-        residual_without_gains = misfit - (level_jacobian @ mean_without_gains[:, :, None])[:, :, 0]
+        residual = misfit - multiply_stacks(level_jacobian, mean)
+        residual_without_gains = misfit - multiply_stacks(level_jacobian, mean_without_gains)
 
         offset_jacobian = level_jacobian[self.nearest, :, self._layout.offset]
         offset_variance = self._scatter_std[level] ** 2 * (offset_jacobian**2).sum()

@@ -48,21 +48,24 @@ FEWEST_TOUCHES = 12
 """Number of touches before the first correction of contacts."""
 
 LARGEST_SQUARE = 9.0
-"""Upper bound of the squared misfit of a touch in this decision, relative to the mean square of good touches."""
+"""Upper limit of the squared misfit of a touch, relative to the mean square of good touches.
+
+The limit applies to the decision whether the film is lost. A single touch then has little influence.
+"""
 
 EXPLAINED_SQUARE = 1.25
 """Largest mean of the squared misfits of very many touches that are explained by a pretension."""
 
 EXPLAINED_SCATTER = 5.0
-"""Amount by which the sum of n squared misfits may exceed n times `EXPLAINED_SQUARE`, relative to the root of n."""
+"""Amount by which the sum of n squared misfits may exceed n * EXPLAINED_SQUARE, divided by the square root of n."""
 
 WRONG_GAINS = np.outer([-1.0, 1.0], [0.03, 0.04, 0.06, 0.09]).ravel()
 """Gain errors of a single electrode that are compared with a change of the pretension."""
 
 WRONG_GAIN_MARGIN = 9.0
-"""Smallest difference of two sums of squared misfits that shows a wrong gain.
+"""Smallest reduction of the sum of squared misfits by a wrong gain with which the gain is considered wrong.
 
-The first sum is the smallest sum for any pretension, and the second sum is the sum with the wrong gain.
+The sum with the wrong gain is compared with the smallest sum for any pretension.
 """
 
 OFFSET_CORRECTION_ERROR = 0.5
@@ -170,7 +173,7 @@ class FilmFollower:
     The methods must be called from one thread. The same frames always give bitwise equal contacts.
 
     Attributes:
-        predictor: Model of the film with the pretension that is estimated now.
+        predictor: Model of the film with the estimated pretension.
         is_lost: Whether the estimate is not updated, because no pretension explains the latest touches.
     """
 
@@ -180,7 +183,7 @@ class FilmFollower:
         Args:
             predictor: The calibrated model.
             rule: Settings; None for the settings of an empty section.
-            offset_ratio: Ratio of the charge that warmth adds to an electrode to the common offset, shape
+            offset_ratio: Charge that warmth adds to each electrode, relative to the common offset, shape
                 (n_electrode,), or one number for all electrodes.
 
         Raises:
@@ -273,9 +276,10 @@ class FilmFollower:
     def follow_contact(self, contact: Contact, charge_pC: Array) -> FollowedContact:
         """Correct a contact for the present estimate of the film, and add the uncertainty of the pretension.
 
-        The followed film has other charges than the calibrated one. The measured charges are therefore divided by the
-        ratio of both, and the contact is computed again from the result. The uncertainty is computed with a model at a
-        neighbouring pretension. Before the first estimate, the contact is returned unchanged.
+        The same contact gives other charges on the followed film than on the calibrated film. The measured charges are
+        therefore divided by the ratio of these charges, and the contact is computed again from the result. The
+        uncertainty is computed with a model at a neighbouring pretension. Before the first estimate, the contact is
+        returned unchanged.
 
         Args:
             contact: Contact that `predictor` computed from the charges.
@@ -334,6 +338,7 @@ class FilmFollower:
         self._recent_misfits.append(self._squared_misfits(peak.charge_pC, log_changes, residuals))
         if len(self._recent_misfits) < FEWEST_TOUCHES:
             return
+
         was_lost = self.is_lost
         self.is_lost = self._is_unexplained() or self._is_gain_wrong() or self._filter.is_offset_too_large
         if not self.is_lost:
@@ -362,11 +367,13 @@ class FilmFollower:
         """
         directions = self._filter.direction_means(self._filter.mean_MPa)
         corrected_pC = (charge_pC - self._filter.offset_pC) * np.exp(-directions @ log_changes)
-        charges_with_wrong_gain_pC = corrected_pC * self._wrong_gains
-        models = (self._calibrated, self.predictor)
-        misfits = [model.predict_batch(charges_with_wrong_gain_pC).misfit for model in models]
+        charges_with_wrong_gain_pC = corrected_pC * self._wrong_gains  # one row for each wrong gain
+        calibrated_misfit = self._calibrated.predict_batch(charges_with_wrong_gain_pC).misfit
+        followed_misfit = self.predictor.predict_batch(charges_with_wrong_gain_pC).misfit
+        misfit = np.concatenate([calibrated_misfit, followed_misfit]).astype(float)
         mean_square_of_good_touches = self._pretensions.misfit_rms**2 * (1.0 + residuals.offset_variance)
-        wrong_gain = np.concatenate(misfits).astype(float) ** 2 / mean_square_of_good_touches
+        wrong_gain = misfit**2 / mean_square_of_good_touches
+
         filtered = np.minimum(residuals.filtered, LARGEST_SQUARE)
         return SquaredMisfits(
             filtered=filtered,
@@ -439,7 +446,7 @@ class FilmFollower:
         return 1.0 / (1.0 + odds)
 
     def _apply_estimate(self, estimate: FilmStateEstimate) -> None:
-        """Use a new estimate of the film to compute all later contacts.
+        """Use a new estimate of the film for all later contacts.
 
         If the pretension has changed by less than `SMALLEST_CHANGE_MPa`, the present pretension and the present models
         are kept, and only the other values of the estimate are used.

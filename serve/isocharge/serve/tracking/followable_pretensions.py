@@ -44,12 +44,14 @@ def _check_same_model(predictor: Predictor, pretensions: Pretensions) -> None:
     charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)  # a weak, a typical and a strong press
     calibrated_model = predictor.with_constants(pretensions.constants(pretensions.calibrated_MPa))
     other_model = predictor.with_constants(pretensions.constants(other_MPa))
-    own, calibrated, other = (
-        np.asarray(model.predict_batch(charges_pC)) for model in (predictor, calibrated_model, other_model)
-    )
+    own = np.asarray(predictor.predict_batch(charges_pC))
+    calibrated = np.asarray(calibrated_model.predict_batch(charges_pC))
+    other = np.asarray(other_model.predict_batch(charges_pC))
+
     # The tolerance covers the rounding errors of the interpolated weights. Missing correlations are NaN.
-    is_same_model = np.allclose(calibrated, own, rtol=1e-5, atol=1e-5, equal_nan=True)
-    if not is_same_model or np.array_equal(other, own):
+    is_equal_at_calibration = np.allclose(calibrated, own, rtol=1e-5, atol=1e-5, equal_nan=True)
+    depends_on_pretension = not np.array_equal(other, own)
+    if not (is_equal_at_calibration and depends_on_pretension):
         raise ModelError(
             f"{predictor.folder}: pretensions.npz is not of this model.onnx; copy the model's folder again, or "
             "calibrate again"

@@ -91,10 +91,10 @@ class ContactHypothesis(NamedTuple):
 
     @property
     def contact(self) -> Contact:
-        """The contact of the component as a `Contact`, the type that a model predicts.
+        """The hypothesis as a `Contact`, the type that a model predicts.
 
-        The state of the component has the logarithm of the force. The standard deviation of the force is therefore the
-        force times the standard deviation of this logarithm.
+        The state contains the logarithm of the force. The standard deviation of the force is therefore the force
+        multiplied by the standard deviation of this logarithm.
         """
         x_mm, y_mm, log_force = self.mean[CONTACT].tolist()
         covariance = self.covariance[CONTACT, CONTACT]
@@ -123,7 +123,7 @@ class ContactHypothesis(NamedTuple):
 
     @property
     def moving_probability(self) -> float:
-        """Probability that a contact at rest would have a smaller estimated velocity than this component.
+        """Probability that a contact at rest would have a smaller estimated velocity than this contact.
 
         The probability is the result of a chi-squared test of the velocity.
         """
@@ -140,7 +140,7 @@ class Components(NamedTuple):
         mean: Means of the state, shape (n, 6 + n_electrode).
         covariance: Covariances of the state, shape (n, 6 + n_electrode, 6 + n_electrode).
         log_weight: Logarithms of the weights, shape (n,). Only their differences matter.
-        misfit: Distance of the latest charges from those of the most probable component, in standard deviations.
+        misfit: Distance of the latest charges from the charges of the most probable component, in standard deviations.
     """
 
     mean: Array
@@ -158,7 +158,7 @@ class Components(NamedTuple):
         return self._replace(mean=self.mean[rows], covariance=self.covariance[rows], log_weight=self.log_weight[rows])
 
     def with_component(self, mean: Array, covariance: Array, log_weight: float) -> "Components":
-        """Return the components and another one.
+        """Return the components with an additional component.
 
         Args:
             mean: Mean of the state, shape (6 + n_electrode,).
@@ -186,7 +186,7 @@ def predict_components(components: Components, dt_s: float) -> Components:
     transition[CONTACT, RATES] = dt_s * np.eye(3)
     covariance = transition @ components.covariance @ transition.T
 
-    # The process noise of the position is proportional to the squared speed, because resting contacts rarely move off.
+    # The process noise of the position is proportional to the squared speed, because contacts at rest rarely move.
     squared_speed = (mean[:, VELOCITY] ** 2).sum(axis=1)
     relative_density = np.maximum(squared_speed / POSITION_MOTION.velocity_variance, MIN_ACCELERATION_SHARE)
     position_density = POSITION_MOTION.acceleration_density * relative_density
@@ -248,7 +248,7 @@ def _similar_component(components: Components, row: int, candidates: list[int]) 
 
 
 def combine_components(components: Components, probability: Array) -> ContactHypothesis:
-    """Combine components of the same contact by matching the mean and the covariance of the state.
+    """Combine components of the same contact into one Gaussian with the same mean and covariance of the state.
 
     Args:
         components: The components.
@@ -258,6 +258,8 @@ def combine_components(components: Components, probability: Array) -> ContactHyp
     share = probability / total_probability
     mean = share @ components.mean
     deviation = components.mean - mean
+
+    # The covariance of a mixture is the mean of the covariances plus the covariance of the means.
     covariance_within = np.tensordot(share, components.covariance, 1)
     covariance_between = (share[:, None] * deviation).T @ deviation
     covariance = covariance_within + covariance_between

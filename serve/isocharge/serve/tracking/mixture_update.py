@@ -16,7 +16,7 @@ MAX_ITERATION_LOG_STEP = 0.2
 
 
 class Measurement(NamedTuple):
-    """Charges averaged over a step.
+    """Measured charges and their variances, averaged over the frames of a step.
 
     Attributes:
         charge_pC: Touch charges, shape (n_electrode,), pC.
@@ -28,12 +28,12 @@ class Measurement(NamedTuple):
 
 
 class LinearisedUpdate(NamedTuple):
-    """Quantities of a Kalman update. The measurement is linearised about one state of each component.
+    """Quantities of a Kalman update of n components. The charges are linearised about one state of each component.
 
     Attributes:
         charge_pC: Charges of the state, shape (n, n_electrode), pC.
         cross_covariance: Covariance of the charges and the state, shape (n, n_electrode, 6 + n_electrode).
-        charge_covariance: Covariance of the charges that the uncertain state causes, shape
+        charge_covariance: Covariance of the charges due to the uncertainty of the state, shape
             (n, n_electrode, n_electrode), pC^2.
         innovation_covariance: Sum of `charge_covariance` and the noise of the measurement, the same shape, pC^2.
         weighted_innovation: Innovation multiplied by the inverse of its covariance, shape (n, n_electrode, 1), 1/pC.
@@ -71,7 +71,7 @@ def charges_and_jacobian(charges: ChargeSeries, mean: Array) -> tuple[Array, Arr
 def linearise_update(
     charges: ChargeSeries, state: Array, prior: Components, measurement: Measurement
 ) -> LinearisedUpdate:
-    """Linearise the Kalman update of the components.
+    """Linearise the charges about a state of each component, and compute the quantities of a Kalman update.
 
     Args:
         charges: Charges of the film.
@@ -84,8 +84,11 @@ def linearise_update(
     cross_covariance = jacobian @ prior.covariance
     charge_covariance = cross_covariance @ transposed
     innovation_covariance = charge_covariance + np.diag(measurement.variance)
-    state_correction = ((prior.mean - state)[:, None] @ transposed)[:, 0]
-    innovation = measurement.charge_pC - charge_pC - state_correction
+
+    # The linearised charges of the prior mean are the charges of the state plus this change.
+    prior_rows = (prior.mean - state)[:, None]  # shape (n, 1, 6 + n_electrode)
+    prior_change_pC = (prior_rows @ transposed)[:, 0]
+    innovation = measurement.charge_pC - charge_pC - prior_change_pC
     weighted_innovation = np.linalg.solve(innovation_covariance, innovation[:, :, None])
     return LinearisedUpdate(
         charge_pC, cross_covariance, charge_covariance, innovation_covariance, np.asarray(weighted_innovation)
@@ -100,15 +103,23 @@ def updated_covariance(prior: Components, linearised: LinearisedUpdate) -> Array
         linearised: The update, linearised about the new states.
     """
     cross_covariance = linearised.cross_covariance
-    gain = np.linalg.solve(linearised.innovation_covariance, cross_covariance)
-    covariance = prior.covariance - cross_covariance.swapaxes(1, 2) @ gain
+    transposed_gain = np.linalg.solve(linearised.innovation_covariance, cross_covariance)
+    covariance = prior.covariance - cross_covariance.swapaxes(1, 2) @ transposed_gain
     symmetric = 0.5 * (covariance + covariance.swapaxes(1, 2))  # rounding errors would make it asymmetric
     return np.asarray(symmetric)
 
 
 def limit_iteration_step(step: Array) -> Array:
-    """Shorten steps of the state, shape (n, 6 + n_electrode), so that the linearisation is accurate over each step."""
-    position_excess = np.hypot(step[:, X], step[:, Y]) / MAX_ITERATION_STEP_mm
-    force_excess = np.abs(step[:, LOG_FORCE]) / MAX_ITERATION_LOG_STEP
-    excess = np.maximum(position_excess, force_excess)
-    return np.asarray(step / np.maximum(excess, 1.0)[:, None])
+    """Shorten long steps of the state, so that the linearisation is accurate over each step.
+
+    Args:
+        step: Step of the state of each component, shape (n, 6 + n_electrode).
+
+    Returns:
+        Steps in the same directions, shape (n, 6 + n_electrode).
+    """
+    relative_distance = np.hypot(step[:, X], step[:, Y]) / MAX_ITERATION_STEP_mm
+    relative_force_change = np.abs(step[:, LOG_FORCE]) / MAX_ITERATION_LOG_STEP
+    relative_length = np.maximum(relative_distance, relative_force_change)
+    divisor = np.maximum(relative_length, 1.0)  # steps that are short enough are not changed
+    return np.asarray(step / divisor[:, None])
