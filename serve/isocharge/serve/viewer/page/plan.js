@@ -127,9 +127,14 @@ export class Plan {
     for (const outline of Object.values(this.film.outlines_mm)) { path(g, outline); g.fill(); }
     g.strokeStyle = theme.accent; g.strokeRect(-this.reach, -this.reach, 2 * this.reach, 2 * this.reach);
     g.restore();
-    this.text(g, `Ø ${2 * this.film.radius_mm} mm`, x + size + 6 * px, y - size + 6 * px, 11 * px, theme.quiet, "left");
     const isShaded = this.film.unnoticed?.share.flat().some((value) => value >= UNNOTICED_SHARE);
-    if (isShaded) this.text(g, "shaded: wrong, no flag", x + size + 6 * px, y - size + 20 * px, 11 * px, theme.warn, "left");
+    // Two lines beside the overview. The longer line is below the electrodes of the built-in sensors.
+    const diameter = `Ø ${2 * this.film.radius_mm} mm`;
+    const left = x + size + 6 * px;
+    const lowerLine = y - size + 6 * px;
+    const upperLine = y - size + 20 * px;
+    this.text(g, diameter, left, isShaded ? upperLine : lowerLine, 11 * px, theme.quiet, "left");
+    if (isShaded) this.text(g, "shaded: wrong, no flag", left, lowerLine, 11 * px, theme.warn, "left");
   }
 
   radius(force) { return (5 + 15 * Math.sqrt(Math.min(Math.max(force, 0) / this.largest, 1.5))) * this.css; }
