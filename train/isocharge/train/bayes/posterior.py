@@ -92,12 +92,13 @@ class Cells:
         return self.press.size
 
     def __getitem__(self, rows: np.ndarray) -> "Cells":
+        """Return some of the cells."""
         return Cells(self.press[rows], self.root[rows], self.centre[rows], self.side)
 
     def divided(self, radius: float) -> "Cells":
         """Divide each cell into four cells, and drop the cells outside the disk with this radius, mm."""
-        parts = self._quarters(0.25)
-        return parts[_overlaps_disk(parts.centre, parts.side, radius)]
+        quarters = self._quarters(0.25)  # the centres of four equal parts
+        return quarters[_overlaps_disk(quarters.centre, quarters.side, radius)]
 
     def finer(self, radius: float) -> Iterator["Cells"]:
         """Yield finer cells for the last integration.
@@ -108,7 +109,7 @@ class Cells:
         Args:
             radius: Radius of the disk, mm.
         """
-        gauss_offset = 1.0 / np.sqrt(12.0)
+        gauss_offset = 1.0 / np.sqrt(12.0)  # of the two points of Gauss-Legendre quadrature on an interval of length 1
         is_on_edge = self.on_edge(radius)
         yield self[~is_on_edge]._quarters(gauss_offset)
         yield self[is_on_edge].divided(radius).divided(radius)
@@ -117,9 +118,10 @@ class Cells:
         """Replace each cell by four cells whose sides are half as long.
 
         Args:
-            offset: Distance of their centres from the centre of the cell along x and y, in sides of the cell.
+            offset: Distance of the new centres from the centre of the cell along x and y, in sides of the cell.
         """
-        centre = (self.centre[:, None] + _grid(2, 2.0 * offset * self.side)).reshape(-1, 2)
+        displacements = _grid(2, 2.0 * offset * self.side)  # shape (4, 2)
+        centre = (self.centre[:, None] + displacements).reshape(-1, 2)
         return Cells(np.repeat(self.press, 4), np.repeat(self.root, 4), centre, 0.5 * self.side)
 
     def on_edge(self, radius: float) -> Booleans:
@@ -146,7 +148,7 @@ class Cells:
         points = centroid[edge_cells, None] + _grid(EDGE_POINTS, self.side / EDGE_POINTS)  # shape (n, n_point, 2)
         is_inside = np.hypot(points[..., 0], points[..., 1]) <= radius
         n_inside = is_inside.sum(axis=1)
-        fraction[edge_cells] = np.maximum(n_inside, 0.5) / EDGE_POINTS**2
+        fraction[edge_cells] = np.maximum(n_inside, 0.5) / EDGE_POINTS**2  # of all points of the cell
 
         # The centroid is the mean of the points inside or, without such points, the nearest point of the disk.
         point_sum = (points * is_inside[..., None]).sum(axis=1)
@@ -172,8 +174,8 @@ class _RootCells(NamedTuple):
     """The first cells of a press.
 
     Attributes:
-        cells: The cells, n of them.
-        terms: Terms of the charges at their centres, shape (n, n_term, n_electrode).
+        cells: The n cells.
+        terms: Terms of the charges at the centres of the cells, shape (n, n_term, n_electrode).
         largest_slope: Largest slope of each scaled charge in each cell, shape (n, n_electrode), 1/mm.
     """
 
@@ -214,12 +216,13 @@ class Posterior:
             Mean and standard deviation of (x, y, F), shape (n, 3) each, mm and N.
 
         Raises:
-            ChargeError: If there are no charges, or they are not finite or of another number of electrodes.
+            ChargeError: If there are no charges, if a charge is not finite, or if the number of electrodes is wrong.
         """
         charge = np.asarray(charge, dtype=float)
         n_electrode = len(self.charges.electrodes)
-        has_shape = charge.ndim == 2 and charge.shape[1] == n_electrode and len(charge) > 0
-        if not has_shape or not np.isfinite(charge).all():
+        has_electrodes = charge.ndim == 2 and charge.shape[1] == n_electrode
+        is_valid = has_electrodes and len(charge) > 0 and bool(np.isfinite(charge).all())
+        if not is_valid:
             raise ChargeError(
                 f"expected finite charges of shape (n, {n_electrode}), n at least 1, got shape {charge.shape}"
             )
@@ -297,7 +300,7 @@ class Posterior:
             log_force = self._profile.best(terms, cell_charge, self.noise)
             chi2, slope = self._chi2_and_slope(terms, log_force, cell_charge, roots.largest_slope[cells.root])
             smallest_chi2 = np.full(n_press, np.inf)
-            np.minimum.at(smallest_chi2, cells.press, chi2)
+            np.minimum.at(smallest_chi2, cells.press, chi2)  # the smallest value among the cells of each press
             excess_chi2 = chi2 - smallest_chi2[cells.press]
 
             # A lower bound of chi-squared in the whole cell: no position is farther from the centre than the corners.
@@ -309,7 +312,7 @@ class Posterior:
             # of the position in any of them.
             largest_inverse_std = np.zeros(n_press)
             inverse_std = self._inverse_std(cells[possible], terms[possible], log_force[possible])
-            np.maximum.at(largest_inverse_std, cells.press[possible], inverse_std)
+            np.maximum.at(largest_inverse_std, cells.press[possible], inverse_std)  # among the cells of each press
             press_is_fine = largest_inverse_std * cells.side <= MAX_SIDE_STD
             if division == MAX_DIVISIONS:
                 press_is_fine[:] = True
@@ -358,7 +361,7 @@ class Posterior:
 
         Args:
             cells: Cells at whose centres the contact is assumed.
-            terms: Terms of the charges there, shape (n, n_term, n_electrode).
+            terms: Terms of the charges at the centres, shape (n, n_term, n_electrode).
             log_force: Logarithms of the forces, shape (n,).
 
         Returns:
@@ -424,7 +427,7 @@ def _moments(press: Integers, position: Array, log_force: Array, log_weight: Arr
         Means and then standard deviations, shape (2, n_press, 3), mm and N.
     """
     # The rows of a press follow each other, so `reduceat` with the first row of each press gives values by press.
-    first_row = np.flatnonzero(np.diff(press, prepend=-1))
+    first_row = np.flatnonzero(np.diff(press, prepend=-1))  # where the number of the press changes
     n_row = np.diff(first_row, append=press.size)
 
     # The largest weight of each press is scaled to 1, so that the exponentials do not underflow.
@@ -435,7 +438,11 @@ def _moments(press: Integers, position: Array, log_force: Array, log_weight: Arr
     total_weight = np.add.reduceat(position_weight, first_row)
 
     def expectation(weighted: Array) -> Array:
-        """Return the weighted mean over the positions of each press."""
+        """Return the weighted mean over the positions of each press, shape (n_press,).
+
+        Args:
+            weighted: Values at the positions times their weights, shape (n_position,).
+        """
         return np.asarray(np.add.reduceat(weighted, first_row, axis=0) / total_weight)
 
     x, y = (expectation(position_weight * coordinate) for coordinate in position.T)

@@ -30,8 +30,9 @@ from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.calibration.side_forces import solve_side_forces, with_friction
 
 UNEXPLAINED_PROBABILITY = 1e-6
-"""Probability of the residuals for presses of a possible film, below which no film explains the presses, provided that
-the residuals exceed `UNEXPLAINED_CHI2`."""
+"""Probability of the residuals below which no film explains the presses.
+
+The presses are refused only if the mean squared residual also exceeds `UNEXPLAINED_CHI2`."""
 
 UNEXPLAINED_CHI2 = 9.0
 """Mean squared residual, in units of the noise variance, above which no film explains the presses."""
@@ -40,26 +41,30 @@ UNCERTAIN_PROBABILITY = 0.01
 """Probability of the residuals below which the stated errors are increased by Birge's ratio."""
 
 STRAINED_PROBABILITY = 1e-7
-"""Probability of a film that differs this much from its description, below which the presses are considered to be
-recorded wrongly."""
+"""Probability of a film below which the presses are considered to be recorded wrongly.
+
+It is the probability that a film differs at least as much from its description as the estimated film does."""
 
 ODD_PROBABILITY = 1e-3
-"""Probability of such a film below which common mistakes in the records of presses are searched for."""
+"""Probability of a film, as for `STRAINED_PROBABILITY`, below which common mistakes in the records are searched for."""
 
 MISLEADING_MISFIT = 8.0
 """Misfit of the recorded presses, as `misfit` returns it, above which mistakes are searched for before a fit."""
+
+MAX_MISTAKE_PROBABILITY = 0.5
+"""Largest probability of an unseen mistake that is assumed because other presses were left out."""
 
 FEW = 3
 """Largest number of presses among which a wrong one cannot be recognised. The user is warned."""
 
 BOUND_DISTANCE = 0.1
-"""Distance from its bound within which a parameter counts as limited by the bound, in prior standard deviations."""
+"""Distance from a bound within which a parameter counts as limited by the bound, in prior standard deviations."""
 
 MAX_FRICTION_ROUNDS = 3
-"""Largest number of fits of presses with friction, each with the effect of friction on the film of the one before."""
+"""Largest number of fits of presses with friction. Each fit uses the effect of friction on the previous film."""
 
 MAX_FRICTION_STEP = 0.25
-"""Largest change of a parameter, in standard deviations of its prior, after which the effect of friction is kept."""
+"""Largest step of a parameter, in prior standard deviations, for which the effect of friction is not computed again."""
 
 CLOSE_MM = 1.0
 """Distance within which all presses lie too close to each other to determine the positions of the electrodes, mm."""
@@ -278,7 +283,7 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
     # Presses that were left out as wrong make further mistakes likely, unless many good presses agree with each other.
     good_count = int((~posterior.bad).sum())
     left_out_count = int(posterior.bad.sum())
-    mistake_probability = min(left_out_count / (good_count * good_count), 0.5)
+    mistake_probability = min(left_out_count / (good_count * good_count), MAX_MISTAKE_PROBABILITY)
     if good_count <= FEW:
         mistake_probability += MISTAKE_PROBABILITY * good_count
     correct_probability = 1.0 - mistake_probability
@@ -302,7 +307,7 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
     Args:
         presses: All presses of the calibration.
         problem: The possible films.
-        posterior: The estimate of the film, which says which presses are bad.
+        posterior: The estimate of the film, and the presses that were left out as bad.
     """
     if posterior.bad.any():
         lines = row_words(presses[posterior.bad].lines, presses.row_noun)

@@ -27,7 +27,7 @@ FORMAT_VERSION = 1
 """Version of the format, which is written and read."""
 
 PASCAL_FACTOR = 1e6
-"""Factor from MPa to Pa, in which the file has the pretension."""
+"""Factor from MPa to Pa, the unit of the pretension in the file."""
 
 LARGEST_STD = 100.0
 """Largest standard deviation that the reader accepts, in standard deviations of the prior."""
@@ -39,16 +39,20 @@ BOUND_TOLERANCE = 1e-6
 """Distance from the bounds of a parameter that counts as rounding, in standard deviations of the prior."""
 
 CORRELATION_TOLERANCE = 2e-6
-"""Difference of correlations that counts as rounding: they are written with six digits."""
+"""Difference of correlations that counts as rounding, because correlations are written with six digits."""
 
 EIGENVALUE_TOLERANCE = 1e-4
-"""Largest negative eigenvalue of a matrix of correlations that counts as rounding; 160 unknowns give some 1e-5."""
+"""Largest magnitude of a negative eigenvalue of a correlation matrix that counts as rounding.
+
+Rounding the correlations of 160 unknowns causes negative eigenvalues of about 1e-5."""
 
 TEMPERATURES_C = (-100.0, 200.0)
 """Lowest and highest temperature of a film, degrees Celsius, as in files of presses."""
 
 
 class _Estimate(Struct, frozen=True):
+    """Value of a quantity in the file, with its standard deviation."""
+
     value: Finite
     std: NotNegative
 
@@ -57,19 +61,23 @@ Correlation = Annotated[float, Meta(ge=-1.0 - CORRELATION_TOLERANCE, le=1.0 + CO
 
 
 class _Temperature(Struct, frozen=True):
+    """Section of the file about the change of the pretension with temperature."""
+
     at_C: Annotated[float, Meta(ge=TEMPERATURES_C[0], le=TEMPERATURES_C[1])]
     pretension_per_K: _Estimate
     correlations: list[Correlation] = []  # older versions wrote none
 
 
 class _Discrepancy(Struct, frozen=True):
+    """Section of the file about the coefficients of the film."""
+
     coefficients: list[Finite]
     std: list[NotNegative]
     correlations: list[list[Correlation]]
 
 
 class _CalibrationFile(Struct, frozen=True):
-    """What the reader takes from calibration.json."""
+    """The entries of calibration.json that the reader uses."""
 
     format_version: Literal[1]
     sensor: Text
@@ -116,7 +124,7 @@ def _correlation_table(covariance: Array) -> list[list[float]]:
 def _discrepancy_table(posterior: FilmPosterior) -> dict[str, Any] | None:
     """Return coefficients, standard deviations and correlations of parameters and coefficients for the file.
 
-    The result is None if the film probably has no discrepancy.
+    The result is None if the film probably has neither imperfections nor a discrepancy.
     """
     if not posterior.imperfect:
         return None
@@ -131,7 +139,7 @@ def _temperature_table(posterior: FilmPosterior) -> dict[str, Any] | None:
     """Return the change of the pretension with temperature for the file, in C and Pa/K.
 
     The table includes the correlations of the change with the other unknowns in the file: the parameters, and the
-    coefficients if the film has imperfections. A calibration without temperatures gives None.
+    coefficients if the film has imperfections. The result is None if no temperatures were measured.
 
     Args:
         posterior: The estimate of the film.
@@ -439,7 +447,7 @@ def _numbers(path: Path, key: str, rows: list[list[Correlation]], may_be_null: B
     Raises:
         PressError: If a row contains null where a number is needed.
     """
-    matrix = np.array([[np.nan if value is None else value for value in row] for row in rows])
+    matrix = np.array(rows, dtype=float)  # NumPy converts None into NaN
     is_null = np.isnan(matrix)
     is_missing = is_null & ~may_be_null
     if is_missing.any():
@@ -473,4 +481,5 @@ def _possible(path: Path, correlations: Array) -> Array:
         )
     if smallest_eigenvalue >= 0.0:
         return correlations
-    return np.asarray((vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T)
+    limited_eigenvalues = np.maximum(eigenvalues, 0.0)
+    return np.asarray((vectors * limited_eigenvalues) @ vectors.T)

@@ -19,7 +19,7 @@ STEP = 0.005
 """Step of the finite differences with respect to a parameter, in standard deviations of its prior."""
 
 STEPPED = tuple(parameter.name for parameter in PARAMETERS if parameter.derivative == "difference")
-"""Parameters whose derivatives are differences."""
+"""Names of the parameters whose derivatives are computed as finite differences."""
 
 CONTACT_STEPS = (5e-3, 5e-3, 1e-3)
 """Steps of the finite differences in x and y (mm) and in ln F. They are small, because the domain is reduced by a
@@ -92,6 +92,7 @@ class FilmMaps:
 
     @cached_property
     def _maps(self) -> dict[tuple[Film, Circle], ForwardMap]:
+        """Cache of `forward_map`, by film and probe. The first entry is the oldest one."""
         return {}
 
     def parameter_jacobian(

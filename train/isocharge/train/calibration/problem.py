@@ -32,8 +32,9 @@ DRIFT = {
     "probe_radius": 0.03,
     "gain": 0.1,
 }
-"""Standard deviation of the change of each parameter since an earlier calibration, relative to the prior, by the field
-of `FilmSpread`.
+"""Standard deviation of the change of each parameter since an earlier calibration, relative to the prior.
+
+The keys are fields of `FilmSpread`.
 
 The values correspond to 0.35 MPa of the pretension (creep and a degree of temperature), 1 % of the piezoelectric
 coefficients and 0.5 % of the gains. Presses with a known force can also reveal larger changes. Touches with an unknown
@@ -133,8 +134,9 @@ class FilmEstimate:
         covariance = self.covariance + np.diag(drift_std**2)
         joint = self.joint
         if joint.size:
-            coefficient_std = np.full(self.coefficients.size, COEFFICIENT_DRIFT_STD)
-            joint = joint + np.diag(np.concatenate([drift_std, coefficient_std]) ** 2)
+            coefficient_drift_std = np.full(self.coefficients.size, COEFFICIENT_DRIFT_STD)
+            joint_drift_std = np.concatenate([drift_std, coefficient_drift_std])
+            joint = joint + np.diag(joint_drift_std**2)
         parameters = np.clip(self.parameters, *prior.bounds)
         return FilmEstimate(parameters, covariance, self.coefficients, joint, self.warming)
 
@@ -383,7 +385,9 @@ def _with_electrodes(prior: FilmPrior, sensor: Sensor) -> FilmPrior:
 
     The electrodes of the sensor may have traces and patterned backs.
     """
-    if _pads(prior.sensor) != _pads(sensor) or prior.sensor.electrodes == sensor.electrodes:
+    has_other_pads = _pads(prior.sensor) != _pads(sensor)
+    has_equal_electrodes = prior.sensor.electrodes == sensor.electrodes
+    if has_other_pads or has_equal_electrodes:
         return prior
     return replace(prior, sensor=replace(prior.sensor, electrodes=sensor.electrodes))
 
@@ -402,6 +406,15 @@ def _folders(models: Path | None, name: str) -> list[Path]:
         models: Folder of models that is searched first.
         name: Name of the sensor.
     """
-    folders = [find_model((root / model).resolve()) for root in repositories(models) for model in model_names(root)]
-    with_films = [folder for folder in folders if (folder / FILE).is_file()]
-    return sorted(with_films, key=lambda folder: not folder.parent.name.startswith(name))
+    folders_with_network = []
+    for root in repositories(models):
+        for model in model_names(root):
+            version_folder = find_model((root / model).resolve())
+            if (version_folder / FILE).is_file():
+                folders_with_network.append(version_folder)
+
+    def has_other_name(version_folder: Path) -> bool:
+        """Return whether the name of a model does not begin with the name of the sensor. False is sorted first."""
+        return not version_folder.parent.name.startswith(name)
+
+    return sorted(folders_with_network, key=has_other_name)

@@ -36,9 +36,10 @@ class CalibrationResult:
     Attributes:
         problem: The films that were considered.
         presses: The presses that were fitted.
-        posterior: Best parameters, covariance, residuals.
-        cautions: Warnings for the user, a sentence each.
-        moved: How an earlier calibration was moved to another temperature, without presses; empty with presses.
+        posterior: Estimate of the film from the presses.
+        cautions: Warnings for the user. Each warning is one sentence.
+        moved: Words that describe how an earlier calibration was moved to another temperature without presses; empty
+            for a calibration by presses.
         side_force_map: Effect of side forces on the charges of the film; None if neither the presses have friction nor
             the contacts a declared side force.
     """
@@ -141,7 +142,8 @@ class CalibrationResult:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Factors, shape (n, n_electrode). They contain half of the friction of the presses; see `SideForces`.
+            Factors, shape (n, n_electrode), dimensionless. The factors include half of the friction of the presses; see
+            `SideForces`.
         """
         factor = self.problem.charges.factor(unknowns, contact)
         if self.side_forces is None:
@@ -171,7 +173,7 @@ class CalibrationResult:
         contact_covariance = self.sensitivity.contact_covariance(covariance)
         if self.side_forces is not None:
             contact_covariance = contact_covariance + self.side_forces.contact_covariance(self.sensitivity)
-        contact_variance = np.einsum("nii->ni", contact_covariance)  # the diagonals, shape (n, 3)
+        contact_variance = np.diagonal(contact_covariance, axis1=1, axis2=2)  # shape (n, 3)
         added_variance = AddedVariance(self.sensitivity.contact, contact_variance)
         parameters = unknowns[self.problem.charges.layout.parameters]
         factor = partial(self.charge_factor, unknowns)

@@ -25,8 +25,9 @@ MIN_PRESSES = 2
 """Smallest number of presses after which the remaining error is reported. One press does not determine it."""
 
 ENOUGH = 0.5
-"""Ratio of the position error that the uncertainty of the film causes to the error that noise causes, at which a
-session is complete."""
+"""Ratio of two position errors at which a session is complete.
+
+The first error is caused by the uncertainty of the film, and the second error by noise."""
 
 EXPECTED_ANSWER = (
     'Enter for "as proposed", the real "x y force" in mm and N (? for a value that is unknown), s to skip the place, '
@@ -148,8 +149,7 @@ class PressSession:
             presses: Presses of an earlier session to continue.
             position_std_mm: Standard deviation of the places of further presses, mm.
             force_std: Standard deviation of the forces of further presses, as a share of the force.
-            until: Ratio of the position error that the uncertainty of the film causes to the error that noise causes,
-                at which the session is complete; 0 for never.
+            until: Ratio of position errors at which the session is complete, as `ENOUGH`; 0 for never.
         """
         self.problem = problem
         self._save = save
@@ -168,25 +168,25 @@ class PressSession:
         Raises:
             PressError: If every place was skipped.
         """
-        if self._proposed is None:
-            skipped_mm = np.reshape(self._skipped_places, (-1, 2))  # a list of places may be empty
-            film: FilmEstimate
-            if self.result is not None:
-                film = self.result.posterior
-                count = 1
-            else:
-                # No film explains the presses. The plan for the film of the sensor file is continued, in which each
-                # press so far counts as one of the plan.
-                film = self.problem.expected
-                count = len(self) + 1
-            plan = next_presses(self.problem, count, film, avoid_mm=skipped_mm, **self._stds)
-            self._proposed = plan[-1]
+        if self._proposed is not None:
+            return self._proposed
+        skipped_mm = np.reshape(self._skipped_places, (-1, 2))  # a list of places may be empty
+        film: FilmEstimate
+        if self.result is not None:
+            film = self.result.posterior
+            count = 1
+        else:
+            # There are no presses, or no film explains them. The presses for the film of the sensor file are planned
+            # from the beginning, and each press so far counts as one of the plan.
+            film = self.problem.expected
+            count = len(self) + 1
+        plan = next_presses(self.problem, count, film, avoid_mm=skipped_mm, **self._stds)
+        self._proposed = plan[-1]
         return self._proposed
 
     @property
     def enough(self) -> bool:
-        """Whether the position error that the uncertainty of the film causes is small compared with the error that
-        noise causes."""
+        """Whether the uncertainty of the film causes a small position error, compared with the error by noise."""
         if self.result is None or len(self) < FEW:
             return False
         noise_mm = self.result.sensitivity.noise_error.position_mm
@@ -204,18 +204,17 @@ class PressSession:
         """
         self.check(contact)
         presses = self.presses
-        self._change(
-            replace(
-                presses,
-                contact=np.vstack([presses.contact, contact]),
-                charge_pC=np.vstack([presses.charge_pC, charge]),
-                position_std_mm=np.append(presses.position_std_mm, self._stds["position_std_mm"]),
-                force_std=np.append(presses.force_std, self._stds["force_std"]),
-                temperature_C=_with_unknown(presses.temperature_C),
-                film_temperature_C=_with_unknown(presses.film_temperature_C),
-                lines=(*presses.lines, len(presses) + 1),
-            )
+        presses_with_new_one = replace(
+            presses,
+            contact=np.vstack([presses.contact, contact]),
+            charge_pC=np.vstack([presses.charge_pC, charge]),
+            position_std_mm=np.append(presses.position_std_mm, self._stds["position_std_mm"]),
+            force_std=np.append(presses.force_std, self._stds["force_std"]),
+            temperature_C=_with_unknown(presses.temperature_C),
+            film_temperature_C=_with_unknown(presses.film_temperature_C),
+            lines=(*presses.lines, len(presses) + 1),
         )
+        self._change(presses_with_new_one)
 
     def check(self, contact: Array) -> None:
         """Raise PressError if no calibration accepts a press.

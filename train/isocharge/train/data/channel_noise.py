@@ -33,10 +33,10 @@ If no charge is small, the presses do not determine the white noise.
 """
 
 BOTH_SIGNS = 0.01
-"""Fraction of the presses with the rarer sign above which a channel counts as one with charges of both signs."""
+"""Fraction of presses with the rarer sign, above which a channel is treated as having charges of both signs."""
 
 LEAST_BEND = 0.5
-"""Smallest charge from which on features are logarithmic for channels with both signs, relative to the usual size.
+"""Smallest charge above which features are logarithmic for channels with both signs, relative to the usual size.
 
 With a smaller value, the features of charges with little noise would have a kink where the charge changes its sign.
 """
@@ -86,7 +86,7 @@ class ChannelNoise:
         channel_variances = [
             _variance(value, residual) for value, residual in zip(planes.value.T, planes.residual.T, strict=True)
         ]
-        white_std, gain_std = np.sqrt(np.array(channel_variances)).T
+        white_std, gain_std = np.sqrt(np.array(channel_variances)).T  # each of shape (n_electrode,)
         gain = np.maximum(gain_std, LEAST_GAIN)
         white = np.maximum(white_std, LEAST_SHARE * gain * usual_size(charge))
         return cls(white, gain)
@@ -129,8 +129,9 @@ class ChannelNoise:
             charge: Charges of presses, shape (n, n_electrode), pC.
         """
         share_of_rarer_sign = np.minimum(np.mean(charge > 0.0, axis=0), np.mean(charge < 0.0, axis=0))
-        smallest = np.where(share_of_rarer_sign > BOTH_SIGNS, LEAST_BEND * usual_size(charge), 0.0)
-        return np.asarray(np.maximum(self.white / self.gain, smallest))
+        has_both_signs = share_of_rarer_sign > BOTH_SIGNS
+        smallest_bend = np.where(has_both_signs, LEAST_BEND * usual_size(charge), 0.0)
+        return np.asarray(np.maximum(self.white / self.gain, smallest_bend))
 
     def scaled(self, factor: float) -> "ChannelNoise":
         """Return the noise model with all standard deviations multiplied by a factor."""
@@ -177,13 +178,15 @@ class LocalPlanes:
         offsets = unit[neighbours] - unit[:, None]
         # The constant and the offsets of the neighbours, shape (n, NEIGHBOURS, 1 + number of coordinates)
         columns = np.concatenate([np.ones((*neighbours.shape, 1)), offsets], axis=2)
-        solver = np.linalg.pinv(columns)
-        coefficients = solver @ values[neighbours]  # the value at the press, and then the slopes
+        # The pseudoinverse contains the weights of the neighbours in the least-squares solution.
+        neighbour_weights = np.linalg.pinv(columns)
+        coefficients = neighbour_weights @ values[neighbours]  # the value at the press, and then the slopes
         value = coefficients[:, 0]
         slope = coefficients[:, 1:].swapaxes(1, 2)
 
         # The plane is itself uncertain, by the sum of the squared weights of its neighbours.
-        residual_std = np.sqrt(1.0 + (solver[:, :1] ** 2).sum(axis=2))
+        value_weights = neighbour_weights[:, :1]  # weights in the value of the plane, shape (n, 1, NEIGHBOURS)
+        residual_std = np.sqrt(1.0 + (value_weights**2).sum(axis=2))
         residual = (values - value) / residual_std
         reach = distance[:, -1]
         return cls(value, slope, residual, reach)

@@ -123,13 +123,13 @@ class ChargeField:
             size, _ = _size(log_size, unit[:, 2])
             target = presses.charge / size
             first_degrees, *further_degrees = SIGNED_CANDIDATE_DEGREES
-            smallest_unit = NOISE_CORNER_pC
+            smallest_error_unit = NOISE_CORNER_pC
         else:
             log_size = None
             target = np.log(presses.charge)
             first_degrees, *further_degrees = CANDIDATE_DEGREES
-            smallest_unit = 0.0
-        error_unit = np.hypot(validation.charge, smallest_unit)
+            smallest_error_unit = 0.0
+        error_unit = np.hypot(validation.charge, smallest_error_unit)  # errors are relative to this charge, pC
 
         def fit_degrees(degree: int, force_degree: int) -> ChargeField | None:
             """Fit a series of these degrees, and measure its error on the validation presses.
@@ -153,17 +153,20 @@ class ChargeField:
         if best is None:
             fewest = FEWEST_PER_TERM * series_term_count(*first_degrees)
             raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(unit)}")
+
+        # If the lowest degrees for taut films have a clearly smaller error, the film is taut.
         if not presses.signed and best.error > GOOD_ENOUGH:
             first_taut_degrees, *further_taut_degrees = TAUT_CANDIDATE_DEGREES
             taut = fit_degrees(*first_taut_degrees)
             if taut is not None and taut.error < TAUT_ERROR_RATIO * best.error:
                 best = taut
                 further_degrees = further_taut_degrees
+
         for degree, force_degree in further_degrees:
             if best.error < GOOD_ENOUGH:
                 break
             field = fit_degrees(degree, force_degree)
-            if field is None:
+            if field is None:  # there are too few presses for this degree and all higher ones
                 break
             if field.error < best.error:
                 best = field
@@ -171,11 +174,13 @@ class ChargeField:
 
     def charges(self, contact: Array) -> Array:
         """Return the charges of contacts; see `ChargeMap`."""
-        return self.linearised(contact)[0]
+        charge, _ = self.linearised(contact)
+        return charge
 
     def derivatives(self, contact: Array) -> Array:
         """Return the derivatives of the charges; see `ChargeMap`."""
-        return self.linearised(contact)[1]
+        _, derivatives = self.linearised(contact)
+        return derivatives
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Return charges and derivatives together, which takes half the time; see `ChargeMap`.
@@ -200,6 +205,7 @@ class ChargeField:
 
     @cached_property
     def _series(self) -> Series:
+        """The series with its coefficients, in the form in which it is evaluated."""
         return Series(self.series)
 
     @property
@@ -211,7 +217,7 @@ class ChargeField:
 
 
 def _log_size(unit_log_force: Array, charge: Array) -> Array:
-    """Fit ln S as a polynomial of l.
+    """Fit the logarithm of the size S of the charges as a polynomial of the scaled logarithm l of the force.
 
     Args:
         unit_log_force: Logarithms l of the forces scaled to [-1, 1], shape (n,).
@@ -225,7 +231,7 @@ def _log_size(unit_log_force: Array, charge: Array) -> Array:
 
 
 def _size(coefficients: Array, unit_log_force: Array) -> tuple[Array, Array]:
-    """Compute S and the derivative of ln S with respect to l.
+    """Compute the size S of the charges, and the derivative of ln S with respect to l.
 
     Args:
         coefficients: Coefficients of ln S, as `_log_size` returns them.

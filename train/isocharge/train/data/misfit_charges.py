@@ -59,7 +59,7 @@ LARGE_BOX_FRACTION = 0.3
 OUTSIDE_SCATTER = 0.02
 """Standard deviation of the logarithm of a factor of all charges of a press outside the working area, dimensionless.
 
-It fills the gaps between the presses that are given.
+The factor fills the gaps between the given presses.
 """
 
 LARGEST_FACTOR = 2.0
@@ -163,7 +163,7 @@ def draw_outside_examples(
         options: Limits of the charges, and settings of the search for the nearest contact.
 
     Returns:
-        Charges and residuals, as of `draw_misfit_examples`.
+        Charges and residuals, as `draw_misfit_examples` returns them, shape (2, count, n_electrode).
     """
     rng = np.random.default_rng(seed)
     chosen_charge = outside[rng.integers(len(outside), size=count)]
@@ -243,11 +243,11 @@ def draw_charges(rng: np.random.Generator, charge: Array, others: Array, noise: 
     drawn = np.empty_like(charge)
     for kind in KINDS:
         rows = kinds == kind
-        drawn[rows] = _draw(kind, rng, charge[rows], others, noise)
+        drawn[rows] = _draw_kind(kind, rng, charge[rows], others, noise)
     return kinds, drawn
 
 
-def _draw(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> Array:
+def _draw_kind(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> Array:
     """Draw charges of one kind.
 
     Args:
@@ -294,7 +294,7 @@ def _moved_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Arr
     Returns:
         Moved charges, same shape, pC.
     """
-    one_per_press = (len(charge), 1)
+    one_per_press = (len(charge), 1)  # the shape of an array with one number for each press
     if isinstance(noise, ChannelNoise):
         distance = 10.0 ** rng.uniform(SMALLEST_MOVE, FARTHEST, one_per_press)
         moved_level = noise.level(charge) + distance * rng.standard_normal(charge.shape)
@@ -306,7 +306,8 @@ def _moved_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Arr
 def _wrong_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
     """Draw gains, shape (n, n_electrode). About half of them are wrong, with a standard deviation of 15 %."""
     is_wrong = rng.random(shape) < 0.5
-    return np.exp(WRONG_GAIN_STD * is_wrong * rng.standard_normal(shape))
+    log_gain = np.where(is_wrong, WRONG_GAIN_STD * rng.standard_normal(shape), 0.0)
+    return np.exp(log_gain)
 
 
 def _failing_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
@@ -315,7 +316,8 @@ def _failing_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
     One electrode has a gain between 0.001 and 1, and all others have the gain 1.
     """
     n_press, n_electrode = shape
-    is_failing = rng.integers(n_electrode, size=(n_press, 1)) == np.arange(n_electrode)
+    failing_electrode = rng.integers(n_electrode, size=(n_press, 1))
+    is_failing = failing_electrode == np.arange(n_electrode)  # shape (n_press, n_electrode)
     failing_gain = 10.0 ** rng.uniform(-3.0, 0.0, (n_press, 1))
     return np.where(is_failing, failing_gain, 1.0)
 
@@ -335,7 +337,7 @@ def _any_charges(rng: np.random.Generator, shape: tuple[int, ...], others: Array
 
     Args:
         rng: Random number generator.
-        shape: Shape (n, n_electrode) of the charges.
+        shape: Shape of the charges, (n, n_electrode).
         others: Charges of presses, which determine the box for charges of any sign, shape (m, n_electrode), pC.
         noise: Noise of good presses; a `ChannelNoise` for charges of any sign.
 
@@ -347,7 +349,8 @@ def _any_charges(rng: np.random.Generator, shape: tuple[int, ...], others: Array
         lowest = level.min(axis=0)
         highest = level.max(axis=0)
         margin = 0.5 * (highest - lowest)  # on both sides, so the box is twice as wide as the range of the charges
-        return noise.charge(rng.uniform(lowest - margin, highest + margin, shape))
+        drawn_level = rng.uniform(lowest - margin, highest + margin, shape)
+        return noise.charge(drawn_level)
 
     n_press, _ = shape
     has_large_box = rng.random((n_press, 1)) < LARGE_BOX_FRACTION

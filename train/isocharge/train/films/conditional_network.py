@@ -195,11 +195,28 @@ class ConditionalPerceptron(nn.Module):
 
 
 def _mix(constant: Tensor, bases: Tensor, phi: Tensor) -> Tensor:
-    """Compute the weights W_l of films, shape (n_film, n_input, n_output), from phi of shape (n_film, n_basis)."""
+    """Compute the weights W_l of films: a constant matrix plus a weighted sum of basis matrices.
+
+    Args:
+        constant: Constant matrix, shape (n_input, n_output).
+        bases: Basis matrices, shape (n_basis, n_input, n_output).
+        phi: Factors of the basis matrices for each film, shape (n_film, n_basis).
+
+    Returns:
+        Weights, shape (n_film, n_input, n_output).
+    """
+    # Sum over the bases k, for each film f, input i and output o
     return constant + torch.einsum("fk,kio->fio", phi, bases)
 
 
 def _uniform_weights(size: float, shape: tuple[int, int], batch: tuple[int, ...] = ()) -> nn.Parameter:
-    """Draw weights of shape (*batch, n_input, n_output), uniform within +-size / sqrt(n_input)."""
+    """Draw weights that are uniformly distributed between -size / sqrt(n_input) and size / sqrt(n_input).
+
+    Args:
+        size: Size of the weights.
+        shape: Shape of a matrix, (n_input, n_output).
+        batch: Leading dimensions, if several matrices are drawn.
+    """
     n_input, _ = shape
-    return nn.Parameter(size * (2.0 * torch.rand((*batch, *shape)) - 1.0) / np.sqrt(n_input))
+    from_minus_one_to_one = 2.0 * torch.rand((*batch, *shape)) - 1.0
+    return nn.Parameter(size * from_minus_one_to_one / np.sqrt(n_input))

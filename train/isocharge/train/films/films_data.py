@@ -40,13 +40,13 @@ A candidate costs more here than for a single film, so there are fewer.
 """
 
 D31 = SHARED.index("d31")
-"""Position of ln d31 among the parameters."""
+"""Index of ln d31 among the parameters."""
 
 D32 = SHARED.index("d32")
-"""Position of ln d32 among the parameters."""
+"""Index of ln d32 among the parameters."""
 
 GAINS = slice(len(SHARED), None)
-"""Positions of the logarithms of the gains among the parameters."""
+"""Indices of the logarithms of the gains among the parameters."""
 
 
 @dataclass(frozen=True)
@@ -248,6 +248,7 @@ class FilmsSource:
         forward_map = self.family.forward_map(*self.prior.film(parameters))
 
         def charges(contact: Array) -> Array:
+            """Return the clipped charges of contacts (x, y, F), shape (n, n_electrode), pC."""
             return np.clip(forward_map.charges(contact), LOWEST_CHARGE, HIGHEST_CHARGE)
 
         return FunctionMap(charges, forward_map.electrodes, self.domain)

@@ -69,7 +69,8 @@ def films_bytes(films: FilmsModel) -> bytes:
         **_packed("contact", films.contact.arrays),
         **_packed("misfit", films.misfit.arrays),
     }
-    return _npz({**arrays, "sha256": np.array(_checksum(arrays))})
+    checksum = np.array(_checksum(arrays))
+    return _npz({**arrays, "sha256": checksum})
 
 
 def read_films(version_folder: Path) -> FilmsModel:
@@ -221,8 +222,14 @@ def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str)
 
 
 def _converted(value: float, factor: float) -> float:
-    """Convert a number to another unit, and round it to the 15 digits that a conversion keeps."""
-    return value if factor == 1.0 else float(f"{factor * value:.15g}")
+    """Multiply a number by the factor between two units, and round the product to 15 digits.
+
+    A number of up to 15 digits is therefore the same after a conversion to another unit and back. The factor 1 leaves
+    any number unchanged.
+    """
+    if factor == 1.0:
+        return value
+    return float(f"{factor * value:.15g}")
 
 
 def _within(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np.ndarray]:

@@ -87,8 +87,15 @@ class ConditionalWeights:
         return np.asarray(value @ layer.weight + layer.bias)
 
     def _mix(self, constant: str, bases: str, phi: Array) -> Array:
-        """Compute the weights of a layer from phi, shape (n_basis,)."""
-        return np.asarray(self.arrays[constant] + np.tensordot(phi, self.arrays[bases], axes=1))
+        """Compute the weights of a layer: a constant matrix plus a weighted sum of basis matrices.
+
+        Args:
+            constant: Name of the constant matrix, shape (n_input, n_output).
+            bases: Name of the array with the basis matrices, shape (n_basis, n_input, n_output).
+            phi: Factors of the basis matrices, shape (n_basis,).
+        """
+        weighted_sum = np.tensordot(phi, self.arrays[bases], axes=1)
+        return np.asarray(self.arrays[constant] + weighted_sum)
 
 
 class AddedVariance(NamedTuple):
@@ -115,7 +122,7 @@ class FilmsModel:
         contact: Weights of the contact network.
         misfit: Weights of the misfit network.
         noise: Noise of the training.
-        sha256: Checksum of the file from which the model was read, or "".
+        sha256: Checksum of the file from which the model was read; empty for a model that was not read from a file.
         made_with: Settings of the training, for the metadata; they are not in the file.
     """
 

@@ -172,10 +172,12 @@ def fit_films(
         examples = draw_misfit_films(
             source, config.misfit_films, config.misfit_charges, config.seed, saving_executor("nearest-contacts")
         )
-        good = draw_near_films(source, config.near_films, config.presses, config.seed, saving_executor("good-presses"))
+        good_presses = draw_near_films(
+            source, config.near_films, config.presses, config.seed, saving_executor("good-presses")
+        )
         n_electrode = inputs.mean.size
         misfit_perceptron = _new_perceptron(inputs, config.misfit_hidden, n_electrode, activation)
-        _train(misfit_stage(misfit_perceptron, inputs, examples, good, source.noise, config), config, run)
+        _train(misfit_stage(misfit_perceptron, inputs, examples, good_presses, source.noise, config), config, run)
     return FilmsModel(
         family=family,
         scaling=inputs.scaling,
@@ -302,7 +304,7 @@ class _ContactTraining:
         return loss_function(*batch)
 
     def score(self) -> tuple[float, str]:
-        """Return the loss on the films for validation, and a text with the errors."""
+        """Return the loss on the validation films, and a text that states the errors."""
         films = np.arange(self.n_train, len(self.presses))
         n_press = self.presses.contact.shape[1]
         all_press_rows = np.tile(np.arange(n_press), (self.config.watched, 1))
@@ -336,6 +338,7 @@ class _ContactTraining:
         scaling = self.inputs.scaling
         rotation = as_tensor(scaling.rotation(parameters))
         offset = as_tensor(scaling.offset(parameters))
+        # baddbmm(o, u, T') computes o + u T' for each film, with one press in each row of u
         mean = torch.baddbmm(offset[:, None], outputs[..., MEAN], rotation.transpose(1, 2))
         target = as_tensor(scaling.domain.to_unit(contact.reshape(-1, 3).astype(float)))
         return _Batch(mean.reshape(-1, 3), outputs[..., LOG_STD].reshape(-1, 3), target)

@@ -47,8 +47,8 @@ class FilmsErrors:
     Attributes:
         with_known_film: Errors if the parameters of each film are known.
         with_assumed_film: Errors on the same films if each of them is taken for the assumed film.
-        parameters: Parameters of the assumed film, shape (n_parameter,). It is the described film or the mean of the
-            prior, whichever gives the lower errors.
+        parameters: Parameters of the assumed film, shape (n_parameter,). The assumed film is the described film or the
+            mean of the prior, whichever gives the smaller errors.
         description: The assumed film in words, with the errors of both.
     """
 
@@ -97,7 +97,7 @@ def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PR
     assumed_films = {"as described": films.prior.described, "in the middle of all": films.prior.mean}
     assumed_errors = {name: errors_with(np.tile(film, (n_film, 1))) for name, film in assumed_films.items()}
     rms_mm = {name: errors["position_rms_mm"] for name, errors in assumed_errors.items()}
-    best_name, other_name = sorted(rms_mm, key=lambda name: rms_mm[name])
+    best_name, other_name = sorted(rms_mm, key=lambda name: rms_mm[name])  # the smaller error first
     best_film = assumed_films[best_name]
     pretension_MPa = best_film[films.prior.index("pretension")]
     description = (

@@ -47,8 +47,9 @@ class GraphBuilder:
 
         If the argument `to` is given, it is the name of the result.
         """
-        (result,) = self.add_many(operator, *inputs, to=(to or f"t{len(self.nodes)}",), **attributes)
-        return result
+        result_name = to or f"t{len(self.nodes)}"
+        self.add_many(operator, *inputs, to=(result_name,), **attributes)
+        return result_name
 
     def add_many(self, operator: str, *inputs: str, to: tuple[str, ...], **attributes: Any) -> tuple[str, ...]:
         """Add a node with several results and return their names."""
@@ -63,7 +64,8 @@ class GraphBuilder:
 
     def split(self, data: str, widths: Mapping[str, int]) -> tuple[str, ...]:
         """Split the columns of a tensor into results with the given names and widths."""
-        return self.add_many("Split", data, self.constant(tuple(widths.values()), np.int64), to=tuple(widths), axis=1)
+        sizes = self.constant(tuple(widths.values()), np.int64)
+        return self.add_many("Split", data, sizes, to=tuple(widths), axis=1)
 
 
 def write_graph(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
@@ -134,7 +136,8 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
 
 def _add_answers(build: GraphBuilder, network: FoldedNetwork) -> str:
     """Add the features and the perceptron of a network and return the name of the answers."""
-    return _add_perceptron(build, _add_features(build, network.features), network.layers)
+    features = _add_features(build, network.features)
+    return _add_perceptron(build, features, network.layers)
 
 
 def _add_features(build: GraphBuilder, features: ChargeFeatures) -> str:
@@ -282,11 +285,10 @@ def _activation_of(operators: Sequence[str], where: str) -> Activation:
     activation_of_operator = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
     first_layer = operators.index("Gemm") if "Gemm" in operators else len(operators)
     following = operators[first_layer + 1 : first_layer + 2]  # one operator, or none at the end of the graph
-    for operator in following:
-        if operator in activation_of_operator:
-            return activation_of_operator[operator]
-    known_operators = ", ".join(activation_of_operator)
-    return _refuse(where, f"expected one of the activations {known_operators} after a Gemm, got {following}")
+    if not following or following[0] not in activation_of_operator:
+        known_operators = ", ".join(activation_of_operator)
+        _refuse(where, f"expected one of the activations {known_operators} after a Gemm, got {following}")
+    return activation_of_operator[following[0]]
 
 
 def _constants_in_order(graph: onnx.GraphProto, where: str) -> Iterator[Array]:
@@ -307,11 +309,17 @@ def _constants_in_order(graph: onnx.GraphProto, where: str) -> Iterator[Array]:
 
 
 def _take_features(constants: Iterator[Array], *, is_signed: bool) -> ChargeFeatures:
-    """Return the features whose constants come first."""
+    """Take the constants of the features, which are the first ones of a graph, and return the features.
+
+    Args:
+        constants: Iterator over the constants, which is advanced.
+        is_signed: Whether charges may be negative, so that the features have a mean.
+    """
     low = next(constants)
     high = next(constants)
-    typical = 1.0 / next(constants)
-    return ChargeFeatures(typical, low, high, next(constants) if is_signed else None)
+    inverse_typical = next(constants)
+    mean = next(constants) if is_signed else None
+    return ChargeFeatures(1.0 / inverse_typical, low, high, mean)
 
 
 def _check_shapes(features: ChargeFeatures, perceptron: Perceptron[Array], where: str) -> None:
