@@ -163,6 +163,7 @@ def _frames_of(device: Device, electrodes: tuple[str, ...], notation: str | None
         channels = tuple(Field("f64", name) for name in names)
         return BoardFrames(names, channels, partial(_encode_row, frames.columns))
 
+    # The device file does not describe the channels of the frames. The format determines the possible notations.
     names, count = _channel_names(device, electrodes)
     fitting_notation = PAIRS if device.channels and names else BINARY
     fitting_notations = (BINARY, *TEXT_FORMATS)
@@ -175,10 +176,12 @@ def _frames_of(device: Device, electrodes: tuple[str, ...], notation: str | None
     _check_notation(device.where, notation, fitting_notations)
     chosen_notation = notation or fitting_notation
     if chosen_notation == BINARY:
-        return BoardFrames((), (Field("f32", BINARY),) * count, encode_frame)
+        binary_channels = (Field("f32", BINARY),) * count
+        return BoardFrames((), binary_channels, encode_frame)
     frame_names = () if chosen_notation == CSV else names
+    text_channels = (Field("f64", chosen_notation),) * count
     encode = partial(encode_text, notation=chosen_notation)
-    return BoardFrames(frame_names, (Field("f64", chosen_notation),) * count, encode)
+    return BoardFrames(frame_names, text_channels, encode)
 
 
 def _check_notation(where: str, notation: str | None, fitting_notations: tuple[str, ...]) -> None:
@@ -215,7 +218,8 @@ def _channel_names(device: Device, electrodes: tuple[str, ...]) -> tuple[tuple[s
     numbers = [channel_number(name) for name in names]
     if None in numbers:
         return names, len(names)
-    count = max(len(electrodes), *(number or 0 for number in numbers))
+    used_numbers = [number for number in numbers if number is not None]
+    count = max(len(electrodes), *used_numbers)
     if count > MAX_CHARGES:
         raise DeviceError(f"{device.where}: channels: expected numbers from 1 to {MAX_CHARGES}, got {count}")
     return (), count

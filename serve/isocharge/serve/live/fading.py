@@ -2,10 +2,10 @@
 
 A leak removes the same share of the charge in every second. Creep removes the same share in every decade of time. Let t
 be the time since the touch. With a leak, ln Q = a - t / tau is a straight line over t. With creep, ln Q = a + b ln t is
-a straight line over ln t. Both lines are fitted to the charges of a press. A law is only reported if the
-squared residuals of the other law are at least `MIN_RESIDUAL_RATIO` times as large. A third law is creep with a
-thermoelastic step (see `isocharge.serve.signal_chain.memory`). This law is reported if the squared residuals of both
-lines are at least `MIN_RESIDUAL_RATIO` times as large.
+a straight line over ln t. Both lines are fitted to the charges of a press. A law is only reported if the squared
+residuals of the other law are at least `MIN_RESIDUAL_RATIO` times as large. A third law is creep with a thermoelastic
+step (see `isocharge.serve.signal_chain.memory`). This law is reported if the squared residuals of both lines are at
+least `MIN_RESIDUAL_RATIO` times as large.
 
 The section [leak] of a device file corrects a leak, and the section [memory] corrects creep. If [leak] is used for
 creep, the error grows with time.
@@ -111,8 +111,8 @@ def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
         sizes: Times since the touch, s, and mean magnitudes of the charges at these times, positive, pC.
 
     Returns:
-        The law with its parameter; an empty law if there are too few times, if the charges do not decrease, or if no
-        law fits clearly better than the others.
+        The law with its parameters. The parameters have their defaults if there are too few times, if the charges do
+        not decrease, or if no law fits clearly better than the others.
     """
     if len(sizes) < MIN_WINDOWS:
         return Fading()
@@ -147,8 +147,10 @@ def _fit_creep_and_step(held_s: Array, size_pC: Array, max_squared_residual: flo
     Returns:
         The law; None if the fit is rejected, or its parameters are not physical.
     """
-    step = np.exp(-held_s / MemoryRule().warmth_s)
-    design_matrix = np.column_stack([np.ones_like(held_s), -np.log10(held_s), step])
+    level_column = np.ones_like(held_s)
+    creep_column = -np.log10(held_s)
+    step_column = np.exp(-held_s / MemoryRule().warmth_s)
+    design_matrix = np.column_stack([level_column, creep_column, step_column])
     coefficients = np.linalg.lstsq(design_matrix, size_pC, rcond=None)[0]
     level_pC, creep_pC, step_pC = coefficients.tolist()
     fitted_pC = design_matrix @ coefficients

@@ -77,7 +77,7 @@ class RecordedStream:
             recorder: The next recording, which the stream opens and closes; None for no recording.
         """
         self._next_recorder.append(recorder)
-        self._requests.append(self._record)
+        self._requests.append(self._begin_requested_recording)
 
     def request_marker(self, marker: Marker) -> None:
         """Request to write a marker to the recording, if there is one."""
@@ -112,11 +112,14 @@ class RecordedStream:
         """
         try:
             for chunk in chunks:
+                # Execute the requests before the chunk.
                 if self._next_load or self._loading_model:
                     self._continue_loading()
                 while self._requests:
                     execute_request = self._requests.popleft()
                     execute_request()
+
+                # The lines of the records are added to the current chunk, which is written after its last record.
                 lines: list[str] = []
                 self._current_chunk = (chunk, lines)
                 for record in self._stream.feed(chunk):
@@ -134,7 +137,7 @@ class RecordedStream:
             self.recorder.chunk(*self._current_chunk)
         self._current_chunk = None
 
-    def _record(self) -> None:
+    def _begin_requested_recording(self) -> None:
         """Begin the recording that was requested, or end the recording if no recording was requested.
 
         The stream is restarted, so that the records of the recording depend only on the bytes in the recording. If the

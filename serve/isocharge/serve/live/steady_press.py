@@ -325,12 +325,11 @@ class PressWatch:
         The scatter is the standard deviation of the residuals. The change is the difference between the two ends of the
         line.
         """
-        frame_times, charges, flags = zip(*self._window, strict=True)  # one sequence for each field of `WindowFrame`
-        begin_s = frame_times[0]
+        begin_s = self._window[0].t_s
         end_s = self._end_s
-        times_s = np.array(frame_times) - begin_s
-        charge_pC = np.array(charges)  # shape (frames, n_electrode)
         window_s = float(end_s - begin_s)
+        times_s = np.array([frame.t_s for frame in self._window]) - begin_s
+        charge_pC = np.array([frame.charge_pC for frame in self._window])  # shape (frames, n_electrode)
 
         # Least squares with centred times, so that the slope is independent of the mean.
         centred_s = times_s - times_s.mean()
@@ -338,14 +337,16 @@ class PressWatch:
         slope_pC_per_s = centred_s @ charge_pC / square_sum_s2
         mean_pC = charge_pC.mean(axis=0)
         residual_pC = charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)
-        different_flags = dict.fromkeys(flag for frame_flags in flags for flag in frame_flags)
+
+        all_flags = [flag for frame in self._window for flag in frame.flags]
+        different_flags = dict.fromkeys(all_flags)  # each flag once, in the order of its first frame
         return SteadyPress(
             charge_pC=mean_pC,
             scatter_pC=residual_pC.std(axis=0),
             drift_pC=slope_pC_per_s * window_s,
             held_s=end_s - self._begin_s,
             window_s=window_s,
-            frames=len(charges),
+            frames=len(self._window),
             flags=tuple(different_flags),
         )
 

@@ -291,7 +291,7 @@ class TouchStream:
             self.counts.outages += 1
             self._discard_contact()
         frames = self._readings.frames(chunk)
-        skipped_flags = set[str]()  # flags of frames without a record, of which the lasting flags are passed on
+        skipped_flags: set[str] = set()  # flags of frames without a record; the lasting flags are passed on
         for number, frame in enumerate(frames, start=1):
             timed = self._readings.advance(frame, chunk)
             is_last = number == len(frames)
@@ -349,8 +349,10 @@ class TouchStream:
         """Return charges by electrode name; None for a charge that is not a number."""
         if charge_pC is None:
             return None
-        values = charge_pC.tolist()
-        return {name: q if math.isfinite(q) else None for name, q in zip(self._electrodes, values, strict=True)}
+        charges: Charges = {}
+        for name, charge in zip(self._electrodes, charge_pC.tolist(), strict=True):
+            charges[name] = charge if math.isfinite(charge) else None
+        return charges
 
     def _misfit(self, charge_pC: Array) -> Reals:
         """Return the misfits of charges with the current model.

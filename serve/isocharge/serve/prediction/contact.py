@@ -115,7 +115,7 @@ REUSE_FORCE_RATIO = 0.05
 class Sensitivity:
     """Sensitivity of a contact to a parameter whose value is uncertain.
 
-    The change is computed from a second prediction with another value of the parameter. The change is reused while the
+    The sensitivity is computed from a second prediction with another value of the parameter. It is reused while the
     contact hardly moves, so that most frames of a held press need one prediction instead of two.
     """
 
@@ -132,10 +132,11 @@ class Sensitivity:
     def shift(
         self, contact: Contact, size: float, predict_after_unit: Callable[[], Contact]
     ) -> tuple[float, float, float]:
-        """Compute by how much a change of the parameter moves a contact.
+        """Compute by how much a change of the parameter changes the position and the force of a contact.
 
-        The movement is proportional to the change. The movement for a change by `unit` is stored, and is used again for
-        the next contacts, as long as these are close to the contact for which it was computed.
+        The contact is assumed to change in proportion to the parameter. The change of the contact for a change of the
+        parameter by `unit` is stored. It is used again for contacts that are close to the contact for which it was
+        computed.
 
         Args:
             contact: The contact at the present value of the parameter.
@@ -165,12 +166,12 @@ def is_close(contact: Contact, reference: Contact | None) -> bool:
         contact: The contact.
         reference: The contact to compare it with. The result is False for None.
     """
-    return (
-        reference is not None
-        and abs(contact.x_mm - reference.x_mm) <= REUSE_DISTANCE_mm
-        and abs(contact.y_mm - reference.y_mm) <= REUSE_DISTANCE_mm
-        and abs(contact.force_N - reference.force_N) <= REUSE_FORCE_RATIO * reference.force_N
-    )
+    if reference is None:
+        return False
+    is_x_close = abs(contact.x_mm - reference.x_mm) <= REUSE_DISTANCE_mm
+    is_y_close = abs(contact.y_mm - reference.y_mm) <= REUSE_DISTANCE_mm
+    is_force_close = abs(contact.force_N - reference.force_N) <= REUSE_FORCE_RATIO * reference.force_N
+    return is_x_close and is_y_close and is_force_close
 
 
 class Contacts(NamedTuple):

@@ -41,7 +41,7 @@ BAD_PRESS_PROBABILITY = 1e-3
 """Probability with which noise makes at least one of all presses look bad."""
 
 MAX_BAD_FRACTION = 0.1
-"""Largest fraction of bad presses, at least one press, with which a model may still fit."""
+"""Largest fraction of bad presses with which a model may still fit. A single bad press is always allowed."""
 
 BAD_PRESS_MIN_CHI_SQUARED = 9.0
 """Sum of the squared error ratios of a press below which the press is certainly not bad."""
@@ -50,7 +50,7 @@ MISFIT_FRACTION = 0.01
 """Fraction of good presses whose misfit is above the limit `misfit_p99` of the model."""
 
 MISFIT_PROBABILITY = 2e-3
-"""Probability below which a number of presses with a misfit is no longer attributed to chance."""
+"""Probability below which a number of presses with a large misfit is not attributed to chance."""
 
 MIN_COMMON_SIGNIFICANCE = 3.0
 """Significance above which a common shift or a common scale is reported, in standard deviations."""
@@ -238,7 +238,7 @@ def _force_summary(errors: PressErrors, rows: Booleans) -> ErrorSummary | None:
 
 
 def _frequent_misfits(errors: PressErrors, rows: Booleans, metadata: ModelMetadata) -> str:
-    """Return a statement about the number of presses with a misfit above the limit of the model.
+    """Return a statement if more presses than chance explains have a misfit above the limit of the model.
 
     Args:
         errors: Errors of all presses.
@@ -251,7 +251,8 @@ def _frequent_misfits(errors: PressErrors, rows: Booleans, metadata: ModelMetada
     has_misfit = np.array([MISFIT in flags for flags in errors.flags], dtype=np.bool_)
     count = int(rows.sum())
     misfit_count = int((has_misfit & rows).sum())
-    if 1.0 - _probability_of_fewer(misfit_count, count) >= MISFIT_PROBABILITY:
+    probability_of_as_many = 1.0 - _probability_of_fewer(misfit_count, count)
+    if probability_of_as_many >= MISFIT_PROBABILITY:
         return ""
     limit = misfit_limit(metadata)
     return f"{misfit_count} of {count} presses have a misfit above {limit:.3g}, which 1 % of good ones have"
@@ -316,7 +317,9 @@ def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: Err
     yield f"the errors would be the rig's if that were as uncertain as {' '.join(options)}"
 
     calibration = metadata.sensor.get("calibration")
-    is_calibrated = isinstance(calibration, dict) and any(calibration.get(key) for key in ("gain", "rotation_deg"))
+    is_calibrated = False
+    if isinstance(calibration, dict):
+        is_calibrated = bool(calibration.get("gain") or calibration.get("rotation_deg"))
     if not is_calibrated:
         yield "this model is of the film as described: calibrate it (isocharge train calibrate)"
         return
@@ -339,7 +342,8 @@ def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[s
         metadata: Metadata of the model.
     """
     reasons = errors.exclusion_reasons
-    for reason in sorted(set(reasons) - {""}):
+    different_reasons = set(reasons) - {""}  # a press that is compared has an empty reason
+    for reason in sorted(different_reasons):
         lines = [line for line, line_reason in zip(errors.lines, reasons, strict=True) if line_reason == reason]
         words = row_words(lines, errors.row_noun, MAX_LISTED_PRESSES)
         explanation = _explain_exclusion(reason, metadata)

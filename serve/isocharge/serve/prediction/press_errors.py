@@ -208,7 +208,7 @@ def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tup
 
 
 SIGNIFICANCE = 0.01
-"""Probability with which a model that fits is refused. Each of the two tests has half of this probability."""
+"""Probability that a model that fits is rejected. Each of the two tests has half of this probability."""
 
 MAX_ACCEPTED_CHI_SQUARED = 1.1
 """Chi-squared per degree of freedom that is always accepted, because standard deviations are known to 5 % at best."""
@@ -245,29 +245,29 @@ class ErrorSummary:
     beyond: float
 
     @classmethod
-    def of(cls, size: Array, noise_variance: Array, rig_variance: Array) -> "ErrorSummary | None":
+    def of(cls, absolute_error: Array, noise_variance: Array, rig_variance: Array) -> "ErrorSummary | None":
         """Summarise errors, and compare their mean square with the variances that noise and rig cause.
 
         Args:
-            size: Absolute errors, shape (n,).
+            absolute_error: Absolute errors, shape (n,).
             noise_variance: Variances that noise of the charges causes, shape (n,).
             rig_variance: Variances that the uncertainty of the rig causes, shape (n,).
 
         Returns:
             The summary; None if there are no presses.
         """
-        if not size.size:
+        if absolute_error.size == 0:
             return None
-        mean_square = float(np.mean(size**2))
+        mean_square = float(np.mean(absolute_error**2))
         mean_noise_variance = float(np.mean(noise_variance))
         mean_rig_variance = float(np.mean(rig_variance))
         explained_variance = mean_noise_variance + mean_rig_variance
         unexplained_variance = max(mean_square - mean_noise_variance - mean_rig_variance, 0.0)
         return cls(
-            presses=size.size,
+            presses=absolute_error.size,
             rms=math.sqrt(mean_square),
-            median=float(np.median(size)),
-            max=float(size.max()),
+            median=float(np.median(absolute_error)),
+            max=float(absolute_error.max()),
             noise=math.sqrt(mean_noise_variance),
             rig=math.sqrt(mean_rig_variance),
             explained=math.sqrt(explained_variance),
@@ -373,10 +373,10 @@ class Agreement:
     @property
     def acceptable(self) -> bool:
         """Whether noise and rig explain the errors."""
-        scatter_is_large = (
-            self.p_value < 0.5 * SIGNIFICANCE and self.chi_squared > MAX_ACCEPTED_CHI_SQUARED * self.degrees
-        )
-        common_error_is_large = self.common_p_value < 0.5 * SIGNIFICANCE
+        max_p_value = 0.5 * SIGNIFICANCE  # for each of the two tests
+        max_accepted_chi_squared = MAX_ACCEPTED_CHI_SQUARED * self.degrees
+        scatter_is_large = self.p_value < max_p_value and self.chi_squared > max_accepted_chi_squared
+        common_error_is_large = self.common_p_value < max_p_value
         return not scatter_is_large and not common_error_is_large
 
 

@@ -134,7 +134,7 @@ def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) ->
     usual, is_constant = usual_bytes(rows)
     is_zero = is_constant & (usual == 0)
     length = rows.shape[1] // 2  # a row has the bytes of two frames
-    lowest_byte_first = slice(None) if order == "little" else slice(None, None, -1)
+    byte_step = 1 if order == "little" else -1  # reverses big-endian numbers, so that the lowest byte comes first
     parts_at: list[list[Part]] = []
     for position in range(length):
         pad_score = weights.constant if is_constant[position] else weights.noise
@@ -143,9 +143,9 @@ def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) ->
             size = int(kind[1:]) // 8  # in bytes
             span = slice(position, position + size)
             if span.stop <= 2 * length:
-                number_bytes = rows[:, span][:, lowest_byte_first]
-                number_is_constant = is_constant[span][lowest_byte_first]
-                number_is_zero = is_zero[span][lowest_byte_first]
+                number_bytes = rows[:, span][:, ::byte_step]
+                number_is_constant = is_constant[span][::byte_step]
+                number_is_zero = is_zero[span][::byte_step]
                 parts += _number_parts(number_bytes, number_is_constant, number_is_zero, kind, rate_Hz, weights)
         parts_at.append(parts)
     return parts_at
@@ -283,8 +283,13 @@ def _values(number_bytes: Bytes, kind: str) -> Array:
 
 
 def _bits(step: Array, unit: float, size: int) -> float:
-    """Return the mean number of bits for a step of a number that changes by multiples of `unit`.
+    """Return the mean number of bits that encode a step of a number, at most the size of the number.
 
-    The result is at most the size of the number.
+    Args:
+        step: Differences of the values of consecutive frames, shape (n,).
+        unit: Smallest step that the number can represent.
+        size: Size of the number, bytes.
     """
-    return float(np.fmin(np.log2(1.0 + np.abs(step) / unit), 8 * size).mean())
+    step_bits = np.log2(1.0 + np.abs(step) / unit)
+    limited_bits = np.fmin(step_bits, 8 * size)  # also replaces NaN by the size
+    return float(limited_bits.mean())

@@ -77,17 +77,24 @@ class Windows(NamedTuple):
 
         The position at which a frame begins is unknown, but it is the same in every window.
         """
-        starts = self.starts[self.starts + 2 * self.length <= len(self.stream)]
-        return np.asarray(self.stream[starts[:, None] + np.arange(2 * self.length)])
+        row_length = 2 * self.length
+        starts = self.starts[self.starts + row_length <= len(self.stream)]
+        positions = starts[:, None] + np.arange(row_length)  # positions in the stream, shape (frames, 2 * length)
+        return np.asarray(self.stream[positions])
 
 
 def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
     """Return the most frequent byte at each position, and whether nearly all frames have this byte.
 
-    Both arrays have the shape (length,).
+    Args:
+        rows: Bytes of the frames, shape (n, length).
+
+    Returns:
+        The most frequent bytes, and whether each of them is constant, each of shape (length,).
     """
     usual = np.array([np.bincount(column).argmax() for column in rows.T], np.uint8)
-    return usual, (rows == usual).mean(axis=0) >= CONSTANT_SHARE
+    share_of_frames = (rows == usual).mean(axis=0)
+    return usual, share_of_frames >= CONSTANT_SHARE
 
 
 def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Windows]:
@@ -102,18 +109,18 @@ def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Window
         common_divisor = gcd(*map(len, chunks))
         for length in range(MIN_FRAME_BYTES, min(common_divisor, MAX_FRAME_BYTES) + 1):
             if common_divisor % length == 0:
-                yield _side_by_side(DATAGRAM, data, length)
+                yield _adjacent_frames(DATAGRAM, data, length)
     for name, stuffing in STUFFINGS.items():
-        yield from _stuffed(name, stuffing, data)
-    yield from _synchronised(np.frombuffer(data, np.uint8))
+        yield from _stuffed_frames(name, stuffing, data)
+    yield from _synchronised_frames(np.frombuffer(data, np.uint8))
 
 
-def _side_by_side(framing: str, data: bytes, length: int) -> Windows:
+def _adjacent_frames(framing: str, data: bytes, length: int) -> Windows:
     """Return the windows of a stream that contains only whole frames of one length."""
     return Windows(framing, np.frombuffer(data, np.uint8), np.arange(0, len(data), length), length)
 
 
-def _stuffed(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Windows]:
+def _stuffed_frames(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Windows]:
     """Yield the division of a stream at the delimiters of a byte stuffing, if the pieces are frames of one length.
 
     Args:
@@ -137,7 +144,7 @@ def _stuffed(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Windows]:
     _, count_without_decoding = _most_common_length(pieces)
     if name == "cobs" or count > count_without_decoding:
         frames = [piece for piece in decoded_pieces if len(piece) == length]
-        yield _side_by_side(name, b"".join(frames), length)
+        yield _adjacent_frames(name, b"".join(frames), length)
 
 
 def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
@@ -147,7 +154,7 @@ def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
     return Counter(map(len, pieces)).most_common(1)[0]
 
 
-def _synchronised(stream: Bytes) -> Iterator[Windows]:
+def _synchronised_frames(stream: Bytes) -> Iterator[Windows]:
     """Yield the divisions of a stream at bytes that repeat after the length of a frame.
 
     For each length, the pair of bytes or the single byte is chosen whose repetitions cover the largest share of the
@@ -164,22 +171,23 @@ def _synchronised(stream: Bytes) -> Iterator[Windows]:
     best_coverage: dict[int, float] = {}
     best_starts: dict[int, NDArray[np.int64]] = {}
     for codes, penalty in ((byte_pairs, 0.0), (single_bytes, SINGLE_BYTE_PENALTY)):
-        for length, starts in _repeats(codes):
+        for length, starts in _frequent_distances(codes):
             coverage = len(starts) * length / len(stream) - penalty
             required_coverage = best_coverage.get(length, COVERED_SHARE - penalty)
             if coverage > required_coverage:
                 best_coverage[length] = coverage
                 best_starts[length] = starts
 
-    def order_of(length: int) -> tuple[float, int]:
+    def sorting_key(length: int) -> tuple[float, int]:
         """Return a key that sorts by decreasing coverage in steps of 10 %, and then by increasing length."""
         return -round(best_coverage[length], 1), length
 
-    for length in sorted(best_coverage, key=order_of)[:MAX_FRAME_LENGTHS]:
+    best_lengths = sorted(best_coverage, key=sorting_key)[:MAX_FRAME_LENGTHS]
+    for length in best_lengths:
         yield Windows(SYNC, stream, best_starts[length], length)
 
 
-def _repeats(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
+def _frequent_distances(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
     """Yield the frequent distances from a code to its next occurrence, and the positions of the code.
 
     Args:
@@ -203,22 +211,36 @@ def _repeats(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]
             yield distance, positions[keys == key]
 
 
-UNNAMED_CRCS = {
-    size: [Crc(8 * size, polynomial, 0, reflected, 0) for polynomial in polynomials for reflected in (False, True)]
-    for size, polynomials in {
-        4: (0x04C11DB7, 0x1EDC6F41),
-        3: (0x864CFB,),
-        2: (0x1021, 0x8005, 0x3D65, 0x8BB7),
-        1: (0x07, 0x31, 0x1D, 0x2F, 0x9B, 0x39, 0xD5),
-    }.items()
+CRC_POLYNOMIALS = {
+    4: (0x04C11DB7, 0x1EDC6F41),
+    3: (0x864CFB,),
+    2: (0x1021, 0x8005, 0x3D65, 0x8BB7),
+    1: (0x07, 0x31, 0x1D, 0x2F, 0x9B, 0x39, 0xD5),
 }
-"""Cyclic redundancy checks that are tried without a name, by their size in bytes, with initial and final value 0."""
+"""Polynomials of cyclic redundancy checks that are tried without a name, by the size of the check in bytes."""
+
+
+def _crcs_of_size(size: int) -> list[Crc]:
+    """Return the checks of a size in bytes with both bit orders. Their initial and final values are 0."""
+    bit_count = 8 * size
+    polynomials = CRC_POLYNOMIALS[size]
+    return [Crc(bit_count, polynomial, 0, reflected, 0) for polynomial in polynomials for reflected in (False, True)]
+
+
+UNNAMED_CRCS = {size: _crcs_of_size(size) for size in CRC_POLYNOMIALS}
+"""Cyclic redundancy checks that are tried without a name, by their size in bytes."""
 
 MIN_CHECKED_FRAMES = 6
 """Smallest number of different frames from which a checksum is recognised."""
 
 MAX_CHECKED_FRAMES = 24
 """Largest number of different frames from which a checksum is recognised."""
+
+N_FIRST_FRAMES = 4
+"""Number of frames for which each checksum is computed first."""
+
+MIN_FITTING_FIRST_FRAMES = 2
+"""Smallest number of these first frames whose checksum must fit, before it is computed for the other frames."""
 
 FITTING_SHARE = 0.75
 """Smallest share of frames whose checksum must fit, because some frames may be damaged."""
@@ -255,12 +277,13 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
         rows: Bytes of the frames, shape (n, length).
     """
     different_rows = np.unique(rows, axis=0)
+
     # The frames are drawn at random, because neighbours in the sorted array differ in a few bits only.
     drawn = np.random.default_rng(0).permutation(len(different_rows))[:MAX_CHECKED_FRAMES]
     checked_rows = different_rows[drawn]
     if len(checked_rows) < MIN_CHECKED_FRAMES:
         return
-    _, is_constant = usual_bytes(checked_rows)
+    _usual, is_constant = usual_bytes(checked_rows)
     length = len(is_constant)
     frames = [row.tobytes() for row in checked_rows]
     # Number of constant bytes at the beginning: the position of the first False
@@ -271,12 +294,13 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
             continue
         last_begin = min(leading_constant_count, length - size - 1)
         for order in ORDERS[:size]:  # a single byte has no byte order
-            named_checks = _named(frames, size, order, range(last_begin + 1))
-            all_checks = chain(named_checks, _unnamed(frames, size, order))
+            named_checks = _named_checks(frames, size, order, range(last_begin + 1))
+            unnamed_checks = _unnamed_checks(frames, size, order)
+            all_checks = chain(named_checks, unnamed_checks)
             yield from islice(all_checks, 1)  # the first check that fits
 
 
-def _named(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> Iterator[Check]:
+def _named_checks(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> Iterator[Check]:
     """Yield the named checksums that fit, and the position of the first byte that each of them covers.
 
     Args:
@@ -296,18 +320,28 @@ def _named(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> I
 
 
 def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size: int, order: ByteOrder) -> bool:
-    """Return whether nearly all frames end with their checksum.
+    """Return whether most frames end with their checksum.
 
-    The first four frames decide whether the others are examined, which saves time.
+    If it fits too few of the first frames, the other frames are not examined, which saves time.
+
+    Args:
+        compute: Function that computes the checksum of bytes.
+        frames: The frames, which are of one length.
+        begin: Position of the first byte that the checksum covers.
+        size: Number of bytes of the checksum.
+        order: Byte order of the checksum.
     """
 
     def count_fitting(some_frames: list[bytes]) -> int:
+        """Return the number of frames whose computed checksum is the checksum that was sent."""
         return sum(compute(frame[begin:-size]) == int.from_bytes(frame[-size:], order) for frame in some_frames)
 
-    return count_fitting(frames[:4]) >= 2 and count_fitting(frames) >= FITTING_SHARE * len(frames)
+    if count_fitting(frames[:N_FIRST_FRAMES]) < MIN_FITTING_FIRST_FRAMES:
+        return False
+    return count_fitting(frames) >= FITTING_SHARE * len(frames)
 
 
-def _unnamed(frames: list[bytes], size: int, order: ByteOrder) -> Iterator[Check]:
+def _unnamed_checks(frames: list[bytes], size: int, order: ByteOrder) -> Iterator[Check]:
     """Yield the cyclic redundancy checks that fit, described by their parameters.
 
     With the right polynomial, the computed and the sent value differ by the same constant in all frames. The constant
@@ -319,7 +353,11 @@ def _unnamed(frames: list[bytes], size: int, order: ByteOrder) -> Iterator[Check
         order: Byte order of the checksum.
     """
     for crc in UNNAMED_CRCS[size]:
-        differences = Counter(crc(frame[:-size]) ^ int.from_bytes(frame[-size:], order) for frame in frames)
+        differences: Counter[int] = Counter()
+        for frame in frames:
+            computed = crc(frame[:-size])
+            sent = int.from_bytes(frame[-size:], order)
+            differences[computed ^ sent] += 1
         final, count = differences.most_common(1)[0]
         if count >= FITTING_SHARE * len(frames):
             parameters = {

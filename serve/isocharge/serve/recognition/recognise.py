@@ -97,14 +97,18 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
     usual, is_constant = usual_bytes(rows[:, :length])
     may_be_sync = is_constant & (usual != 0)  # zeros are mostly the high bytes of numbers
     starts = np.flatnonzero(may_be_sync)[:MAX_FRAME_STARTS].tolist() if has_sync else [0]
-    checks = [(start, check) for start in starts for check in find_checks(rows[:, start : start + length])]
+
+    # Pairs of a first byte and a checksum. If no checksum fits, frames without a checksum are tried.
+    starts_and_checks = [(start, check) for start in starts for check in find_checks(rows[:, start : start + length])]
+    has_check = bool(starts_and_checks)
 
     covered_share = min(1.0, len(windows.starts) * length / len(windows.stream))
     rate_Hz = len(windows.stream) / length / seconds
     for order in ORDERS:
         parts_at = parts_of(rows, order, rate_Hz, weights)
-        starts_without_check = [(start, Check(0, order, {})) for start in starts]
-        for start, check in checks or starts_without_check:
+        if not has_check:
+            starts_and_checks = [(start, Check(0, order, {})) for start in starts]
+        for start, check in starts_and_checks:
             frame_parts = parts_at[start:] + parts_at[:start]  # from the first byte of the frame
             parts_before_check = frame_parts[: length - check.size]
             sync_lengths = _sync_lengths(may_be_sync, start) if has_sync else [0]

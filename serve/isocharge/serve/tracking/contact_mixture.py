@@ -344,7 +344,7 @@ class ContactMixture:
         covariance = components.covariance[best]
         has_space_for_two = len(components.mean) <= MAX_COMPONENTS - 2
         variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])
-        longest = int(variances.argmax())
+        longest = variances.size - 1  # `eigh` returns the variances in ascending order
         std_mm = math.sqrt(max(variances[longest], 0.0))  # rounding errors may make the variance negative
         if std_mm < MIN_SPLIT_STD_mm or not has_space_for_two:
             return components
