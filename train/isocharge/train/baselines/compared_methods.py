@@ -25,7 +25,7 @@ from isocharge.train.baselines.paper import AffineTable, LinearBand, Triangulate
 from isocharge.train.data.presses import LabelledPresses
 
 Kind = Literal["paper", "learnt", "fitted map", "network"]
-"""Kind of a method, which decides about its colour in pictures."""
+"""Kind of a method. Each kind has a colour in pictures."""
 
 FIRST_COPY_SEED = 1000
 """Seed of the noise on the first copy of the training presses, relative to the seed of the task."""
@@ -38,7 +38,7 @@ class GivenMethod(BaseEstimator, RegressorMixin):  # type: ignore[misc]
     """A method that is not fitted to presses."""
 
     def fit(self, charge: Array, contact: Array) -> Self:
-        """Return the unchanged method."""
+        """Return the unchanged method. The presses are not used."""
         del charge, contact
         return self
 
@@ -109,12 +109,13 @@ class ComparedMethod:
 
     Attributes:
         name: Name in tables and pictures.
-        kind: Kind, which decides about the colour in pictures.
+        kind: Kind of the method, which determines the colour in pictures.
         computed_by: Library that computes the method.
         regressor: The method; not fitted before `fit`.
-        copies: Number of copies of the presses with noise to which it is fitted; 0 for presses without noise.
-        candidates: Values of its parameters, among which validation chooses.
-        given_force: Whether it gets the true force beside the charges, which no sensor measures.
+        copies: Number of noisy copies of the presses to which the method is fitted; 0 for presses without noise.
+        candidates: Candidate values of the parameters of the method, by the name of the parameter. The values with the
+            smallest error on the validation presses are used.
+        given_force: Whether the method gets the true force in addition to the charges. No sensor measures this force.
         choice: The chosen parameters in words, and how they were chosen; empty before `fit`.
     """
 
@@ -140,7 +141,7 @@ class ComparedMethod:
         return np.column_stack([charge, force]) if self.given_force else charge
 
     def fit(self, task: FittingTask) -> "ComparedMethod":
-        """Fit the method with each candidate and return the one with the smallest error on validation presses.
+        """Fit the method with each candidate, and return the fit with the smallest error on the validation presses.
 
         Args:
             task: Presses for the fit and for the validation.
@@ -190,8 +191,10 @@ def describe_parameter(name: str, value: object) -> str:
     """
     if isinstance(value, Mapping):
         return ", ".join(f"{axis} axis x {factor:g}" for axis, factor in value.items())
-    _, _, short_name = name.rpartition("__")
-    return f"{short_name} {value:g}" if isinstance(value, int | float) else f"{name} {value}"
+    if isinstance(value, int | float):
+        _, _, short_name = name.rpartition("__")
+        return f"{short_name} {value:g}"
+    return f"{name} {value}"
 
 
 GAUSS_NEWTON = "Gauss-Newton"
@@ -204,7 +207,7 @@ POLYNOMIAL_DEGREES = (4, 6, 8, 10, 12)
 """Candidates for the degree of the polynomial."""
 
 MAX_MONOMIALS = 500
-"""Largest number of monomials of the polynomial. More do not reduce the error under noise and cost time."""
+"""Largest number of monomials of the polynomial. More monomials take longer and do not reduce the error under noise."""
 
 SKLEARN = "scikit-learn"
 KD_TREE = "SciPy KD-tree"
@@ -245,6 +248,7 @@ def polynomial_ridge(task: FittingTask) -> ComparedMethod:
     """
     n_electrode = task.train.charge.shape[1]
     copies = 5
+    # A polynomial of n variables up to the degree d has "n + d choose d" monomials.
     allowed_degrees = [
         degree
         for degree in range(1, max(POLYNOMIAL_DEGREES) + 1)

@@ -26,7 +26,7 @@ MAX_ATTEMPTS = 3
 RESTART_THRESHOLD = 12.0
 """Sum of squared residuals above which another start is tried.
 
-Noise alone rarely exceeds it, with three or four charges.
+With three or four charges, noise alone rarely causes a larger sum.
 """
 
 BATCH = 512
@@ -53,7 +53,7 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         self.seed = seed
 
     def fit(self, charge: Array, contact: Array) -> "GaussNewton":
-        """Fit the charge map, unless it is given, and choose the starts.
+        """Fit the charge map unless one is given, and choose the starts of the searches.
 
         Args:
             charge: Charges without noise, shape (n, n_electrode), pC.

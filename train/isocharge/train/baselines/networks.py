@@ -60,6 +60,7 @@ class OnnxContact(GivenMethod):
         contact = np.zeros(3, np.float32)
 
         def compute() -> object:
+            """Return the contact of the press, float32, shape (3,)."""
             press.run_into(single_charge, contact)
             return contact
 
@@ -70,6 +71,7 @@ class OnnxContact(GivenMethod):
 
     @cached_property
     def _session(self) -> ort.InferenceSession:
+        """Session of ONNX Runtime, which is opened at the first use."""
         return open_session(self.graph, "the contact's graph")
 
 
@@ -77,7 +79,7 @@ class TrainedNetwork(OnnxContact):
     """Perceptron of one size that is trained to estimate the contact only.
 
     Args:
-        data: Sensor and domain; its presses are replaced by those of `fit`.
+        data: Sensor and domain. The presses in these data are replaced by the presses of `fit`.
         hidden: Widths of the hidden layers.
         steps: Number of optimiser steps.
         noise: Noise that is added to the charges in every step.
@@ -141,7 +143,8 @@ class ReleasedModel(GivenMethod):
             charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
-            Contact (x, y, F), shape (n, 3), mm and N; its standard deviations, shape (n, 3); misfit, shape (n, 1).
+            Contacts (x, y, F), shape (n, 3), mm and N; standard deviations of the contacts, shape (n, 3), mm and N; and
+            misfits, shape (n, 1).
         """
         answers = self.predictor.predict_batch(charge)
         contact = np.stack([answers.x_mm, answers.y_mm, answers.force_N], axis=1)
@@ -155,9 +158,9 @@ class ReleasedModel(GivenMethod):
         Args:
             charge: Charges of the press, shape (n_electrode,), pC.
         """
-        return partial(
-            self.predictor.predict_into, charge.astype(np.float32), np.zeros(N_WITHOUT_CORRELATION, np.float32)
-        )
+        single_charge = charge.astype(np.float32)
+        answer = np.zeros(N_WITHOUT_CORRELATION, np.float32)
+        return partial(self.predictor.predict_into, single_charge, answer)
 
     @cached_property
     def predictor(self) -> Predictor:

@@ -54,8 +54,9 @@ The density of such a cell is smaller by a factor of exp(-18).
 """
 
 EDGE_CHI2 = 9.0
-"""Excess of chi-squared below which a cell at the edge of the disk matters, so that the cells of this press are refined
-once more."""
+"""Excess of chi-squared below which a cell at the edge of the disk matters.
+
+If a press has such a cell, the cells of this press are refined once more."""
 
 FORCE_HALF_WIDTH_STD = 5.0
 """Half width of the integral over the logarithm of the force, in standard deviations."""
@@ -66,7 +67,7 @@ N_FORCE_NODES = 12
 
 @dataclass(frozen=True)
 class Cells:
-    """Square cells of the plane of positions, each of which belongs to one press.
+    """Square cells of the plane of positions. Each cell belongs to one press.
 
     Attributes:
         press: Number of the press, ascending, shape (n,).

@@ -77,9 +77,9 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
     stated errors are then increased if the presses scatter too much, or if there are only a few presses.
 
     Args:
-        presses: The presses in the order in which they were made, with position, force or both, and their standard
-            deviations. Presses without both show how a film has changed since an earlier calibration, if it has more
-            than three electrodes.
+        presses: The presses in the order in which they were made, with position, force or both, and the standard
+            deviations of these measurements. If the sensor has more than three electrodes, presses without position and
+            force can show how the film has changed since an earlier calibration.
         problem: The possible films.
 
     Raises:

@@ -209,7 +209,7 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
 
 
 def _film_correlations(path: Path, table: _Discrepancy, film_std: Array, parameter_correlations: Array) -> Array:
-    """Read the correlations of parameters and coefficients, and compare them with those of the parameters alone.
+    """Read the correlations of parameters and coefficients, and check the correlations of the parameters.
 
     Args:
         path: The file, for error messages.
@@ -222,7 +222,7 @@ def _film_correlations(path: Path, table: _Discrepancy, film_std: Array, paramet
         Correlations, shape (n, n).
 
     Raises:
-        PressError: If the matrix is not a matrix of correlations, or contradicts those of the parameters.
+        PressError: If the matrix is not a correlation matrix, or contradicts the section `correlations`.
     """
     correlations = _correlations(path, "discrepancy.correlations", table.correlations, film_std)
     n_parameter = len(parameter_correlations)

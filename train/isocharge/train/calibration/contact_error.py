@@ -1,7 +1,7 @@
 """Errors of contacts that are caused by the uncertainty of a film, and a choice of presses that reduce these errors.
 
-An estimator may assume a film whose parameters differ by dp from those of the real film. The error of the estimated
-contact is then the change that compensates the difference of the charges best:
+An estimator may assume wrong parameters of the film, which differ from the real parameters by dp. The error of the
+estimated contact is then the change that compensates the difference of the charges best:
 
     dc = -G dp,   G = (J' W J)^-1 J' W P.
 
@@ -191,7 +191,7 @@ def spread_contacts(domain: Domain, count: int) -> Array:
 
 
 def _whitened_slopes(problem: CalibrationProblem, parameters: Array, contact: Array) -> tuple[Array, Array]:
-    """Return the derivatives of the charges, each divided by the noise standard deviation of its charge.
+    """Return the derivatives of the charges in units of the noise of each charge.
 
     Args:
         problem: The films.

@@ -1,8 +1,8 @@
 """Contacts of the presses of a calibration, adjusted to both the measurements of the rig and the charges.
 
 A rig measures the position and the force of a press with some uncertainty, or does not measure one of them at all. For
-a given film, the adjusted contact minimises the sum of the squared residuals. The residuals are those of the charges
-and those of the measurements of the rig. These residuals show how well the film explains the press.
+a given film, the adjusted contact minimises the sum of the squared residuals. Each measured charge and each measurement
+of the rig has a residual. These residuals show how well the film explains the press.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,14 +22,14 @@ CANDIDATE_POSITIONS = 300
 """Number of positions among which the start is chosen for a press of unknown position."""
 
 MIN_CHANGE = 1e-5
-"""Smallest change of the chi2 of a press, relative to 1 + chi2, for which the search of its contact continues."""
+"""Smallest change of chi2 for which the search for the contact of a press continues, relative to 1 + chi2."""
 
 
 class AdjustedContacts(NamedTuple):
     """Contacts adjusted to one film.
 
     Attributes:
-        contact: (x, y, ln F), shape (n, 3).
+        contact: Contacts (x, y, ln F), shape (n, 3).
         residual: Residuals of charges and rig as in `PressData.residual`, shape (n, n_electrode + 3).
     """
 
@@ -149,6 +149,9 @@ def _interpolated(film_values_and_slopes: list[tuple[Array, Array]], film_weight
     Args:
         film_values_and_slopes: Values and derivatives on each of k films, as `_values_and_slopes` returns them.
         film_weights: Weight of each film in each press, shape (n, k).
+
+    Returns:
+        Interpolated values, shape (n, n_electrode), and interpolated derivatives, shape (n, n_electrode, 3).
     """
     values = weighted_sum([film_values for film_values, _ in film_values_and_slopes], film_weights)
     slopes = weighted_sum([film_slopes for _, film_slopes in film_values_and_slopes], film_weights)

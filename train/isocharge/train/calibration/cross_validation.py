@@ -35,7 +35,7 @@ class HeldOutAnswers:
     Attributes:
         presses: The measured presses.
         answers: Contacts and misfits that the networks compute from the charges of the presses. The standard deviations
-            include those of the measured contacts, so they describe the differences from the measured contacts.
+            are those of the differences from the measured contacts, so they include the errors of the rig.
     """
 
     presses: LabelledPresses

@@ -32,7 +32,7 @@ MAX_NEGATIVE_FRACTION = 0.8
 """Fraction of negative charges above which a channel counts as reversed."""
 
 MIN_POSITION_RANGE_MM = 0.05
-"""Range of the positions below which they were probably written in metres, mm."""
+"""Smallest credible range of the positions, mm. Positions in a smaller range were probably written in metres."""
 
 
 class OtherUnit(NamedTuple):
@@ -138,7 +138,7 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
     Args:
         presses: The measured presses.
-        charges: Charges of the films of the calibration. The charges of a channel may be as small as those of a film.
+        charges: Charges of the films of the calibration. A channel may have as small charges as one of these films.
 
     Raises:
         PressError: If there is such a channel.
@@ -279,7 +279,7 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
 
 
 def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected: Array) -> float:
-    """Compute the difference between measured charges and those of the most similar of several films.
+    """Compute how much measured charges differ from the charges of the most similar of several films.
 
     The difference is computed from the logarithms of the ratios of measured to expected charges. The difference has two
     parts: the mean squared scatter of these logarithms about their median, and the squared median. Each part is in

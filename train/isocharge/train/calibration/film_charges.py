@@ -1,9 +1,9 @@
 """Charges of presses on any film of a prior, and their derivatives with respect to the contact and the film.
 
 A film is described by a vector of unknowns. The parameters of `FilmPrior` come first. The parameters may be followed by
-three kinds of coefficients. The first are those of the modes of imperfections, in units of their standard deviations.
-The second are those of traces that the sensor file does not describe. The third are those of the terms of the
-discrepancy. `UnknownLayout` defines their order.
+three kinds of coefficients: coefficients of the modes of imperfections, in units of their standard deviations;
+coefficients of traces that the sensor file does not describe; and coefficients of the terms of the discrepancy.
+`UnknownLayout` defines the order of the unknowns.
 """
 
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ LOAD_PARAMETERS = ("pretension", "young", "thickness")
 """Parameters that change the stress of the film under a load. The others move electrodes or scale charges."""
 
 NEGLIGIBLE = 1e-3
-"""Coefficient of the modes and traces below which they are not computed. The charges change by less than 1e-4."""
+"""Coefficient below which modes and traces are not computed, because they change the charges by less than 1e-4."""
 
 LARGEST_LOCAL_COEFFICIENT = 0.1
 """Largest coefficient of modes and traces whose factor is assumed to be the same on neighbouring films."""

@@ -95,7 +95,7 @@ def _fitted_series(domain: Domain, contact: Array, log_changes: Array) -> Array:
         log_changes: Changes of ln Q at the contacts, shape (n, n_direction, n_electrode).
 
     Returns:
-        Coefficients of the series. Their last two axes are those of the directions and electrodes.
+        Coefficients of the series, shape (degree + 1, degree + 1, force_degree + 1, n_direction, n_electrode).
     """
     n_contact, n_direction, n_electrode = log_changes.shape
     for degree, force_degree in DEGREES:

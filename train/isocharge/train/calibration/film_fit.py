@@ -22,7 +22,7 @@ from isocharge.train.calibration.problem import FilmEstimate, Warming
 from isocharge.train.calibration.unknowns import UnknownLayout
 
 STUDENT_T_DEGREES = 4.0
-"""Degrees of freedom of the Student's t distribution that weights the presses while bad ones may be among them."""
+"""Degrees of freedom of the Student's t distribution from which the weights of possibly bad presses follow."""
 
 MAX_WEIGHTINGS = 6
 """Largest number of rounds in which the weights are computed."""
@@ -40,7 +40,7 @@ If more presses disagree, all presses are kept, because it is then uncertain whi
 """
 
 MIN_PRESSES_TO_JUDGE = 4
-"""Smallest number of presses from which it can be determined which of them are bad."""
+"""Smallest number of presses among which bad presses can be recognised."""
 
 MISTAKE_PROBABILITY = 0.01
 """Probability that a press is recorded wrongly."""
@@ -139,7 +139,7 @@ def fit_film(
     *,
     friction: float = 0.0,
 ) -> FilmPosterior:
-    """Estimate the film from presses, some of which may be bad.
+    """Estimate the film from presses, and leave out bad presses.
 
     The film is fitted to all presses first. If some residuals are too large, the presses that agree with each other are
     searched for, and only they are fitted.

@@ -23,7 +23,7 @@ from isocharge.train.calibration.nuisances import NUISANCES
 from isocharge.train.calibration.unknowns import UnknownLayout
 
 MODE_SIZES = {0.0: 0.5, 1.0: 0.5}
-"""Considered sizes of the modes relative to those of typical films, each with its prior probability."""
+"""Considered sizes of the modes, relative to typical films, each with its prior probability."""
 
 DISCREPANCY_SIZES = {0.0: 0.5, 0.003: 0.1, 0.01: 0.15, 0.03: 0.15, 0.1: 0.1}
 """Considered relative sizes of the discrepancy of the charges, each with its prior probability."""
@@ -32,8 +32,9 @@ TRACES_PROBABILITY = 0.01
 """Prior probability that traces collect charge and are not described in the sensor file."""
 
 FORCE_SCATTERS = {0.0: 0.95, 0.03: 0.03, 0.1: 0.02}
-"""Considered relative standard deviations of the forces in addition to that of the rig, each with its prior
-probability."""
+"""Considered standard deviations of an additional scatter of the forces, each with its prior probability.
+
+The standard deviations are relative to the force. They are added in quadrature to the standard deviation of the rig."""
 
 NEGLIGIBLE_PROBABILITY = 1e-7
 """Probability up to which a hypothesis is left out of the mixture."""
@@ -41,16 +42,16 @@ NEGLIGIBLE_PROBABILITY = 1e-7
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A combination of effects that the presses of a session may contain in addition to those of the film's parameters.
+    """A combination of effects on the presses of a session that the parameters of the film do not describe.
 
     Attributes:
-        modes: Size of the modes relative to those of typical films, dimensionless.
+        modes: Size of the modes, relative to the modes of typical films, dimensionless.
         discrepancy: Relative size of the discrepancy of the charges, dimensionless.
         nuisance_stds: Standard deviation of each nuisance before the presses, in the unit of the nuisance and in the
             order of `NUISANCES`. The part that known temperatures add is not included.
         force_scatter: Relative standard deviation of the forces in addition to that of the rig.
         prior_probability: Probability before the presses.
-        traces: Size of the traces that are not described, relative to those of typical films, dimensionless.
+        traces: Size of the traces that the sensor file does not describe, relative to typical films, dimensionless.
     """
 
     modes: float = 0.0

@@ -49,7 +49,7 @@ class Nuisance:
     std_with_temperatures: float = 0.0
 
     def charge_error(self, data: PressData, value: float) -> Array:
-        """Return the charges that the nuisance adds to the measured ones, shape (n, n_electrode), pC."""
+        """Return the charges that the nuisance adds to the measured charges, shape (n, n_electrode), pC."""
         del value
         return np.zeros_like(data.charge)
 

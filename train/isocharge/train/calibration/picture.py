@@ -22,7 +22,7 @@ FITTED = "#3a7ca5"
 """Colours of the estimates before and after the presses."""
 
 NEIGHBOURS = 12
-"""Number of contacts over which the map of the error is smoothed, since neighbours have different forces."""
+"""Number of contacts over which the map of the error is smoothed, because neighbours have different forces."""
 
 MAX_DRAWN_RESIDUAL = 10.0
 """Height of the largest bar of a residual, relative to the expected size of the residual."""
@@ -61,7 +61,7 @@ def calibration_picture(result: CalibrationResult) -> Figure:
 
 
 def _draw_presses(axes: Any, result: CalibrationResult) -> None:
-    """Draw the positions of the presses, and mark those that were left out as bad.
+    """Draw the positions of the presses, and mark the presses that were left out as bad.
 
     Args:
         axes: Axes of matplotlib.

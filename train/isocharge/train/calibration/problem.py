@@ -49,7 +49,7 @@ CREEP = 0.1
 If both temperatures are known, the effect of the temperature is subtracted, and only creep remains."""
 
 PLANNED_IMPERFECTIONS = Hypothesis(modes=0.5, discrepancy=0.01)
-"""Imperfections that are assumed when presses are planned: half of those of typical imperfect films.
+"""Imperfections that are assumed when presses are planned: half as large as on typical imperfect films.
 
 If smaller imperfections are assumed, the remaining errors on imperfect films are 1.5 times as large. On a film without
 imperfections, the assumption does not change the error after eight presses, and increases it by 7 % after five."""
@@ -260,8 +260,8 @@ class CalibrationProblem:
     ) -> Fitted:
         """Return the network of a film, adapted to the charges of this film and sensor.
 
-        The charges of the film are those of its parameters times a given factor. If the electrodes of the sensor differ
-        from those of the network for all films, the ratio of their charges is a further factor.
+        The charges that follow from the parameters of the film are multiplied by a given factor. If the sensor has
+        other electrodes than the network for all films, the ratio of the charges of both is a further factor.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -344,8 +344,8 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
     The networks are tried in order until one fits. The name of the sensor does not matter.
 
     Args:
-        sensor: The sensor. Its pads, the radius of its film and its readout must be those for which the network was
-            trained. All other properties may differ within the spread of the films, and the electrodes may have traces
+        sensor: The sensor. The pads, the radius of the film and the readout must be the same as in the training of the
+            network. All other properties may differ within the spread of the films, and the electrodes may have traces
             and patterned backs.
         probe: The probe. Its radius must be within the spread of the films.
         models: Folder of models that is searched first.
@@ -381,7 +381,7 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
 
 
 def _with_electrodes(prior: FilmPrior, sensor: Sensor) -> FilmPrior:
-    """Replace the electrodes of the prior by those of a sensor, if the pads of both are equal.
+    """Return a prior with the electrodes of a sensor, if the pads of both are equal; otherwise, return the given prior.
 
     The electrodes of the sensor may have traces and patterned backs.
     """

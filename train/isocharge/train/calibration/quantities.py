@@ -88,7 +88,7 @@ def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
     A quantity is a weighted sum of the parameters.
 
     Args:
-        prior: The films; their standard deviations are those before the presses.
+        prior: The films, with the standard deviations of their parameters before the presses.
         film: The estimate of the film.
     """
     table = {}
@@ -167,7 +167,7 @@ def _relative(meaning: str, log_weights: Array) -> _Definition:
 
 
 def summarise(table: Mapping[str, Quantity]) -> tuple[str, ...]:
-    """Return sentences about the quantities that the presses identify, and about those that they do not identify.
+    """Return sentences about the identified and the unidentified quantities.
 
     If single parameters are not identified, a further sentence states how well their combination is known.
 

@@ -92,7 +92,14 @@ def read_answer(text: str) -> Answer:
 
 
 def _with_unknown(temperatures_C: Array | None) -> Array | None:
-    """Append an unknown temperature to those of earlier presses. None means that no temperatures are measured."""
+    """Append an unknown temperature to the temperatures of earlier presses.
+
+    Args:
+        temperatures_C: Temperatures, shape (n,), degrees Celsius; None if no temperatures are measured.
+
+    Returns:
+        Temperatures, shape (n + 1,), of which the last one is NaN; None if no temperatures are measured.
+    """
     if temperatures_C is None:
         return None
     return np.append(temperatures_C, np.nan)

@@ -72,8 +72,8 @@ class ChannelNoise:
     def of(cls, charge: Array, unit: Array) -> "ChannelNoise":
         """Estimate the noise from measured presses.
 
-        A plane through the neighbours of each press gives the charge without noise and the residual. The residuals of
-        each channel give its white noise and the noise of its gain, both of which are limited from below.
+        A plane through the neighbours of each press gives the charge without noise and the residual. The white noise
+        and the noise of the gain of each channel are fitted to the residuals. Both are limited from below.
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.

@@ -381,7 +381,7 @@ def _uncertain_fold_caution(fold_radius: float, requested_radius: float) -> str:
 
 
 def _fold_caution(field: ChargeField, presses: LabelledPresses, fold_radius: float) -> str:
-    """Return a sentence about a fold that is certain, because of which the domain is reduced.
+    """Return a sentence about a certain fold, and about the reduction of the domain because of this fold.
 
     For positive charges, the sentence also names the command that follows contacts beyond the fold.
 

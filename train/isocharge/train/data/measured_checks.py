@@ -44,7 +44,7 @@ def check_measured_presses(presses: MeasuredPresses) -> None:
     """Check that a network can be trained on measured presses without unknown values.
 
     Args:
-        presses: The presses, of which all positions, forces and charges are known.
+        presses: The presses. All positions, forces and charges are known.
 
     Raises:
         PressError: If the charges of a channel hardly vary or are too small or too large, if a value is far from all
@@ -163,7 +163,7 @@ def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compare
 
 
 def _check_independence(channels: Mapping[str, Array]) -> None:
-    """Raise an error if the charges of a channel are a linear combination of those of other channels.
+    """Raise an error if the charges of a channel are a linear combination of the charges of other channels.
 
     Args:
         channels: Charges of each channel, shape (n,), pC, by its name.
@@ -181,8 +181,12 @@ def _check_independence(channels: Mapping[str, Array]) -> None:
         return
     # The last singular vector contains the coefficients of a combination of the channels that is nearly zero.
     coefficients = np.abs(directions[-1])
-    is_dependent = coefficients > LEAST_PARTICIPATION * coefficients.max()
-    dependent_names = [shown(name) for name, dependent in zip(channels, is_dependent, strict=True) if dependent]
+    smallest_coefficient = LEAST_PARTICIPATION * coefficients.max()
+    dependent_names = [
+        shown(name)
+        for name, coefficient in zip(channels, coefficients, strict=True)
+        if coefficient > smallest_coefficient
+    ]
     raise PressError(
         f"channels {', '.join(dependent_names)}: expected charges that are linearly independent, got channels of which "
         "each follows from the others; leave out a channel that is a copy or a sum of others"

@@ -14,8 +14,9 @@ from isocharge.simulate import Domain
 from isocharge.simulate.numerics.polygon import area_of, to_complex, to_corners
 
 LEAST_HOLE = 6.0
-"""Radius of the circumscribed circle from which on a triangle between places may lie outside the area, relative to the
-distance between neighbouring places."""
+"""Radius of the circumscribed circle above which a triangle between places may be left out of the area.
+
+The radius is relative to the distance between neighbouring places."""
 
 LEAST_RANGE = 1.1
 """Smallest ratio of the largest to the smallest force of an area, also if all presses have the same force."""
@@ -159,8 +160,9 @@ def outline(places: Array) -> Array:
     distances, _ = cKDTree(places).query(places, 2)
     spacing = float(np.median(distances[:, 1]))
     circumradii = _circumradii(places[triangles])
-    radius_limits = [*LEAST_HOLE * spacing * 2.0 ** np.arange(0.0, 20.0, 0.5), np.inf]
-    for radius_limit in radius_limits:
+    # Each limit is larger than the previous one by a factor of sqrt(2). The last limit includes all triangles.
+    finite_limits = LEAST_HOLE * spacing * 2.0 ** np.arange(0.0, 20.0, 0.5)
+    for radius_limit in [*finite_limits, np.inf]:
         boundary = _single_boundary(triangles[circumradii <= radius_limit], len(places))
         if boundary is not None:
             return _enlarged(places[boundary], 0.5 * spacing)
@@ -256,7 +258,7 @@ def _enlarged(corners: Array, distance: float) -> Array:
             `LONGEST_MITRE` times this distance.
 
     Returns:
-        Corners, anticlockwise, without those between two sides in the same direction, shape (m, 2), mm.
+        Corners, anticlockwise, shape (m, 2), mm. Corners between two sides in the same direction are left out.
     """
     is_anticlockwise = area_of(corners) > 0.0
     all_points = to_complex(corners if is_anticlockwise else corners[::-1])

@@ -110,12 +110,13 @@ class OutsidePresses:
         return self._presses(distances.ravel(), angles.ravel(), forces.ravel())
 
     def unnoticed(self, is_unnoticed: Booleans) -> UnnoticedPresses:
-        """Return the measured shares, by place.
+        """Compute the share of unnoticed presses in each ring and sector of `grid`.
 
         Args:
             is_unnoticed: Whether each press of `grid` is answered wrongly without a flag, shape (n,).
         """
-        shares = is_unnoticed.reshape(N_RINGS, N_SECTORS, -1).mean(axis=2).round(SHARE_DECIMALS)
+        by_place = is_unnoticed.reshape(N_RINGS, N_SECTORS, N_FORCES)
+        shares = by_place.mean(axis=2).round(SHARE_DECIMALS)  # over the forces
         forces = self._measured_forces()
         return UnnoticedPresses(
             from_mm=round(self.inner, 4),

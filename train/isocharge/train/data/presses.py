@@ -22,7 +22,7 @@ HIGHEST_CHARGE = 1e6
 """Limits to which charges are clipped before the logarithm, pC, so that every charge gives a finite answer."""
 
 SOLVER = "solver"
-"""Entry of the manifest of every simulated dataset. Measured datasets do not have it."""
+"""Name of an entry that the manifest of every simulated dataset has, and that of a measured dataset does not have."""
 
 FEWEST = 500
 """Smallest number of presses for a fit."""
@@ -56,6 +56,7 @@ class LabelledPresses:
         return cls(contact, samples.charge_pC, is_measured(dataset))
 
     def __getitem__(self, rows: np.ndarray) -> "LabelledPresses":
+        """Return some of the presses."""
         return LabelledPresses(self.contact[rows], self.charge[rows], self.measured)
 
     def __len__(self) -> int:
@@ -172,8 +173,8 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
         Contacts and charges of the presses.
 
     Raises:
-        DatasetError: If the dataset has too few presses or positions, fewer than three electrodes or one whose charge
-            never varies, or numbers that are not finite or forces that are not positive.
+        DatasetError: If the dataset has too few presses, positions or electrodes. The error is also raised if a number
+            is not finite, if a force is not positive, or if the charge of an electrode never varies.
     """
     presses = LabelledPresses.of(dataset)
     _check_finite(presses)
@@ -284,7 +285,7 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
         probe: Probe with which the presses were made.
 
     Raises:
-        PressError: If fewer than `FEWEST_MEASURED` remain.
+        PressError: If fewer than `FEWEST_MEASURED` presses remain.
     """
     complete_presses = presses[complete(presses)]
     count = len(complete_presses)

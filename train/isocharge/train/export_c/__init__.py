@@ -7,5 +7,6 @@
     host_example.c           a serial port in, contacts out
     arduino/                 a sketch with copies of what it needs
 
-`sources/` holds these files with `$names` for what a model or a board decides; layers of the network are generated.
+The folder `sources/` contains templates of these files. The `$names` in a template are replaced by the values of a
+model or a board. The source of the layers of a network is generated without a template.
 """

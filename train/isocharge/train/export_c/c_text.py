@@ -15,7 +15,9 @@ LINE_WIDTH = 109
 
 def source_text(name: str, **values: object) -> str:
     """Return the text of a file in `sources/` in which each `$name` is replaced by its value."""
-    return Template((resources.files(__package__) / "sources" / name).read_text("utf-8")).substitute(values)
+    file = resources.files(__package__) / "sources" / name
+    template = Template(file.read_text("utf-8"))
+    return template.substitute(values)
 
 
 def c_float(value: float) -> str:
@@ -77,4 +79,9 @@ def c_comment(text: str) -> str:
 
     Characters that could end the comment, or begin another comment, are replaced by `_`.
     """
-    return "".join(sign if sign.isascii() and (sign.isalnum() or sign in " ._-,:()=/") else "_" for sign in text)
+
+    def is_allowed(character: str) -> bool:
+        """Return whether a character can remain in the comment."""
+        return character.isascii() and (character.isalnum() or character in " ._-,:()=/")
+
+    return "".join(character if is_allowed(character) else "_" for character in text)

@@ -20,8 +20,9 @@ from isocharge.common.arrays import Singles
 from isocharge.train.export_c.c_text import c_array
 
 N_ROWS = 4
-"""Number of rows of the weights that are added at a time, so that each output is loaded and stored once for all of
-them."""
+"""Number of rows of the weights whose products are added at a time.
+
+Each output is then loaded and stored only once for these rows."""
 
 LARGEST_INT8 = 127
 """Largest absolute value of a weight that is rounded to 8 bits, in units of the scale of its column."""

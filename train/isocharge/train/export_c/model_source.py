@@ -56,7 +56,7 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     """Return the text of `isocharge_model.c`.
 
     Args:
-        metadata: Metadata of the model, of which the label appears in a comment.
+        metadata: Metadata of the model. The label of the model appears in a comment.
         network: The network.
     """
     hidden, skip, last = _layer_sources(network)
@@ -140,7 +140,8 @@ def _correlations_source(network: FoldedNetwork) -> str:
 
 def self_test(golden: Golden) -> str:
     """Return the text of `self_test.c`, which contains golden vectors and their tolerances."""
-    names = sorted(golden.outputs, key=CORRELATION.__eq__)  # a Contact ends with the correlations
+    # A Contact ends with the correlations. False is sorted before True, and other names keep their order.
+    names = sorted(golden.outputs, key=lambda name: name == CORRELATION)
     answers = np.concatenate([golden.outputs[name] for name in names], axis=1)
     floors = np.array([floor for name in names for floor in golden.floors[name]], np.float32)
     return source_text(

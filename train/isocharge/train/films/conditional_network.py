@@ -62,7 +62,7 @@ class FilmInputs:
 
         Args:
             scaling: Exact scales and contexts of films.
-            presses: Presses on films, of which the first `N_WHITENING_FILMS` films are used.
+            presses: Presses on films. Only the first `N_WHITENING_FILMS` films are used.
         """
         charge = presses.charge()[:N_WHITENING_FILMS]
         log_charge = np.log(np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE))

@@ -45,7 +45,10 @@ class FilmScaling:
     domain: Domain
 
     def log_charge_scale(self, parameters: Array) -> Array:
-        """Compute the logarithms of the exact factors of the charges, which are 1 for the described film.
+        """Compute the logarithms of those factors of the charges that follow exactly from the parameters.
+
+        A factor is the product of Young's modulus, the geometric mean of d31 and d32, and the gain of the electrode,
+        each relative to the described film.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
@@ -94,7 +97,7 @@ class FilmScaling:
         return np.asarray(offset / self.domain.scale)
 
     def to_film(self, parameters: Array, unit: Array) -> Array:
-        """Transform unit coordinates on the described film to those on another film: T u + o.
+        """Transform unit coordinates u on the described film into unit coordinates on another film, T u + o.
 
         The position moves with the electrodes, and the force is proportional to the stiffness.
 
@@ -105,7 +108,7 @@ class FilmScaling:
         Returns:
             Unit coordinates on the other film, shape (..., 3).
         """
-        rotated = (self.rotation(parameters) @ unit[..., None])[..., 0]
+        rotated = (self.rotation(parameters) @ unit[..., None])[..., 0]  # T u, with u as a column vector
         return np.asarray(rotated + self.offset(parameters))
 
     def context(self, parameters: Array) -> Array:

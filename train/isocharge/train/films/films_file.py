@@ -44,7 +44,7 @@ BITS = 12
 """Number of bits of a weight, including its sign. The largest weight of a row has the largest integer."""
 
 FILE_UNITS = {"pretension": 1e6, "shift": 1e-3, "probe_radius": 1e-3}
-"""Factors from the units of the program to those of the file, Pa and m, by name of the quantity."""
+"""Factors that convert quantities to the units of the file, Pa and m, by the name of the quantity."""
 
 FILE_PC = 1e-12
 """Factor from the white noise in pC to that in the file, C."""

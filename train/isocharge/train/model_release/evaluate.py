@@ -13,8 +13,10 @@ from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.fitted import Fitted
 
 Predict = Callable[[Array], tuple[Array, Array, Array]]
-"""Function from charges, shape (n, n_electrode), pC, to contacts, shape (n, 3), mm and N, their standard deviations,
-shape (n, 3), and misfits, shape (n, 1)."""
+"""Function that estimates contacts from charges.
+
+The argument has the shape (n, n_electrode), pC. The results are contacts (x, y, F), shape (n, 3), mm and N, standard
+deviations of the contacts, shape (n, 3), and misfits, shape (n, 1)."""
 
 FALSE_ALARM_RATE = 0.01
 """Fraction of good presses whose misfit exceeds the threshold of the alarm, dimensionless."""
@@ -26,7 +28,7 @@ N_NOISE_DRAWS = 20
 """Number of draws of the noise from which percentiles of the misfit are computed."""
 
 HELD_PRESSES = "measured_presses"
-"""Entry of a model's errors: number of measured presses that they were measured on. Simulated errors have none."""
+"""Name of the entry with the number of measured presses. Errors on simulated presses have no such entry."""
 
 ONLY_SIMULATED = ("position_p99_mm", "force_p99_percent")
 """Errors that need more presses than a rig usually makes."""
@@ -40,16 +42,17 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
 
     Args:
         fitted: The network, with its noise and its presses for the test.
-        presses: Presses on which the errors are measured; None for those on which the network was not trained. To
-            simulated presses the network's noise is added. Measured presses are used as they are, so the errors include
-            those of the measured places and forces.
+        presses: Presses on which the errors are measured; None for the test presses of `fitted`. Noise is added to the
+            charges of simulated presses. Measured presses are used as they are, so the errors include the errors of the
+            measured places and forces.
         seed: Seed of the noise.
 
     Returns:
-        Errors by name: position errors in mm, relative force errors in percent, coverage of the 68 and 95 % intervals
-        (fraction of the coordinates, 0 to 1), and the misfits that 1 % and 0.1 % of the good presses exceed. Simulated
-        presses also give the errors without noise, and the fraction of faults whose misfit exceeds the first of these
-        misfits. Measured presses also give their number.
+        Errors by name. The position errors are in mm, and the force errors are in percent of the force. The coverages
+        of the 68 and 95 % intervals are fractions of the coordinates, 0 to 1. Further entries are the misfits that 1 %
+        and 0.1 % of the good presses exceed. For simulated presses, there are also the errors without noise, and the
+        fractions of faults whose misfit exceeds that of 99 % of the good presses. For measured presses, there is also
+        the number of presses.
     """
     if isinstance(presses, Dataset):
         presses = LabelledPresses.of(presses)
@@ -121,15 +124,15 @@ def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]
 
     Args:
         contact: Estimated contacts (x, y, F), shape (n, 3), mm and N.
-        std: Their standard deviations, shape (n, 3).
+        std: Standard deviations of the contacts, shape (n, 3), mm, mm and N.
         truth: True contacts, shape (n, 3).
 
     Returns:
         Errors by name, as `evaluate` returns them.
     """
     statistics = asdict(ContactErrorStatistics.of(contact, truth))
-    del statistics["presses"]  # their number is not an error
-    deviation = np.abs(contact - truth) / std
+    del statistics["presses"]  # the number of presses is not an error
+    deviation = np.abs(contact - truth) / std  # in standard deviations
     errors = {
         **statistics,
         "coverage_68": np.mean(deviation < 1.0),
@@ -207,7 +210,7 @@ def _detected_faults(
     def detected_fraction(wrong_gain: float) -> float:
         """Return the fraction of presses that are detected if one electrode has a wrong gain.
 
-        The fraction is the mean over the electrodes, each of which has the wrong gain in turn.
+        Each electrode has the wrong gain in turn, and the fraction is the mean over the electrodes.
 
         Args:
             wrong_gain: Gain of the faulty electrode, relative to the true gain; 0 for a dead electrode.

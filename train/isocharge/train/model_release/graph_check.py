@@ -35,12 +35,14 @@ N_COMPARED = 10_000
 """Number of presses with noise on which the graph and the network are compared."""
 
 QUANTILE = 0.999
-"""Fraction of the presses that must meet the tolerances. For the others the position depends so strongly on the charges
-that float32 has too few digits."""
+"""Fraction of the presses that must meet the tolerances.
+
+For the other presses, the position depends so strongly on the charges that float32 has too few digits."""
 
 STD_FACTOR = 100.0
-"""Differences of a contact are relative to at least this many standard deviations. A thousandth of a standard deviation
-is negligible."""
+"""Smallest divisor of the relative difference of a contact, in standard deviations of the contact.
+
+A difference of a thousandth of a standard deviation, which is negligible, is then within the tolerance."""
 
 EXTREME_FACTOR = 10.0
 """Factor on the tolerances for the remaining presses and for charges that no film produces."""

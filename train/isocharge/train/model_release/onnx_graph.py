@@ -218,7 +218,7 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
         where: Name of the file, for error messages.
 
     Returns:
-        The network. Its numbers are those of the file: float32 numbers in float64 arrays.
+        The network. The float32 numbers of the file are stored in float64 arrays.
 
     Raises:
         ModelError: If the file is damaged or was not written by `write_graph`.

@@ -45,7 +45,8 @@ def unnoticed_presses(fitted: Fitted, about: ModelMetadata) -> UnnoticedPresses 
         return None
     presses = outside.grid()
     contact, std, misfit = fitted.predict(presses.noisy(fitted.misfit_noise, NOISE_SEED))
-    is_wrong = (np.abs(contact - presses.contact) > WRONG_STDS * std).any(axis=1)
+    is_coordinate_wrong = np.abs(contact - presses.contact) > WRONG_STDS * std
+    is_wrong = is_coordinate_wrong.any(axis=1)
     is_unnoticed = is_wrong & ~is_flagged(about, contact, std, misfit)
     return outside.unnoticed(is_unnoticed)
 
@@ -65,7 +66,7 @@ def is_flagged(about: ModelMetadata, contact: Array, std: Array, misfit: Array) 
     correlation = np.full_like(std, np.nan)
     columns = np.concatenate([contact, std, misfit, correlation], axis=1).T
     flags = Validity.of(about).batch_flags(Contacts(*columns))
-    return np.array([bool(set(words) - {STRESS}) for words in flags])
+    return np.array([any(flag != STRESS for flag in answer_flags) for answer_flags in flags])
 
 
 def unnoticed_section(unnoticed: UnnoticedPresses | None) -> str:

@@ -1,8 +1,8 @@
 """Settings of a report, the test presses of a dataset, and the theoretical limits of the error on these presses.
 
-The test charges come from solves of the film that are not part of the training data: the forward map of the test covers
-a slightly larger range of distances and forces than the forward map of the dataset, so that its nodes lie at other
-distances and forces. The theoretical limits are the Bayes limit and the Cramér-Rao limit.
+The test charges come from solves of the film that are not part of the training data. The forward map of the test covers
+a slightly larger range of distances and forces than the forward map of the dataset. The nodes of both maps therefore
+lie at different distances and forces. The theoretical limits are the Bayes limit and the Cramér-Rao limit.
 """
 
 from concurrent.futures import Executor

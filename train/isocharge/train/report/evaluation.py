@@ -350,7 +350,8 @@ class DatasetEvaluation:
 
 def _first_presses(dataset: Dataset, max_presses: int) -> Dataset:
     """Return the dataset with at most its first `max_presses` presses."""
-    return select_presses(dataset, np.arange(len(dataset.samples)) < max_presses)
+    is_first = np.arange(len(dataset.samples)) < max_presses
+    return select_presses(dataset, is_first)
 
 
 def _study_drawings(

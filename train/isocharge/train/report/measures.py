@@ -41,8 +41,8 @@ class ContactErrors:
 
     Attributes:
         position_rms_mm: Root mean square of the distance from the true position, mm.
-        position_median_mm: Median of this distance, mm.
-        position_p95_mm: 95th percentile of this distance, mm.
+        position_median_mm: Median of the distance from the true position, mm.
+        position_p95_mm: 95th percentile of the distance from the true position, mm.
         force_rms_percent: Root mean square of the relative error of the force, %.
         force_median_percent: Median of the absolute relative error of the force, %.
         answered: Fraction of the presses for which the method returned an estimate, 0 to 1.

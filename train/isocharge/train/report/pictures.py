@@ -233,7 +233,7 @@ def coverage_plot(record: Mapping[str, Any]) -> Figure:
 
 
 def mismatch_plot(results: Sequence[Mapping[str, Any]], nominal_error_mm: float | None) -> Figure:
-    """Draw the position errors and the alarms for all mismatches except those of the noise.
+    """Draw the position errors and the alarms for all mismatches except other noise.
 
     Each mismatch is one row, which both panels of the figure share.
 

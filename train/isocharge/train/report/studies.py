@@ -159,7 +159,7 @@ SINGLE_GAIN_ERROR = 0.2
 MISMATCH_ACCURACY = 2e-3
 """Relative accuracy of the simulated charges for other probes and pretensions.
 
-It is small compared with the changes of the charges that these cause.
+The errors are small compared with the changes of the charges by another probe or pretension.
 """
 
 CLIP_LIMIT = 50.0
@@ -227,7 +227,7 @@ def _solved_mismatch(
     """Return presses that are simulated with the sensor and the probes of another case.
 
     Args:
-        group: Group of the mismatch, such as "film".
+        group: Kind of the mismatch, such as "probe".
         name: Name of the mismatch within the group.
         other_case: Case whose sensor and probes differ.
         accuracy: Relative accuracy of the charges.
@@ -298,8 +298,9 @@ def measure_mismatch(
         alarm_threshold: Misfit above which the released model gives an alarm, in standard deviations of the noise.
 
     Returns:
-        One entry of "cases" in `report.json`: the errors of each method, and of the released model the percentage of
-        presses with an alarm and the fraction of true values inside plus or minus one standard deviation.
+        One entry of "cases" in `report.json`. The entry contains the errors of each method. For the released model, the
+        entry also contains the percentage of presses with an alarm, and the fraction of true values inside plus or
+        minus one standard deviation.
     """
     estimate, std, misfit = released.answer(mismatch.charge)
     errors = {released_name: asdict(ContactErrors.of(estimate, mismatch.truth))}

@@ -15,28 +15,31 @@ from isocharge.train.rig.correction import Correction, Residuals, fit_correction
 _log = logging.getLogger(__name__)
 
 GROSS_ERROR_RATIO = 100.0
-"""Squared residual of a press over that of the median press, above which the press is left out: ten times as far off.
-"""
+"""Ratio of the squared residual of a press to the median squared residual, above which the press is left out.
+
+The residual of such a press is ten times as large as a typical residual."""
 
 MAX_ROUNDS = 3
-"""Largest number of fits without such presses. A press with a gross error may hide that others are good."""
+"""Largest number of fits without presses with gross errors.
+
+A gross error distorts the fit, so that good presses can seem to have gross errors in the first round."""
 
 SCATTER_PROBABILITY = 1e-3
 """Probability of a scatter as large as the measured one, below which the scatter is reported."""
 
 SCATTER_RATIO = 1.3
-"""Ratio of the scatter to the expected one, above which the scatter is reported."""
+"""Ratio of the scatter to the expected scatter, above which the scatter is reported."""
 
 
 @dataclass(frozen=True)
 class CorrectedFilm:
-    """A film as the presses show it.
+    """Film whose charges are those of a described sensor, corrected by measured presses.
 
     Attributes:
         forward_map: Forward map of the sensor as described.
         correction: Correction by the presses.
         domain: Contacts for which the film is needed.
-        scatter: Root-mean-square residual of the corrected presses over the expected one.
+        scatter: Root-mean-square residual of the presses after the correction, relative to the expected residual.
         is_scattered: Whether the scatter is larger than noise and errors of the contacts explain.
     """
 
@@ -48,7 +51,8 @@ class CorrectedFilm:
 
     def charges(self, contact: Array) -> Array:
         """Return the charges, shape (n, n_electrode), pC, of contacts (x, y, F), shape (n, 3), mm and N."""
-        return np.asarray(self.forward_map.charges(contact) * np.exp(self.correction.log_factor(contact)))
+        factor = np.exp(self.correction.log_factor(contact))
+        return np.asarray(self.forward_map.charges(contact) * factor)
 
     def correction_percent(self, contact: Array) -> float:
         """Return the root mean square of the correction at contacts (n, 3), percent of the charges."""
@@ -74,12 +78,13 @@ def correct_film(presses: MeasuredPresses, forward_map: ForwardMap, domain: Doma
         left_out_rows = row_words(left_out.lines, left_out.row_noun)
         _log.warning("%s: left out, since these presses differ from all others; look at them again", left_out_rows)
 
-    # The scatter is the root of chi-squared over its degrees of freedom: residuals less fitted coefficients.
+    # The scatter is the root of chi-squared over its degrees of freedom. The degrees of freedom are the number of
+    # residuals minus the effective number of fitted coefficients.
     good_residuals = residuals[~is_gross]
     total_chi2 = good_residuals.chi2(correction.log_factor(good_residuals.contact)).sum()
-    freedom = max(good_residuals.log_ratio.size - correction.freedom, 1.0)
-    scatter = float(np.sqrt(total_chi2 / freedom))
-    is_improbable = scipy.stats.chi2.sf(total_chi2, freedom) < SCATTER_PROBABILITY
+    degrees_of_freedom = max(good_residuals.log_ratio.size - correction.freedom, 1.0)
+    scatter = float(np.sqrt(total_chi2 / degrees_of_freedom))
+    is_improbable = scipy.stats.chi2.sf(total_chi2, degrees_of_freedom) < SCATTER_PROBABILITY
     is_scattered = bool(scatter > SCATTER_RATIO and is_improbable)
     return CorrectedFilm(forward_map, correction, domain, scatter, is_scattered)
 

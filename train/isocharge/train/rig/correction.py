@@ -51,6 +51,7 @@ class Residuals:
         return len(self.contact)
 
     def __getitem__(self, rows: Integers | Booleans) -> "Residuals":
+        """Return the residuals of some presses."""
         return Residuals(self.contact[rows], self.log_ratio[rows], self.covariance[rows])
 
     @classmethod
@@ -78,16 +79,17 @@ class Residuals:
         return cls(presses.contact, log_ratio, contact_covariance + noise_covariance)
 
     def chi2(self, correction: Array) -> Array:
-        """Return the squared residual of each press after a correction.
+        """Compute chi-squared of each press after a correction: r' C^-1 r with the residuals r and their covariance C.
 
         Args:
-            correction: What is added to ln Q, shape (n, n_electrode).
+            correction: Change of ln Q by the correction, shape (n, n_electrode).
 
         Returns:
-            Squared residuals over their covariance, shape (n,).
+            Chi-squared of each press, shape (n,).
         """
-        corrected = (self.log_ratio - correction)[:, :, None]
-        return np.asarray((corrected * np.linalg.solve(self.covariance, corrected)).sum(axis=(1, 2)))
+        residual = (self.log_ratio - correction)[:, :, None]  # column vectors, shape (n, n_electrode, 1)
+        weighted_residual = np.linalg.solve(self.covariance, residual)
+        return np.asarray((residual * weighted_residual).sum(axis=(1, 2)))
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,8 @@ class Correction:
     Attributes:
         domain: Places and forces of the presses.
         coefficients: Coefficients of the polynomials, shape (n_term, n_electrode).
-        freedom: Effective number of coefficients that the presses determine; the prior determines the others.
+        freedom: Effective number of coefficients that the presses determine. The prior determines the other
+            coefficients.
     """
 
     domain: Domain
@@ -147,8 +150,9 @@ def fit_correction(residuals: Residuals) -> Correction:
     is_best_without_correction = mixture.best.discrepancy == 0.0
     if is_best_without_correction:
         return Correction(domain, np.zeros((term_count(), n_electrode)), 0.0)
-    degrees_of_freedom = float(np.trace(mixture.covariance @ model.normal))
-    return Correction(domain, mixture.mean.reshape(term_count(), -1), degrees_of_freedom)
+    # The effective number of determined coefficients is the trace of the posterior covariance times the information.
+    effective_count = float(np.trace(mixture.covariance @ model.normal))
+    return Correction(domain, mixture.mean.reshape(term_count(), -1), effective_count)
 
 
 def _normal_equations(residuals: Residuals, domain: Domain, n_coefficient: int) -> LinearModel:

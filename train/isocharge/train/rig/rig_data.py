@@ -32,30 +32,32 @@ from isocharge.train.training.source import TrainingData
 _log = logging.getLogger(__name__)
 
 PRESSES = "presses.csv"
-"""File beside the model with the presses by which the map was corrected."""
+"""File beside the model that contains the presses from which the correction was computed."""
 
 HELD_OUT = "held_out.csv"
-"""File beside the model with the presses by which the model is judged."""
+"""File beside the model that contains the presses on which the errors were measured."""
 
 SENSOR = "sensor.toml"
-"""File beside the model with the sensor as described."""
+"""File beside the model that contains the description of the sensor."""
 
 DRAWN_PRESSES = 24_000
 """Number of presses of the corrected map on which the network is trained."""
 
 MAP_MARGIN = 1.01
-"""Ratio by which a forward map is solved beyond its contacts, in distance and force, for its derivatives there."""
+"""Factor by which a forward map exceeds the distances and forces of its contacts.
+
+The margin is needed for finite differences at the edge of the domain."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Measured presses, and what was pressed.
+    """Measured presses, with the sensor and the probe of these presses.
 
     Attributes:
-        presses: The presses. Those with an unknown place, force or charge are left out.
+        presses: The presses. Presses with an unknown place, force or charge are not used.
         sensor: The sensor as described.
         probe: The probe.
-        radius: Largest distance from the centre at which the model shall compute contacts, mm.
+        radius: Radius of the working area of the model, mm.
     """
 
     presses: MeasuredPresses
@@ -71,7 +73,7 @@ def rig_data(rig: Rig, *, drawn: int = DRAWN_PRESSES, seed: int = 0) -> Training
     contacts do not explain.
 
     Args:
-        rig: The presses, 50 or more. A fifth of them is held out, and the network is judged by these.
+        rig: The presses, 50 or more. A fifth of the presses is held out, and the errors are measured on these presses.
         drawn: Number of presses of the corrected map on which the network is trained.
         seed: Seed of these presses.
 
