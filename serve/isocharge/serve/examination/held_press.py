@@ -154,7 +154,8 @@ def _extrapolate_rest(
     """
     rest_component = component[:rest_blocks]
     (slope, level), covariance = np.polyfit(block_times_s[:rest_blocks], rest_component, 1, cov=True)
-    is_significant = abs(slope) > DRIFT_SIGMAS * np.sqrt(covariance[0, 0])
+    slope_std = np.sqrt(covariance[0, 0])
+    is_significant = abs(slope) > DRIFT_SIGMAS * slope_std
     is_disturbing = abs(slope) * MIN_HELD_S > STEADY_SHARE * step_size
     if is_significant and is_disturbing:
         return level + slope * block_times_s, float(slope)

@@ -134,10 +134,10 @@ def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
 def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
     """Yield a sentence for each setting or property that is missing before held presses keep their force.
 
-    These are the settings with which the leak of the amplifiers is corrected. Touches are computed without them.
+    The settings correct the leak of the amplifiers. Touches are also computed without these settings.
 
-    If the user has held a press during the check, its result determines the settings. Otherwise a sentence asks for the
-    time constants of the amplifiers, unless the device file has them.
+    If the user has held a press during the check, the result of this press determines the settings. Otherwise a
+    sentence asks for the time constants of the amplifiers, unless the device file contains the time constants.
     """
     if not findings.capture.frames:
         return

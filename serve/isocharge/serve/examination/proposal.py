@@ -258,25 +258,35 @@ def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str,
     rests = {electrode: rest_of(column) for electrode, column in columns.items()}
     offsets = {electrode: _offset(column) for electrode, column in columns.items()}
 
-    # `limits` are the largest rest levels, in the unit of the board, that count as 0.
-    if gain:  # a tare accepts a small offset, so half of its limit is allowed
-        limit = 0.5 * TareRule().offset_limit_pC / _largest_pC(gain)
-        limits = dict.fromkeys(columns, limit)
-        differences = [abs(rest - offsets[electrode]) for electrode, rest in rests.items()]
-        if any(difference > limit for difference in differences):
-            offsets = {electrode: _rounded(rest) for electrode, rest in rests.items()}
-    else:  # only the noise shows whether a channel rests at 0
-        limits = {
-            electrode: max(REST_SIGMAS * noise_of(column), SMALLEST_LIMIT) for electrode, column in columns.items()
-        }
-
+    limits = _zero_limits(columns, gain)
     all_rest_at_zero = all(abs(rest) <= limits[electrode] for electrode, rest in rests.items())
     if all_rest_at_zero:
         return {}
+
+    # With half of the range as the offset, the remaining rest level must be small enough for a tare.
+    prevents_tare = any(abs(rest - offsets[electrode]) > limits[electrode] for electrode, rest in rests.items())
+    if gain and prevents_tare:
+        offsets = {electrode: _rounded(rest) for electrode, rest in rests.items()}
     different_offsets = set(offsets.values())
     if len(different_offsets) == 1:
         return {"offset": different_offsets.pop()}
     return {"offset": offsets}
+
+
+def _zero_limits(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, float]:
+    """Return the largest magnitude of the rest level of each electrode that counts as 0, in the unit of the board.
+
+    If the gain is known, the limit is half of the largest offset that a tare accepts. Otherwise the limit is derived
+    from the noise.
+
+    Args:
+        columns: Values of the channel of each electrode at rest, each of shape (n,), in the unit of the board.
+        gain: The other keys of the section `[gain]`; empty if they are not known.
+    """
+    if gain:
+        limit = 0.5 * TareRule().offset_limit_pC / _largest_pC(gain)
+        return dict.fromkeys(columns, limit)
+    return {electrode: max(REST_SIGMAS * noise_of(column), SMALLEST_LIMIT) for electrode, column in columns.items()}
 
 
 def _largest_pC(gain: Mapping[str, Any]) -> float:

@@ -62,7 +62,7 @@ class ContactFrame:
         tracking: The tracked contact; None if contacts are not tracked.
         is_mixture_contact: Whether the contact comes from a `ContactMixture` and not from the model.
         model_charge_pC: Charges for which the current model gives the contact, shape (n_electrode,), pC; None out of
-            contact. On a followed film they differ from those of the reading.
+            contact. On a followed film, these charges differ from the charges of the reading.
     """
 
     reading: Reading
@@ -136,8 +136,8 @@ class FilmStage(ContactStage):
     def step(self, frame: ContactFrame) -> None:
         """Correct the contact for the estimated film, and then update the estimate of the film with the frame.
 
-        If the film can no longer be followed, the contact gets the flag `film`. The updated model is used from the next
-        frame on.
+        If the film is lost, which means that it cannot be followed, the contact gets the flag `film`. The updated model
+        is used from the next frame on.
         """
         charge_pC = frame.reading.charge_pC
         if frame.contact is not None and charge_pC is not None:

@@ -136,7 +136,11 @@ class Saturation(Rule, frozen=True, kw_only=True):
 
 
 class LeakSection(LeakRule, frozen=True, kw_only=True):
-    """Decay of the charge amplifiers: their time constant, s, a number or a number for each electrode."""
+    """Leak of the charge amplifiers.
+
+    Attributes:
+        tau_s: Time constant of the amplifiers, s: one number, or one number for each electrode.
+    """
 
     tau_s: Positive | dict[str, Positive]
 

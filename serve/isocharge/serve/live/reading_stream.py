@@ -279,7 +279,7 @@ class ReadingStream:
 
         Args:
             frame: The frame.
-            chunk: The chunk, whose arrival time dates frames that have no time of their own.
+            chunk: The chunk. Its time of arrival is the time of frames without a device time.
 
         Returns:
             The touch charges with the flags of the frame, and the time of the frame.

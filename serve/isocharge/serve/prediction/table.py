@@ -120,23 +120,32 @@ def write_contacts(
 
     # The rows are converted in blocks, so that the texts of a large table need not be in memory at once.
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(names if validity is None else (*names, "flags"))
+    header = names if validity is None else (*names, "flags")
+    writer.writerow(header)
     rows = np.column_stack(contacts)
     for start in range(0, len(rows), BLOCK_ROWS):
         block = rows[start : start + BLOCK_ROWS]
         block_is_touch = is_touch[start : start + BLOCK_ROWS].tolist()
         values = block[:, :N_WITHOUT_CORRELATION].tolist()
-        flags = [()] * len(block) if validity is None else validity.batch_flags(Contacts(*block.T))
+        flags: list[tuple[str, ...]] = [()] * len(block)
+        if validity is not None:
+            flags = validity.batch_flags(Contacts(*block.T))
         for numbers, row_is_touch, row_flags in zip(values, block_is_touch, flags, strict=True):
-            cells = tuple(f"{number:.6f}" for number in numbers) if row_is_touch else no_contact
-            flag_text = " ".join(row_flags) if row_is_touch else ""
-            writer.writerow(cells if validity is None else (*cells, flag_text))
+            cells = no_contact
+            flag_text = ""
+            if row_is_touch:
+                cells = tuple(f"{number:.6f}" for number in numbers)
+                flag_text = " ".join(row_flags)
+            if validity is not None:
+                cells = (*cells, flag_text)
+            writer.writerow(cells)
 
 
 def blocks(rows: Array) -> Iterator[Array]:
     """Yield blocks of `BLOCK_ROWS` rows.
 
-    The rows are converted to Python numbers, so that they need five times as much memory as an array.
+    The blocks limit the memory, because rows that are converted to Python numbers need five times as much memory as an
+    array.
     """
     for start in range(0, len(rows), BLOCK_ROWS):
         yield rows[start : start + BLOCK_ROWS]

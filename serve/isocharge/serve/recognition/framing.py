@@ -2,7 +2,7 @@
 
 A stream with byte stuffing is split at its delimiter. In other streams, some bytes are the same in every frame. Such
 bytes therefore repeat after the length of a frame. The repetitions of each pair of bytes cover a part of the stream.
-The pair that covers the largest part is chosen. The position of this pair in the frame is not known yet.
+The pair that covers the largest part is chosen. The position of this pair in the frame is determined later.
 
 Named checksums are tried with every possible first byte. For cyclic redundancy checks without a name, only the
 polynomials have to be tried. The initial value, the final value and all constant bytes contribute the same constant in

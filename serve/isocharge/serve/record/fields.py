@@ -91,7 +91,8 @@ def _without_none(declared: Any) -> tuple[Any, bool]:
     """Return a type without its alternative None, and whether it had this alternative."""
     if get_origin(declared) not in (Union, UnionType):
         return declared, False
-    (value_type,) = (alternative for alternative in get_args(declared) if alternative is not NoneType)
+    other_types = [alternative for alternative in get_args(declared) if alternative is not NoneType]
+    (value_type,) = other_types  # a field has exactly one other type
     return value_type, True
 
 

@@ -87,7 +87,7 @@ def update_contact(
             return Touch(last_pC=total_pC, base_pC=total_pC)
         return Touch(contact=True, peak_pC=peak_pC, last_pC=total_pC)
 
-    # Nothing has touched in the previous frame.
+    # Nothing touched in the previous frame.
     base_pC = decay * touch.base_pC
     if total_pC > base_pC + touch_threshold_pC:
         return Touch(contact=True, peak_pC=min(total_pC, touch.last_pC), last_pC=total_pC)

@@ -13,8 +13,14 @@ LARGEST = 1_000_000_000
 """Largest setting, in its unit."""
 
 Setting = Annotated[float, Meta(ge=0, le=LARGEST)]
+"""Number from 0 to `LARGEST`."""
+
 Share = Annotated[float, Meta(ge=0, lt=1)]
+"""Share of a whole, from 0 to below 1, dimensionless."""
+
 Count = Annotated[int, Meta(ge=0, le=LARGEST)]
+"""Whole number from 0 to `LARGEST`."""
+
 TimeConstant = Annotated[float, Meta(ge=1e-3, le=LARGEST)]
 """Time constant, s. It is never 0, because the signal chain divides by it."""
 

@@ -75,9 +75,9 @@ class ContactFilter:
     def step(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> TrackedContact:
         """Smooth the position and the force of the next frame, each with its own filter.
 
-        Both filters start again after a gap in time, and if the filter of the position rejects the position. A rejected
-        position that could only be reached faster than `MAX_SPEED_mm_per_s` is an outlier instead: up to `MAX_OUTLIERS`
-        outliers in succession are ignored. If only the force is rejected, only its filter starts again.
+        Both filters start again after a gap in time, or if the filter of the position rejects the position. If only the
+        force is rejected, only the filter of the force starts again. A rejected position is an outlier if the contact
+        would have to move faster than `MAX_SPEED_mm_per_s`. Up to `MAX_OUTLIERS` outliers in succession are ignored.
 
         Args:
             contact: Contact predicted by the model.

@@ -99,7 +99,7 @@ class NoiseEstimate(NamedTuple):
 
     @classmethod
     def start(cls, measured: complex) -> "NoiseEstimate":
-        """Return the estimate after the first measured value, which is the variance stated by the model."""
+        """Return the estimate after the first measured value. The estimate is the variance stated by the model."""
         return cls(relative_variance=1.0, frames=PRIOR_FRAMES, measured=measured, rate=0j, dt_s=0.0)
 
     def updated(

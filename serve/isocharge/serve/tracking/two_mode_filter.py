@@ -95,7 +95,7 @@ class TwoModeFilter:
             held_value=measured,
             held_variance=variance,
             moving_value=measured,
-            velocity=measured - measured,
+            velocity=measured - measured,  # zero of the same type as the value, real or complex
             moving_variance=variance,
             moving_covariance=0.0,
             velocity_variance=motion.velocity_variance,
