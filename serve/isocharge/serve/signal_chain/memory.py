@@ -225,21 +225,17 @@ def undo_memory(
             learn_s=LEARN_S + RELEASE_S if contact else memory.learn_s - dt_s,
         )
 
-    # Out of contact, the whole charge is warmth. The fading-memory filter updates the warmth and its slope.
-    fading = math.exp(-dt_s / rule.settle_s)
-    rows_pC[WARMTH_ROW] += (1.0 - fading * fading) * residual_pC
+    # Out of contact, the warmth and the inflow are updated. The slope and the inflow pause after a release.
+    is_paused = leak.hold_s > 0.0
+    rows_pC = _observe_warmth(rule, rows_pC, residual_pC, dt_s, is_slope_updated=not is_paused)
     leak = leak._replace(charge_pC=charge_pC, output_pC=output_pC)
-    if leak.hold_s > 0.0:
+    if is_paused:
         leak = leak._replace(hold_s=leak.hold_s - dt_s)
-    else:
-        rows_pC[SLOPE_ROW] += ((1.0 - fading) ** 2 / max(dt_s, MIN_STEP_S)) * residual_pC
-        steepest_pC_per_s = max(map(abs, rows_pC[SLOPE_ROW].tolist()))
-        is_calm = leak.learned_s < leak_rule.settle_s or steepest_pC_per_s < CALM_PC_PER_S
-        if tau_s is not None and leak_rule.learn and is_calm:
-            # The part of the surplus that creep and the thermoelastic step explain is not inflow.
-            change_pC = rows_pC - memory.rows_pC
-            recovery_pC = film.response.dot(change_pC) - change_pC[WARMTH_ROW]
-            leak = learn_inflow(leak_rule, leak, surplus_pC - recovery_pC, noise_pC, dt_s)
+    elif tau_s is not None and leak_rule.learn and _is_inflow_observable(leak_rule, leak, rows_pC):
+        # The part of the surplus that creep and the thermoelastic step explain is not inflow.
+        change_pC = rows_pC - memory.rows_pC
+        recovery_pC = film.response.dot(change_pC) - change_pC[WARMTH_ROW]
+        leak = learn_inflow(leak_rule, leak, surplus_pC - recovery_pC, noise_pC, dt_s)
 
     # For some time after a release, the scale factors of the film are updated.
     learn_s = memory.learn_s
@@ -264,6 +260,40 @@ def undo_memory(
     if is_learning and leak.hold_s <= 0.0:
         after = _learn_film(after, dt_s)
     return _replace_trusted_warmth(after, leak_rule.look_back_s)
+
+
+def _observe_warmth(
+    rule: MemoryRule, rows_pC: Array, residual_pC: Array, dt_s: float, *, is_slope_updated: bool
+) -> Array:
+    """Return the state after the warmth has been updated with a frame out of contact.
+
+    Out of contact, the whole charge of the film that the predicted state does not explain is warmth. A fading-memory
+    filter updates the warmth and its slope.
+
+    Args:
+        rule: Memory of the film.
+        rows_pC: Predicted state, shape (rows, electrodes).
+        residual_pC: Charge of the film minus its prediction, shape (electrodes,), pC.
+        dt_s: Time since the previous frame, s.
+        is_slope_updated: Whether the slope is updated, too.
+    """
+    fading = math.exp(-dt_s / rule.settle_s)
+    updated_rows_pC = rows_pC.copy()
+    updated_rows_pC[WARMTH_ROW] += (1.0 - fading * fading) * residual_pC
+    if is_slope_updated:
+        updated_rows_pC[SLOPE_ROW] += ((1.0 - fading) ** 2 / max(dt_s, MIN_STEP_S)) * residual_pC
+    return updated_rows_pC
+
+
+def _is_inflow_observable(rule: LeakRule, leak: Leak, rows_pC: Array) -> bool:
+    """Return whether the inflow may be updated with a frame out of contact.
+
+    A steep warmth could be mistaken for inflow. The inflow is nevertheless updated until it has been averaged over
+    `settle_s` for the first time.
+    """
+    is_first_average = leak.learned_s < rule.settle_s
+    steepest_pC_per_s = max(map(abs, rows_pC[SLOPE_ROW].tolist()))
+    return is_first_average or steepest_pC_per_s < CALM_PC_PER_S
 
 
 def _replace_trusted_warmth(memory: Memory, look_back_s: float) -> Memory:

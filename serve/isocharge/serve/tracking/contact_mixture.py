@@ -18,6 +18,7 @@ Charges are averaged over `STEP_s` before an update. Shorter steps are hardly mo
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -170,21 +171,15 @@ class ContactMixture:
 
     def _process_step(self, t_s: float) -> None:
         """Update the mixture with the mean charges of the frames of a step. The step ends at time `t_s`."""
-        charges, times_s = zip(*self._step_frames, strict=True)
-        frame_count = len(times_s)
-        mean_time_s = sum(times_s) / frame_count
+        charges, times_s = zip(*self._step_frames, strict=True)  # charges and time of each frame
+        mean_time_s = sum(times_s) / len(times_s)
         dt_s = mean_time_s - self._t_s
         self._step_frames = []
         self._step_begin_s = t_s
         self._t_s = mean_time_s
 
-        # The average reduces the noise of single frames, but not the slow noise.
-        charge_pC = np.mean(charges, axis=0)
-        frame_noise_pC2 = self._noise.variance(charge_pC) / frame_count
-        slow_noise_pC2 = (SLOW_NOISE_STD * charge_pC) ** 2
-        measurement = Measurement(charge_pC, frame_noise_pC2 + slow_noise_pC2)
-
         # Follow the contact of the previous step. If there is none, search the whole film, but not in every step.
+        measurement = self._mean_measurement(charges)
         components = None
         if self._components is not None and 0.0 < dt_s < MAX_GAP_s:
             components = self._advance(self._components, measurement, dt_s)
@@ -193,6 +188,19 @@ class ContactMixture:
             components = self._search(measurement)
         self._components = components
         self._hypotheses = [] if components is None else self._group(components)
+
+    def _mean_measurement(self, charges: Sequence[Array]) -> Measurement:
+        """Return the mean charges of a step, and their variances.
+
+        The average over the frames reduces the noise of single frames, but not the slow noise.
+
+        Args:
+            charges: Touch charges of each frame of the step, each of shape (n_electrode,), pC.
+        """
+        charge_pC = np.mean(charges, axis=0)
+        frame_noise_pC2 = self._noise.variance(charge_pC) / len(charges)
+        slow_noise_pC2 = (SLOW_NOISE_STD * charge_pC) ** 2
+        return Measurement(charge_pC, frame_noise_pC2 + slow_noise_pC2)
 
     def _search(self, measurement: Measurement) -> Components | None:
         """Search the whole film for contacts that explain the charges.

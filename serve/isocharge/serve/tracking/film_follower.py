@@ -458,7 +458,7 @@ class FilmFollower:
             self._applied_estimate = estimate._replace(pretension_MPa=present_MPa)
         else:
             self._applied_estimate = estimate
-            self.predictor = self._model_at(estimate.pretension_MPa)
+            self.predictor = self._model_with_pretension(estimate.pretension_MPa)
 
         # The first estimate needs the neighbouring model even if the pretension has not changed.
         if not is_same_pretension or self._neighbouring_model is None:
@@ -468,16 +468,17 @@ class FilmFollower:
         """Set the model with which the sensitivity of contacts to the pretension is computed.
 
         Args:
-            pretension_MPa: The estimated pretension, whose neighbour within the range of the weights is used.
+            pretension_MPa: The estimated pretension. The pretension of the model is larger by `SENSITIVITY_STEP_MPa`,
+                or smaller if the larger pretension is outside the range of the weights.
         """
         step_MPa = SENSITIVITY_STEP_MPa
         _, largest_MPa = self._pretensions.range_MPa
         if pretension_MPa + step_MPa > largest_MPa:
             step_MPa = -step_MPa
         self._neighbouring_step_MPa = step_MPa
-        self._neighbouring_model = self._model_at(pretension_MPa + step_MPa)
+        self._neighbouring_model = self._model_with_pretension(pretension_MPa + step_MPa)
         self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)  # the sign of the step does not affect variances
 
-    def _model_at(self, pretension_MPa: float) -> Predictor:
-        """Return the model of the film at a pretension."""
+    def _model_with_pretension(self, pretension_MPa: float) -> Predictor:
+        """Return the model of the calibrated film if it had another pretension."""
         return self._calibrated.with_constants(self._pretensions.constants(pretension_MPa))

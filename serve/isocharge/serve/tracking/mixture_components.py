@@ -253,6 +253,9 @@ def combine_components(components: Components, probability: Array) -> ContactHyp
     Args:
         components: The components.
         probability: Probability of each component, shape (n,).
+
+    Returns:
+        The contact. Its probability is the sum of the probabilities of the components.
     """
     total_probability = probability.sum()
     share = probability / total_probability
