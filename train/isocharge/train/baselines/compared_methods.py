@@ -202,6 +202,7 @@ POLYNOMIAL = "polynomial ridge"
 TABLE = "lookup table, interpolated"
 BOOSTING = "gradient boosting"
 LINEAR_BAND = "linear band"
+"""Names of the methods to which a report refers by name."""
 
 POLYNOMIAL_DEGREES = (4, 6, 8, 10, 12)
 """Candidates for the degree of the polynomial."""
@@ -212,6 +213,7 @@ MAX_MONOMIALS = 500
 SKLEARN = "scikit-learn"
 KD_TREE = "SciPy KD-tree"
 NUMPY = "NumPy"
+"""Names of the libraries that compute the methods, for tables."""
 
 
 def compared_methods(task: FittingTask, charge_map: ChargeMap | None = None) -> list[ComparedMethod]:

@@ -272,7 +272,7 @@ class Posterior:
         press_of_cell = np.concatenate([cells.press for cells in levels])
         fractions, centroids = zip(*(cells.inside(self.radius) for cells in levels), strict=True)
 
-        # Sort the cells by press, as `_moments` needs them.
+        # Sort the cells by press, as `_posterior_moments` needs them.
         order = np.argsort(press_of_cell, kind="stable")
         area = (np.concatenate(fractions) * side**2)[order]
         position = np.concatenate(centroids)[order]
@@ -280,7 +280,7 @@ class Posterior:
 
         log_force, log_weight = self._integrate_force(position, charge[press])
         log_weight += np.log(area)[:, None]
-        return _moments(press, position, log_force, log_weight)
+        return _posterior_moments(press, position, log_force, log_weight)
 
     def _integration_cells(self, charge: Array) -> Iterator[Cells]:
         """Yield cells that cover the posterior and are small compared with its width.
@@ -412,7 +412,7 @@ class Posterior:
         return log_force, np.log(weights * (upper - lower)) + log_likelihood
 
 
-def _moments(press: Integers, position: Array, log_force: Array, log_weight: Array) -> Array:
+def _posterior_moments(press: Integers, position: Array, log_force: Array, log_weight: Array) -> Array:
     """Compute the mean and the standard deviation of (x, y, F) for every press.
 
     Both are computed from weighted sums over all positions of the press and over all forces at each position. The mean

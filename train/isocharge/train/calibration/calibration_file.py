@@ -116,7 +116,7 @@ def _correlation_table(covariance: Array) -> list[list[float]]:
     If the variance of an unknown is zero, its correlations with all other unknowns are zero.
     """
     std = np.sqrt(np.diag(covariance))
-    correlations = _over_std(covariance, np.outer(std, std))
+    correlations = _divide_by_std(covariance, np.outer(std, std))
     np.fill_diagonal(correlations, 1.0)
     return [[float(value) for value in row] for row in np.round(correlations, 6)]
 
@@ -150,7 +150,7 @@ def _temperature_table(posterior: FilmPosterior) -> dict[str, Any] | None:
     film_covariance = posterior.joint if posterior.imperfect else posterior.covariance
     film_std = np.sqrt(np.diag(film_covariance))
     covariance_with_film = warming.covariance[: film_std.size]  # without the unknowns that are not in the file
-    correlations = _over_std(covariance_with_film, warming.std * film_std)
+    correlations = _divide_by_std(covariance_with_film, warming.std * film_std)
     return {
         "at_C": warming.at_C,
         "pretension_per_K": {"value": PASCAL_FACTOR * warming.MPa_per_K, "std": PASCAL_FACTOR * warming.std},
@@ -158,7 +158,7 @@ def _temperature_table(posterior: FilmPosterior) -> dict[str, Any] | None:
     }
 
 
-def _over_std(covariance: Array, product_of_std: Array) -> Array:
+def _divide_by_std(covariance: Array, product_of_std: Array) -> Array:
     """Divide covariances by products of standard deviations; the result is zero where a product is zero."""
     return np.divide(covariance, product_of_std, out=np.zeros_like(covariance), where=product_of_std > 0.0)
 
@@ -195,7 +195,7 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
         film_correlations = _film_correlations(path, table.discrepancy, film_std, parameter_correlations)
 
     if table.temperature is None:
-        film_covariance = _possible(path, film_correlations) * np.outer(film_std, film_std)
+        film_covariance = _positive_semidefinite(path, film_correlations) * np.outer(film_std, film_std)
         warming = None
     else:
         film_covariance, warming = _read_temperature(path, table.temperature, film_correlations, film_std)
@@ -256,7 +256,7 @@ def _read_temperature(
     change = table.pretension_per_K
     change_std = change.std / PASCAL_FACTOR
     std = np.append(film_std, change_std)
-    covariance = _possible(path, correlations) * np.outer(std, std)
+    covariance = _positive_semidefinite(path, correlations) * np.outer(std, std)
     n_film = film_std.size  # index of the change, which follows the unknowns of the film
     warming = Warming(
         MPa_per_K=change.value / PASCAL_FACTOR,
@@ -384,8 +384,8 @@ def _with_temperature(path: Path, table: _Temperature, correlations: Array, std:
             f"got {len(given_row)}"
         )
     may_be_null = (std == 0.0) | (change.std == 0.0)  # the correlation of a constant is not defined
-    # `_numbers` reads a matrix, so the row is given and returned as a matrix of one row.
-    (temperature_row,) = _numbers(path, "temperature.correlations", [given_row], may_be_null[None])
+    # `_correlation_array` reads a matrix, so the row is given and returned as a matrix of one row.
+    (temperature_row,) = _correlation_array(path, "temperature.correlations", [given_row], may_be_null[None])
 
     extended = np.eye(std.size + 1)
     extended[:-1, :-1] = correlations
@@ -413,7 +413,7 @@ def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Arra
     if not is_square:
         raise PressError(f"{path}: {key}: expected {std.size} rows of as many numbers")
     is_constant = std == 0.0
-    matrix = _numbers(path, key, rows, may_be_null=is_constant[:, None] | is_constant[None, :])
+    matrix = _correlation_array(path, key, rows, may_be_null=is_constant[:, None] | is_constant[None, :])
 
     diagonal = np.where(is_constant, 1.0, np.diag(matrix))
     deviation_from_one = np.abs(diagonal - 1.0)
@@ -435,7 +435,7 @@ def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Arra
     return matrix
 
 
-def _numbers(path: Path, key: str, rows: list[list[Correlation]], may_be_null: Booleans) -> Array:
+def _correlation_array(path: Path, key: str, rows: list[list[Correlation]], may_be_null: Booleans) -> Array:
     """Convert rows of correlations into an array, in which null becomes zero.
 
     Args:
@@ -459,7 +459,7 @@ def _numbers(path: Path, key: str, rows: list[list[Correlation]], may_be_null: B
     return np.where(is_null, 0.0, matrix)
 
 
-def _possible(path: Path, correlations: Array) -> Array:
+def _positive_semidefinite(path: Path, correlations: Array) -> Array:
     """Return the correlation matrix without the small negative eigenvalues that rounding causes.
 
     Args:

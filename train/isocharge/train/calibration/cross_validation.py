@@ -100,10 +100,9 @@ def cross_validate(
     force_N = presses.contact[:, 2]
     rig_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std * force_N])
     std = np.hypot(std, rig_std)
-    return HeldOutAnswers(
-        LabelledPresses(presses.contact[is_judged], presses.charge_pC[is_judged], measured=True),
-        Answers(contact[is_judged], std[is_judged], misfit[is_judged]),
-    )
+    judged_presses = LabelledPresses(presses.contact[is_judged], presses.charge_pC[is_judged], measured=True)
+    judged_answers = Answers(contact[is_judged], std[is_judged], misfit[is_judged])
+    return HeldOutAnswers(judged_presses, judged_answers)
 
 
 def _thinned(is_chosen: Booleans) -> Booleans:

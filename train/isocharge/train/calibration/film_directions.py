@@ -53,7 +53,7 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
     n_unknown = len(covariance)
     # The covariance of the unknowns at a given pretension is that of all unknowns less the part due to the pretension.
     by_pretension = covariance[:, pretension] / covariance[pretension, pretension]  # regression on the pretension
-    root = _root(covariance - np.outer(by_pretension, covariance[pretension]))
+    root = _covariance_root(covariance - np.outer(by_pretension, covariance[pretension]))
 
     # The singular vectors are orthogonal combinations of the columns of the root, the largest misfit first.
     sensitivity = result.sensitivity
@@ -76,7 +76,7 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
     )
 
 
-def _root(covariance: Array) -> Array:
+def _covariance_root(covariance: Array) -> Array:
     """Return a matrix R, shape (n, m) with m <= n, whose product R R' is a covariance that may be singular."""
     variances, axes = np.linalg.eigh(covariance)
     is_uncertain = variances > LEAST_VARIANCE * variances[-1]

@@ -174,9 +174,11 @@ def _release(result: CalibrationResult, folder: Path, command: str) -> Path:
     from isocharge.simulate.plots.figure import picture_bytes
     from isocharge.train.calibration.picture import calibration_picture
 
+    sensor, _ = result.film
+    table = plain_values(result_table(result))
     files = {
-        RESULT: json.dumps(plain_values(result_table(result)), indent=1, allow_nan=False).encode(),
-        SENSOR: sensor_to_toml(result.film[0]).encode(),
+        RESULT: json.dumps(table, indent=1, allow_nan=False).encode(),
+        SENSOR: sensor_to_toml(sensor).encode(),
         PICTURE: picture_bytes(calibration_picture(result)),
     }
     if not result.moved:
@@ -249,7 +251,8 @@ def read_earlier(folder: Path, problem: CalibrationProblem, *, knows_temperature
     Raises:
         PressError: If the folder has no calibration, or a calibration with other parameters.
     """
-    return _read(folder, problem)[1].drifted(problem.prior, knows_temperature=knows_temperature)
+    _, film = _read_last_film(folder, problem)
+    return film.drifted(problem.prior, knows_temperature=knows_temperature)
 
 
 def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> CalibrationResult:
@@ -264,7 +267,7 @@ def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> Calibr
         PressError: If the folder has no calibration or a calibration with other parameters, or if the change of this
             film with temperature is unknown.
     """
-    path, film = _read(folder, problem)
+    path, film = _read_last_film(folder, problem)
     if film.warming is None or not film.warming.identified:
         raise PressError(
             f"{path}: expected a calibration that contains the change of the film with temperature, got one without; "
@@ -278,11 +281,21 @@ def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> Calibr
     return film_without_presses(replace(problem, earlier=film), moved_film, moved)
 
 
-def _read(folder: Path, problem: CalibrationProblem) -> tuple[Path, FilmEstimate]:
+def _read_last_film(folder: Path, problem: CalibrationProblem) -> tuple[Path, FilmEstimate]:
     """Find the file of an earlier calibration, and read the film from this file.
 
     If the folder is a version folder, its own file is used. Otherwise, the file of the last version in the folder is
     used.
+
+    Args:
+        folder: Folder of an earlier calibration, or one of its version folders.
+        problem: Films of the new calibration.
+
+    Returns:
+        Path of the file, and the estimate of the film.
+
+    Raises:
+        PressError: If the folder has no calibration, or a calibration with other parameters.
     """
     versions = _calibrated_versions(folder)
     version_folder = versions[-1] if versions else folder

@@ -57,10 +57,10 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
     pretension = prior.index("pretension")
     calibrated_MPa = float(posterior.parameters[pretension])
     lower, upper = (float(bound[pretension]) for bound in prior.bounds)
-    nodes = _nodes(calibrated_MPa, lower, upper)
+    nodes = _pretension_nodes(calibrated_MPa, lower, upper)
 
     # The networks have the same layers. Each array of weights is stacked over the nodes, shape (N_NODES, ...).
-    arrays_of_networks = [_arrays(node_network) for node_network in _networks_at(nodes, result, network)]
+    arrays_of_networks = [_weight_arrays(node_network) for node_network in _networks_at(nodes, result, network)]
     stacked_weights = [np.stack(arrays) for arrays in zip(*arrays_of_networks, strict=True)]
 
     drifted_std = np.sqrt(np.diag(posterior.drifted(prior).covariance)) * prior.std
@@ -74,7 +74,7 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
         limits_pC=(LOWEST_CHARGE, HIGHEST_CHARGE),
         typical_pC=network.features.typical_pC,
         activation=network.layers.activation.name,
-        weights=dict(zip(_constants(network), stacked_weights, strict=True)),
+        weights=dict(zip(_weight_names(network), stacked_weights, strict=True)),
     )
 
     # The misfits of the networks are computed with `misfit_rms` = 1, and determine its final value.
@@ -124,7 +124,7 @@ def _typical_misfit(pretensions: Pretensions, result: CalibrationResult) -> floa
     return rms(np.array(misfits))
 
 
-def _nodes(calibrated: float, lower: float, upper: float) -> Array:
+def _pretension_nodes(calibrated: float, lower: float, upper: float) -> Array:
     """Return Chebyshev nodes around the calibrated pretension, shape (N_NODES,), MPa.
 
     The nodes are stretched so that the first and the last of them lie at the ends of the range. The node that is
@@ -163,7 +163,7 @@ def _with_correlations_of(network: FoldedNetwork, other: FoldedNetwork) -> Folde
     return other.with_angles(angle_layer, angle_skip)
 
 
-def _arrays(network: FoldedNetwork) -> list[np.ndarray]:
+def _weight_arrays(network: FoldedNetwork) -> list[np.ndarray]:
     """Return the weights of a network as single-precision arrays, in the order of `Pretensions`.
 
     The order is: weight and bias of each hidden layer, the skip connection, and bias and weight of the last layer.
@@ -179,8 +179,8 @@ def _arrays(network: FoldedNetwork) -> list[np.ndarray]:
     return [np.asarray(array, dtype=np.float32) for array in arrays]
 
 
-def _constants(network: FoldedNetwork) -> list[str]:
-    """Return the names of the constants of the ONNX graph that contain the weights, in the order of `_arrays`.
+def _weight_names(network: FoldedNetwork) -> list[str]:
+    """Return the names of the constants of the ONNX graph that contain the weights, in the order of `_weight_arrays`.
 
     The constants are recognised by their values, because the names depend on how the graph is written.
 
@@ -191,7 +191,7 @@ def _constants(network: FoldedNetwork) -> list[str]:
     constants = {str(constant.name): numpy_helper.to_array(constant) for constant in graph.initializer}
 
     names = []
-    for array in _arrays(network):
+    for array in _weight_arrays(network):
         equal_constants = (name for name, values in constants.items() if np.array_equal(values, array))
         names.append(next(equal_constants))
     return names

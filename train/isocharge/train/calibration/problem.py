@@ -357,7 +357,7 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
         ModelError: If no network was trained for this layout; the message says how to train one.
     """
     reasons = []
-    for folder in _folders(models, sensor.name):
+    for folder in _network_folders(models, sensor.name):
         films = read_films(folder)
         try:
             parameters = _with_electrodes(films.prior, sensor).parameters_of(sensor, probe)
@@ -385,19 +385,19 @@ def _with_electrodes(prior: FilmPrior, sensor: Sensor) -> FilmPrior:
 
     The electrodes of the sensor may have traces and patterned backs.
     """
-    has_other_pads = _pads(prior.sensor) != _pads(sensor)
+    has_other_pads = _pad_corners(prior.sensor) != _pad_corners(sensor)
     has_equal_electrodes = prior.sensor.electrodes == sensor.electrodes
     if has_other_pads or has_equal_electrodes:
         return prior
     return replace(prior, sensor=replace(prior.sensor, electrodes=sensor.electrodes))
 
 
-def _pads(sensor: Sensor) -> dict[str, list[list[float]]]:
+def _pad_corners(sensor: Sensor) -> dict[str, list[list[float]]]:
     """Return the corners of the pads by the names of the electrodes, rounded to 1e-6 mm."""
     return {electrode.name: np.round(electrode.corners, 6).tolist() for electrode in sensor.electrodes}
 
 
-def _folders(models: Path | None, name: str) -> list[Path]:
+def _network_folders(models: Path | None, name: str) -> list[Path]:
     """Return the version folders that contain a network for all films.
 
     The folders of models that have the name of the sensor come first.

@@ -84,7 +84,7 @@ class ChannelNoise:
         """
         planes = LocalPlanes.through(unit, charge)
         channel_variances = [
-            _variance(value, residual) for value, residual in zip(planes.value.T, planes.residual.T, strict=True)
+            _fit_variances(value, residual) for value, residual in zip(planes.value.T, planes.residual.T, strict=True)
         ]
         white_std, gain_std = np.sqrt(np.array(channel_variances)).T  # each of shape (n_electrode,)
         gain = np.maximum(gain_std, LEAST_GAIN)
@@ -227,7 +227,7 @@ def usual_size(charge: Array) -> Array:
     return np.array([np.median(np.abs(column[column != 0.0])) for column in charge.T])
 
 
-def _variance(value: Array, residual: Array) -> tuple[float, float]:
+def _fit_variances(value: Array, residual: Array) -> tuple[float, float]:
     """Estimate the variances white^2 and gain^2 of one channel, for which white^2 + gain^2 Q^2 fits the residuals.
 
     The fit is a weighted least-squares problem with variances that are not negative. The weights of each round follow

@@ -59,7 +59,7 @@ SIGNED_CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = (
 The degrees in force are higher, because on taut films the exponent of the force changes with the force."""
 
 SIZE_DEGREE = 4
-"""Degree of ln S as a polynomial of l."""
+"""Degree of the polynomial in l that approximates ln S, where S is the size of the charges."""
 
 NOISE_CORNER_pC = 500.0
 """Charge at which both parts of the `reference` noise are equal, 1 pC and 0.2 %, pC.
@@ -119,8 +119,8 @@ class ChargeField:
         """
         unit = domain.to_unit(presses.contact)
         if presses.signed:
-            log_size = _log_size(unit[:, 2], presses.charge)
-            size, _ = _size(log_size, unit[:, 2])
+            log_size = _fit_log_size(unit[:, 2], presses.charge)
+            size, _ = _size_and_slope(log_size, unit[:, 2])
             target = presses.charge / size
             first_degrees, *further_degrees = SIGNED_CANDIDATE_DEGREES
             smallest_error_unit = NOISE_CORNER_pC
@@ -197,7 +197,7 @@ class ChargeField:
             charge = np.exp(value)
             factor = charge
         else:  # Q = S(l) * value
-            size, log_size_slope = _size(self.log_size, unit[:, 2])
+            size, log_size_slope = _size_and_slope(self.log_size, unit[:, 2])
             charge = size * value
             slopes[:, 2] += log_size_slope * value
             factor = size
@@ -216,7 +216,7 @@ class ChargeField:
         return ChargeSeries(self._series, self.domain.radius, self.domain.force_range)
 
 
-def _log_size(unit_log_force: Array, charge: Array) -> Array:
+def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
     """Fit the logarithm of the size S of the charges as a polynomial of the scaled logarithm l of the force.
 
     Args:
@@ -230,11 +230,11 @@ def _log_size(unit_log_force: Array, charge: Array) -> Array:
     return np.asarray(chebyshev.chebfit(unit_log_force, np.log(total), SIZE_DEGREE))
 
 
-def _size(coefficients: Array, unit_log_force: Array) -> tuple[Array, Array]:
+def _size_and_slope(coefficients: Array, unit_log_force: Array) -> tuple[Array, Array]:
     """Compute the size S of the charges, and the derivative of ln S with respect to l.
 
     Args:
-        coefficients: Coefficients of ln S, as `_log_size` returns them.
+        coefficients: Coefficients of ln S, as `_fit_log_size` returns them.
         unit_log_force: Logarithms l of the forces scaled to [-1, 1], shape (n,). They are clipped to this interval.
 
     Returns:

@@ -80,13 +80,13 @@ class PressedArea(Domain):
     @classmethod
     def of_corners(cls, corners: Array, force_range: tuple[float, float]) -> "PressedArea":
         """Return the area with these corners, shape (n, 2), mm, and forces, N."""
-        distance_from_middle = np.linalg.norm(corners - _middle(corners), axis=1)
+        distance_from_middle = np.linalg.norm(corners - _box_middle(corners), axis=1)
         return cls(float(distance_from_middle.max()), force_range, tuple((x, y) for x, y in corners.tolist()))
 
     @cached_property
     def centre(self) -> Array:
         """Middle of (x, y, ln F), shape (3,), mm and logarithm of N."""
-        return np.append(_middle(np.array(self.corners)), super().centre[2])
+        return np.append(_box_middle(np.array(self.corners)), super().centre[2])
 
     @cached_property
     def scale(self) -> Array:
@@ -125,7 +125,7 @@ class PressedArea(Domain):
         return has_force & inside_polygon(contact[:, 0], contact[:, 1], np.array(self.corners))
 
 
-def _middle(corners: Array) -> Array:
+def _box_middle(corners: Array) -> Array:
     """Return the middle of the box around corners, shape (2,), mm."""
     return np.asarray(0.5 * (corners.min(axis=0) + corners.max(axis=0)))
 
@@ -165,7 +165,7 @@ def outline(places: Array) -> Array:
     for radius_limit in [*finite_limits, np.inf]:
         boundary = _single_boundary(triangles[circumradii <= radius_limit], len(places))
         if boundary is not None:
-            return _enlarged(places[boundary], 0.5 * spacing)
+            return _enlarged_polygon(places[boundary], 0.5 * spacing)
     raise PressError(f"expected presses over an area, got {len(places)} places that enclose none")
 
 
@@ -247,7 +247,7 @@ def _boundary_neighbours(triangles: Integers) -> dict[int, list[int]]:
     return neighbours
 
 
-def _enlarged(corners: Array, distance: float) -> Array:
+def _enlarged_polygon(corners: Array, distance: float) -> Array:
     """Return a polygon whose sides are moved outwards.
 
     Points and directions in the plane are complex numbers x + i y.

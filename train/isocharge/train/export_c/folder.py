@@ -43,11 +43,14 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
     """
     chain = device.chain(electrodes)
     _check_exists_in_c(device.where, chain)
+    zero = np.zeros(len(electrodes)) if chain.zero is None else chain.zero
+    gain_pC = np.ones(len(electrodes)) if chain.gain_pC is None else chain.gain_pC
+    has_saturation = chain.limit_pC is not None
     numbers = {
-        "ZERO": c_doubles(np.zeros(len(electrodes)) if chain.zero is None else chain.zero),
-        "GAIN_PC": c_doubles(np.ones(len(electrodes)) if chain.gain_pC is None else chain.gain_pC),
+        "ZERO": c_doubles(zero),
+        "GAIN_PC": c_doubles(gain_pC),
         "LARGEST": c_double(chain.largest),
-        "SATURATION": str(int(chain.limit_pC is not None)),
+        "SATURATION": str(int(has_saturation)),
         "HUM_LEAST_TURN": c_double(MIN_SQUARED_STEP),
     }
     if chain.limit_pC is not None:
@@ -57,7 +60,7 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
         numbers[SWITCHES[prefix]] = str(int(is_on))
         for name, value in settings.items():
             c_name = C_NAMES.get(name, name.upper())
-            numbers[f"{prefix}_{c_name}"] = _number(value)
+            numbers[f"{prefix}_{c_name}"] = _c_literal(value)
     lines = "\n".join(f"#define ISOCHARGE_{name} {text}" for name, text in numbers.items())
     return source_text("isocharge_device.h", origin=settings_origin(device), lines=lines)
 
@@ -116,7 +119,7 @@ def _check_exists_in_c(where: str, chain: Chain) -> None:
         )
 
 
-def _number(value: Any) -> str:
+def _c_literal(value: Any) -> str:
     """Return a number, a truth value or an array as a C literal. A truth value becomes 0 or 1.
 
     Args:

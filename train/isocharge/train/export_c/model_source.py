@@ -100,23 +100,23 @@ def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSour
     """
     perceptron = network.layers
     is_logarithmic = network.features.mean is None
-    weights_on_inputs = _weights_on_differences if is_logarithmic else _singles
+    weights_on_inputs = _weights_on_differences if is_logarithmic else _single_precision
     first, *others = perceptron.hidden
-    other_weights = [_singles(layer.weight) for layer in others]
-    last_weight = _singles(perceptron.last.weight)
+    other_weights = [_single_precision(layer.weight) for layer in others]
+    last_weight = _single_precision(perceptron.last.weight)
     # The outputs before the misfit vector belong to the contact perceptron.
     n_contact_output = network.angle_columns.stop
     *other_blocks, last_blocks = find_blocks([*other_weights, last_weight], n_contact_output)
 
     first_weight = weights_on_inputs(first.weight)
-    hidden = [LayerSource("layer_0", first_weight, _singles(first.bias), activation=perceptron.activation)]
+    hidden = [LayerSource("layer_0", first_weight, _single_precision(first.bias), activation=perceptron.activation)]
     for layer_index, (layer, weight, blocks) in enumerate(
         zip(others, other_weights, other_blocks, strict=True), start=1
     ):
-        bias = _singles(layer.bias)
+        bias = _single_precision(layer.bias)
         hidden.append(LayerSource(f"layer_{layer_index}", weight, bias, blocks, perceptron.activation))
     # The bias of the output layer is added with the skip layer.
-    skip = LayerSource("skip", weights_on_inputs(perceptron.skip), _singles(perceptron.last.bias))
+    skip = LayerSource("skip", weights_on_inputs(perceptron.skip), _single_precision(perceptron.last.bias))
     last = LayerSource("last", last_weight, blocks=last_blocks)
     return hidden, skip, last
 
@@ -165,7 +165,7 @@ def _features_source(features: ChargeFeatures) -> str:
     Args:
         features: Typical charges, limits and means of the features.
     """
-    factor = _singles(1.0 / features.typical_pC)
+    factor = _single_precision(1.0 / features.typical_pC)
     if features.mean is None:
         return source_text(
             "features.c",
@@ -176,14 +176,14 @@ def _features_source(features: ChargeFeatures) -> str:
         )
     arrays = [
         c_array("FACTOR", factor),
-        c_array("LOW", _singles(features.low_pC)),
-        c_array("HIGH", _singles(features.high_pC)),
-        c_array("MEAN", _singles(features.mean)),
+        c_array("LOW", _single_precision(features.low_pC)),
+        c_array("HIGH", _single_precision(features.high_pC)),
+        c_array("MEAN", _single_precision(features.mean)),
     ]
     return source_text("features_signed.c", arrays="\n".join(arrays), electrodes=features.n_electrode)
 
 
-def _singles(values: Array) -> Singles:
+def _single_precision(values: Array) -> Singles:
     """Return values in single precision."""
     return np.asarray(values, dtype=np.float32)
 

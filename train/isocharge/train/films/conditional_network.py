@@ -174,9 +174,9 @@ class ConditionalPerceptron(nn.Module):
 
         layers = []
         for layer_index, (constant, bases, bias) in enumerate(zip(self.constant, self.bases, self.bias, strict=True)):
-            weight = _mix(constant, bases, phi[:, layer_index])
+            weight = _mix_weights(constant, bases, phi[:, layer_index])
             layers.append(Layer(weight, bias(psi)[:, None]))
-        skip = _mix(self.skip, self.skip_bases, phi[:, n_layer])
+        skip = _mix_weights(self.skip, self.skip_bases, phi[:, n_layer])
         *hidden, last = layers
         return Perceptron(tuple(hidden), last, skip, self.activation)
 
@@ -194,7 +194,7 @@ class ConditionalPerceptron(nn.Module):
         return [module for module in self.context.values() if isinstance(module, nn.Linear)]
 
 
-def _mix(constant: Tensor, bases: Tensor, phi: Tensor) -> Tensor:
+def _mix_weights(constant: Tensor, bases: Tensor, phi: Tensor) -> Tensor:
     """Compute the weights W_l of films: a constant matrix plus a weighted sum of basis matrices.
 
     Args:

@@ -62,7 +62,7 @@ ADVICE = "copy the model's folder again, or train it again (isocharge train fit 
 def films_bytes(films: FilmsModel) -> bytes:
     """Return the content of the file."""
     arrays = {
-        "about": np.array(json.dumps(_about(films), allow_nan=False)),
+        "about": np.array(json.dumps(_about_table(films), allow_nan=False)),
         "mean": films.mean,
         "whitening": films.whitening,
         **{f"family.{name}": np.asarray(value) for name, value in films.family.to_arrays().items()},
@@ -98,11 +98,11 @@ def films_from_bytes(data: bytes, where: str) -> FilmsModel:
         ModelError: If the file is damaged or has another format.
     """
     try:
-        arrays = _arrays(data)
+        arrays = _checked_arrays(data)
         about = json.loads(str(arrays["about"]))
         if about["format"] != FORMAT:
             raise ModelError(f"{where}: format {about['format']} is not supported (this version reads {FORMAT})")
-        return _model(about, arrays, sha256_of(data))
+        return _model_from_arrays(about, arrays, sha256_of(data))
     except ModelError:
         raise
     except DAMAGED_FILE_ERRORS as error:
@@ -123,7 +123,7 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
     return buffer.getvalue()
 
 
-def _arrays(data: bytes) -> dict[str, np.ndarray]:
+def _checked_arrays(data: bytes) -> dict[str, np.ndarray]:
     """Read the arrays of a file, check the checksum and the numbers, and return all arrays except the checksum.
 
     Args:
@@ -160,8 +160,8 @@ def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
     return checksum.hexdigest()
 
 
-def _about(films: FilmsModel) -> dict[str, Any]:
-    """Return the JSON object of a model, which describes its films, domain and noise.
+def _about_table(films: FilmsModel) -> dict[str, Any]:
+    """Return the JSON object that describes the films, the domain and the noise of a model.
 
     The numbers are converted into the units of the file. If the activation is tanh, the object has no entry for it.
 
@@ -185,8 +185,8 @@ def _about(films: FilmsModel) -> dict[str, Any]:
     return about
 
 
-def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str) -> FilmsModel:
-    """Return the model of a file. This is the inverse of `_about` and of the functions that write the arrays.
+def _model_from_arrays(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str) -> FilmsModel:
+    """Return the model of a file. This is the inverse of `_about_table` and of the functions that write the arrays.
 
     Args:
         about: The JSON object of the file.
@@ -204,12 +204,12 @@ def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str)
     domain = Domain(float(about["radius_mm"]), (float(min_force), float(max_force)))
     activation = ACTIVATIONS[about.get("activation", TANH.name)]
     model = FilmsModel(
-        family=FilmFamily.from_arrays(_within(arrays, "family")),
+        family=FilmFamily.from_arrays(_arrays_of_part(arrays, "family")),
         scaling=FilmScaling(prior, domain),
         mean=arrays["mean"],
         whitening=arrays["whitening"],
-        contact=_unpacked(_within(arrays, "contact"), activation),
-        misfit=_unpacked(_within(arrays, "misfit"), activation),
+        contact=_unpacked(_arrays_of_part(arrays, "contact"), activation),
+        misfit=_unpacked(_arrays_of_part(arrays, "misfit"), activation),
         noise=NoiseModel(**{**noise, "white": _converted(noise["white"], 1.0 / FILE_PC)}),
         sha256=sha256,
     )
@@ -232,7 +232,7 @@ def _converted(value: float, factor: float) -> float:
     return float(f"{factor * value:.15g}")
 
 
-def _within(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np.ndarray]:
+def _arrays_of_part(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np.ndarray]:
     """Return the arrays of one part of the file, by their names in this part."""
     prefix = f"{part}."
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

@@ -70,11 +70,11 @@ class ConditionalWeights:
         phi = self._apply_linear("phi", psi).reshape(n_layer + 1, -1)  # one row for each layer and for the skip layer
         layers = []
         for index in range(n_layer):
-            weight = self._mix(f"constant.{index}", f"bases.{index}", phi[index])
+            weight = self._mix_weights(f"constant.{index}", f"bases.{index}", phi[index])
             bias = self._apply_linear(f"bias.{index}", psi)
             layers.append(Layer(weight, bias))
         *hidden, output_layer = layers
-        skip_weight = self._mix("skip", "skip_bases", phi[n_layer])
+        skip_weight = self._mix_weights("skip", "skip_bases", phi[n_layer])
         return Perceptron(tuple(hidden), output_layer, skip_weight, self.activation)
 
     def _linear(self, name: str) -> Layer[Array]:
@@ -86,7 +86,7 @@ class ConditionalWeights:
         layer = self._linear(name)
         return np.asarray(value @ layer.weight + layer.bias)
 
-    def _mix(self, constant: str, bases: str, phi: Array) -> Array:
+    def _mix_weights(self, constant: str, bases: str, phi: Array) -> Array:
         """Compute the weights of a layer: a constant matrix plus a weighted sum of basis matrices.
 
         Args:

@@ -166,7 +166,7 @@ def fit_films(
         activation = ACTIVATIONS[config.activation]
 
         contact_perceptron = _new_perceptron(inputs, config.hidden, N_CONTACT_ANSWERS, activation)
-        _train(contact_stage(contact_perceptron, inputs, presses, noise, config), config, run)
+        _train_stage(contact_stage(contact_perceptron, inputs, presses, noise, config), config, run)
 
         source = FilmsSource(prior, family, domain, misfit_noise(noise))
         examples = draw_misfit_films(
@@ -177,7 +177,7 @@ def fit_films(
         )
         n_electrode = inputs.mean.size
         misfit_perceptron = _new_perceptron(inputs, config.misfit_hidden, n_electrode, activation)
-        _train(misfit_stage(misfit_perceptron, inputs, examples, good_presses, source.noise, config), config, run)
+        _train_stage(misfit_stage(misfit_perceptron, inputs, examples, good_presses, source.noise, config), config, run)
     return FilmsModel(
         family=family,
         scaling=inputs.scaling,
@@ -232,7 +232,7 @@ def _new_perceptron(
     return ConditionalPerceptron(inputs.mean.size, hidden, n_output, n_context, activation)
 
 
-def _train(stage: TrainingStage, config: FilmsConfig, run: ResumableRun | None) -> None:
+def _train_stage(stage: TrainingStage, config: FilmsConfig, run: ResumableRun | None) -> None:
     """Train without early stopping, because the last steps of the schedule have the smallest loss."""
     stage = replace(stage, optimisers=muon_and_adam)
     Descent(stage, config.learning_rate, stage.steps, config.seed).run(run)

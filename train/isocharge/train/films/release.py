@@ -91,7 +91,7 @@ def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PR
         ]
         contact = np.stack([contact for contact, _, _ in estimates])
         std = np.stack([std for _, std, _ in estimates])
-        return _errors(contact, std, true_contact)
+        return _error_statistics(contact, std, true_contact)
 
     # Two candidates for the assumed film, whose network is used for all films
     assumed_films = {"as described": films.prior.described, "in the middle of all": films.prior.mean}
@@ -129,7 +129,7 @@ def _draw_presses(films: FilmsModel, true_films: Array, n_press: int, rng: np.ra
     return np.stack(contacts), np.stack(noisy_charges)
 
 
-def _errors(contact: Array, std: Array, truth: Array) -> Mapping[str, float]:
+def _error_statistics(contact: Array, std: Array, truth: Array) -> Mapping[str, float]:
     """Compute statistics of the errors of contacts on several films.
 
     Args:

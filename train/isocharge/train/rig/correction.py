@@ -134,7 +134,9 @@ def fit_correction(residuals: Residuals) -> Correction:
     # The domain of the polynomials is the range of the presses.
     x, y, force = residuals.contact.T
     n_electrode = residuals.log_ratio.shape[1]
-    domain = Domain(float(np.hypot(x, y).max()), (float(force.min()), float(force.max())))
+    radius = float(np.hypot(x, y).max())
+    force_range = (float(force.min()), float(force.max()))
+    domain = Domain(radius, force_range)
     n_coefficient = term_count() * n_electrode
 
     def prior_covariance(hypothesis: Hypothesis) -> Array:
