@@ -219,7 +219,7 @@ def _completed_table(table: Mapping[str, Any], held: HeldPress | None, *, withou
     Args:
         table: Content of the device file. Its sections take precedence.
         held: The press; None if there was none.
-        without_offsets: Whether the offsets are removed, because they were measured on a touched film.
+        without_offsets: Whether the offsets are removed. Offsets that were measured on a touched film are wrong.
     """
     completed = dict(table)
     if held is not None:

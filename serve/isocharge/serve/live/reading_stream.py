@@ -33,7 +33,7 @@ class ChannelPicker:
 
     The section `[channels]` of the device file assigns a channel to each electrode, by its name or its number. Without
     this section, channels are assigned by the names of the electrodes (`A`, `A_pC` or `charge.A`). If the channels have
-    no such names, they are assigned by their order, provided that there are as many channels as electrodes.
+    no such names, the channels are assigned by their order. This requires as many channels as electrodes.
     """
 
     def __init__(
@@ -117,8 +117,8 @@ class ChannelPicker:
 def check_channels(device: Device, electrodes: tuple[str, ...], reader: str) -> None:
     """Check without a frame that the device file assigns a channel to each electrode.
 
-    The channels of described frames are known, and are assigned as those of a received frame. The channels of other
-    frames are not known. Each electrode then needs a key in the section `[channels]` if there is such a section.
+    The channels of described frames are known, and are assigned as in a received frame. The channels of other frames
+    are not known. Each electrode then needs a key in the section `[channels]` if there is such a section.
 
     Args:
         device: Settings of the board.

@@ -186,7 +186,7 @@ class RecordedStream:
             loader.shutdown(wait=False)  # the thread ends after this model
 
     def _use(self, loaded: "Future[Predictor]") -> None:
-        """Use a loaded model from now on.
+        """Use a loaded model for all later chunks.
 
         If the loaded model cannot be used, log an error and continue with the present model.
 

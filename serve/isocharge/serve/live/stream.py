@@ -33,7 +33,7 @@ from isocharge.serve.signal_chain.chain import Chain, Reading
 from isocharge.serve.tracking.tracker import Tracker
 
 LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
-"""Flags of a frame without a record that pass to the next record, because they describe what happened before it."""
+"""Flags that the next record receives if a frame has no record. The flags describe events before that record."""
 
 
 class Policy(StrEnum):

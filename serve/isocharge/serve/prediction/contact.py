@@ -22,7 +22,7 @@ MAX_DECIMALS = 6
 
 
 class Contact(NamedTuple):
-    """Position and force of one press with their uncertainties. `Predictor.flags` returns whether they are valid.
+    """Position and force of one press with their uncertainties. `Predictor.flags` checks whether a contact is valid.
 
     Attributes:
         x_mm: Position in the frame of the sensor, mm.
@@ -175,9 +175,9 @@ def is_close(contact: Contact, reference: Contact | None) -> bool:
 
 
 class Contacts(NamedTuple):
-    """Contacts of n presses. The fields are those of `Contact`, each as a float32 array of shape (n,).
+    """Contacts of n presses. Each field of `Contact` is a float32 array of shape (n,).
 
-    `np.asarray` converts these fields to one array of shape (n, 10) with one press in each row.
+    `np.asarray` converts the fields to one array of shape (n, 10) with one press in each row.
     """
 
     x_mm: Singles

@@ -64,7 +64,7 @@ def clock_of(step: Array, rate_Hz: float) -> tuple[str, float] | None:
         rate_Hz: Number of frames per second, Hz.
 
     Returns:
-        The name and the value, or None if the values are not those of a clock.
+        The name and the duration of a tick; None if the values do not come from a clock.
     """
     tick_rate_Hz = steady_step(step) * rate_Hz
     for common_rate_Hz, clock in CLOCKS.items():

@@ -223,7 +223,7 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], rate_Hz: float) -> dict[
     last_frame = frames[-1]
     meanings = _meanings(frames, rate_Hz)
 
-    # A header has given names to the columns of a CSV. All names are copied, and those of counter and clock replaced.
+    # The header of a CSV names all columns. All names are copied, except the names of counter and clock.
     if layout.notation is Notation.csv and layout.names:
         columns = list(layout.names)
         for position, meaning in meanings.items():

@@ -50,7 +50,7 @@ class TrackedContact(Struct, frozen=True):
 
 
 class OtherContact(Struct, frozen=True):
-    """Another contact that explains the charges equally well. Which of the two contacts is real is not known yet."""
+    """Another contact that explains the charges equally well. The charges do not show which of the two is real."""
 
     x_mm: Annotated[float, Meaning("Position x.", "mm", is_shown_live=True)]
     y_mm: Annotated[float, Meaning("Position y.", "mm", is_shown_live=True)]
@@ -214,7 +214,7 @@ NO_CONTACT: dict[str, Any] = UNKNOWN_CONTACT | {"force_N": 0.0}
 
 
 def selected_fields(*, with_tracking: bool, with_film: bool) -> tuple[Field, ...]:
-    """Return the fields that every record has, and those of the selected optional groups.
+    """Return the fields that every record has, and the fields of the selected optional groups.
 
     Args:
         with_tracking: Whether to include the fields of the tracking.

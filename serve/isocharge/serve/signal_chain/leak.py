@@ -137,9 +137,9 @@ def in_touch(leak: Leak, charge_pC: Array, output_pC: Array, hold_off_s: float) 
 def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array, dt_s: float) -> Leak:
     """Return the state with a corrected inflow.
 
-    The inflow follows the mean of the surplus over `settle_s`. Large surpluses are clipped, because they are caused by
-    touches. The latest inflow may contain the beginning of a touch. Every `look_back_s`, the inflow is therefore stored
-    as the candidate, and the previous candidate becomes the trusted inflow.
+    The inflow follows the mean of the surplus over `settle_s`. Large surpluses are clipped, because touches cause large
+    surpluses. The latest inflow may contain the beginning of a touch. Every `look_back_s`, the inflow is therefore
+    stored as the candidate, and the previous candidate becomes the trusted inflow.
 
     Args:
         rule: Settings of the estimate of the inflow.

@@ -11,7 +11,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 
 DECADES_S = 10.0 ** np.arange(-3, 5)
-"""Time constants of the creep terms, s. They represent creep from 1 ms to some minutes."""
+"""Time constants of the creep terms, s. The sum of the terms approximates creep from 1 ms to some minutes."""
 
 WARMTH_ROW = -3
 SLOPE_ROW = -2

@@ -244,10 +244,10 @@ class ContactMixture:
             The updated components; None if no component explains the charges.
         """
         predicted = predict_components(components, dt_s)
-        best = predicted.best
-        added_mean = predicted.mean[best].copy()
-        added_covariance = predicted.covariance[best].copy()
-        added_log_weight = predicted.log_weight[best] + math.log(SUDDEN_CHANGE_RATE * dt_s)
+        most_probable = predicted.best
+        added_mean = predicted.mean[most_probable].copy()
+        added_covariance = predicted.covariance[most_probable].copy()
+        added_log_weight = predicted.log_weight[most_probable] + math.log(SUDDEN_CHANGE_RATE * dt_s)
 
         has_large_innovation = self._squared_innovation(predicted, measurement) > SQUARED_GATE
         is_fast = np.hypot(added_mean[X_RATE], added_mean[Y_RATE]) > SPEED_STD
@@ -269,11 +269,11 @@ class ContactMixture:
             components: Predicted components.
             measurement: Charges of this step.
         """
-        best = components.best
+        most_probable = components.best
         charge_pC, jacobian = charges_and_jacobian(self.charges, components.mean)
         charge_covariance = jacobian @ components.covariance @ jacobian.swapaxes(1, 2)
-        innovation_covariance = charge_covariance[best] + np.diag(measurement.variance)
-        innovation = measurement.charge_pC - charge_pC[best]
+        innovation_covariance = charge_covariance[most_probable] + np.diag(measurement.variance)
+        innovation = measurement.charge_pC - charge_pC[most_probable]
         return float(innovation @ np.linalg.solve(innovation_covariance, innovation))
 
     def _most_probable_states(

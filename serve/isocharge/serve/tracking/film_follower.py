@@ -150,7 +150,7 @@ class PeakFrame(NamedTuple):
 class SquaredMisfits(NamedTuple):
     """Squared misfits of one touch, relative to the mean squared misfit of good touches.
 
-    They are limited to `LARGEST_SQUARE`.
+    The squared misfits are limited to `LARGEST_SQUARE`.
 
     Attributes:
         filtered: Squared misfit after the correction by all linear unknowns, at each pretension, shape (n_pretension,).
@@ -392,8 +392,8 @@ class FilmFollower:
         nearest = self._filter.nearest
         sum_at_present_estimate = sum(float(touch.filtered[nearest]) for touch in self._recent_misfits)
         sum_at_earlier_estimates = sum(touch.filtered_at_estimate for touch in self._recent_misfits)
-        limit = EXPLAINED_SQUARE * count + EXPLAINED_SCATTER * math.sqrt(count)
-        return min(sum_at_present_estimate, sum_at_earlier_estimates) > limit
+        largest_explained_sum = EXPLAINED_SQUARE * count + EXPLAINED_SCATTER * math.sqrt(count)
+        return min(sum_at_present_estimate, sum_at_earlier_estimates) > largest_explained_sum
 
     def _is_gain_wrong(self) -> bool:
         """Return whether a wrong gain of one electrode explains the latest touches far better than any pretension."""

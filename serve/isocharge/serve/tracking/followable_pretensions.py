@@ -1,4 +1,4 @@
-"""Weights of a model whose film can be followed, and the checks that they belong to the model."""
+"""Reading of the weights of a model for other pretensions, and checks that the weights belong to the model."""
 
 import numpy as np
 

@@ -58,7 +58,7 @@ MIN_LOG_WEIGHT = -14.0
 """Logarithm of the weight, relative to the largest weight, below which a component is removed."""
 
 MERGE_DISTANCE = 0.7
-"""Distance between two components, in standard deviations of each entry of `MOTION`, below which they are merged."""
+"""Distance below which two components are merged, in standard deviations of each entry of `MOTION`."""
 
 
 class ContactHypothesis(NamedTuple):
