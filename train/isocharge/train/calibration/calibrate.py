@@ -55,7 +55,7 @@ MAX_MISTAKE_PROBABILITY = 0.5
 """Largest probability of an unseen mistake that is assumed because other presses were left out."""
 
 FEW = 3
-"""Largest number of presses among which a wrong one cannot be recognised. The user is warned."""
+"""Largest number of presses among which a wrong press cannot be recognised. The user is warned."""
 
 BOUND_DISTANCE = 0.1
 """Distance from a bound within which a parameter counts as limited by the bound, in prior standard deviations."""
@@ -302,7 +302,7 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
 
 
 def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> Iterator[str]:
-    """Yield warnings about the presses and the estimate, one sentence each.
+    """Yield warnings about the presses and the estimate. Each warning is one sentence.
 
     Args:
         presses: All presses of the calibration.

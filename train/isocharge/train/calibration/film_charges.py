@@ -53,12 +53,12 @@ class FilmCharges(FilmMaps):
 
     @cached_property
     def layout(self) -> UnknownLayout:
-        """Places of parameters, coefficients and nuisances in the vector of unknowns."""
+        """Indices of the parameters, coefficients and nuisances in the vector of unknowns."""
         return UnknownLayout(self.prior.names, self.modes, self.prior.sensor.electrode_names)
 
     @cached_property
     def _mode_stds(self) -> Array:
-        """Standard deviations of the modes, in their units, shape (n_mode,)."""
+        """Standard deviations of the modes, in the units of the modes, shape (n_mode,)."""
         return np.array([MODES[name].std for name in self.modes])
 
     @cached_property

@@ -30,7 +30,7 @@ The effect is the root mean square of the misfit that one standard deviation of 
 trained network have errors of this size, and directions with a smaller effect would explain these errors."""
 
 MAX_DIRECTIONS = 16
-"""Largest number of directions; it limits the time that a touch takes."""
+"""Largest number of directions. A larger number would increase the time that a touch takes."""
 
 LEAST_VARIANCE = 1e-12
 """Variance of a combination of unknowns, relative to the largest one, below which it counts as known exactly."""

@@ -91,7 +91,7 @@ class SolvedFilm(NamedTuple):
 
 
 class SettledFit(NamedTuple):
-    """A fit after which neither the film nor the selection of presses changes any more.
+    """Result of repeated fits of a film, as `FitProblem.settle` returns it.
 
     Attributes:
         is_kept: Which presses are kept, shape (n,).
@@ -164,7 +164,7 @@ class FitProblem:
 
     @property
     def layout(self) -> UnknownLayout:
-        """Places of the unknowns in their vector."""
+        """Indices of the unknowns in the vector of unknowns."""
         return self.charges.layout
 
     @cached_property

@@ -155,7 +155,7 @@ NUISANCES: tuple[Nuisance, ...] = (
     ChargeDrift("drift", "1", ((0.0, 0.95), (0.15, 0.05))),
     FRICTION,
 )
-"""All nuisances, in the order of their unknowns."""
+"""All nuisances, in the order in which they appear in the vector of unknowns."""
 
 
 def film_warming_sentences(estimates: Mapping[str, NuisanceEstimate]) -> Iterator[str]:

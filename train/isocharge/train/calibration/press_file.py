@@ -57,7 +57,7 @@ class PressFile:
         return presses
 
     def write(self, presses: MeasuredPresses) -> None:
-        """Replace the file by one with these presses, or delete it if there are none.
+        """Write all presses to the file, or delete the file if there are no presses.
 
         Args:
             presses: All presses of the session.

@@ -14,7 +14,7 @@ from isocharge.train.calibration.nuisances import NUISANCES
 
 @dataclass(frozen=True)
 class UnknownLayout:
-    """Positions of the unknowns in their vector.
+    """Indices of the parameters, coefficients and nuisances in the vector of unknowns.
 
     Attributes:
         parameter_names: Names of the film's parameters.
