@@ -149,6 +149,16 @@ def solved(films, monkeypatch):
     monkeypatch.setattr(correlation, "N_EXAMPLES", 1_000)
 
 
+def test_the_contact_network_is_trained_at_the_configured_rate_with_clipped_gradients(random_films):
+    """Large gradients of rare films are clipped. The rate is that of the settings, as for every other network."""
+    model, inputs, [contact, _] = random_films(load_sensor("four-25um-biaxial"))
+    presses = films_data.draw_film_presses(model.prior, model.family, model.domain, 8, 16, seed=3)
+    stage = films_fit.contact_stage(contact, inputs, presses, model.noise, TINY)
+    assert stage.rate_factor == 1.0
+    assert stage.largest_gradient == films_fit.LARGEST_GRADIENT < np.inf
+    assert 0 < stage.warm_up_steps < stage.steps == TINY.steps
+
+
 @pytest.mark.usefixtures("solved")
 @pytest.mark.slow
 def test_a_short_training_gives_a_model_that_is_served(films, tmp_path):

@@ -260,7 +260,13 @@ def contact_stage(
     """
     training = _ContactTraining(network, inputs, presses, noise, config)
     return TrainingStage(
-        "contact", network, training.loss, training.score, config.steps, training.warm_up_steps, LARGEST_GRADIENT
+        "contact",
+        network,
+        training.loss,
+        training.score,
+        config.steps,
+        training.warm_up_steps,
+        largest_gradient=LARGEST_GRADIENT,
     )
 
 

@@ -9,7 +9,7 @@ import io
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, Protocol
 
 import torch
@@ -89,7 +89,7 @@ class TrainingStage:
         steps: Number of steps.
         warm_up_steps: Number of first steps with another loss. Weights of these steps are never the best ones.
         rate_factor: Largest learning rate relative to that of the training's settings.
-        largest_gradient: Norm to which larger gradients are clipped after these steps.
+        largest_gradient: Norm to which larger gradients are clipped after the warm-up.
         slow_parameters: Parameters of the network that have a smaller learning rate in SOAP.
         optimisers: Function from this stage to the optimisers of its network. The key `rate_factor` of each group of
             parameters is the learning rate relative to that of the training.
@@ -101,6 +101,7 @@ class TrainingStage:
     score: Callable[[], tuple[float, str]]
     steps: int
     warm_up_steps: int = 0
+    _: KW_ONLY
     rate_factor: float = 1.0
     largest_gradient: float = math.inf
     slow_parameters: tuple[Tensor, ...] = ()
