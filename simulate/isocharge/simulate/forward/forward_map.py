@@ -23,18 +23,8 @@ from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import Domain, as_contacts, differences
 from isocharge.simulate.forward.family import NODE_COUNTS, CheckPress, Family, check_family, check_presses
 from isocharge.simulate.forward.press_chunk import PressChunk
-from isocharge.simulate.forward.readout import (
-    COARSE,
-    FAR,
-    FAR_DISTANCE,
-    FINE,
-    NEAR,
-    ReadoutPoints,
-    contact_charge,
-    electrode_distances,
-    electrode_gaps,
-    touch_charge,
-)
+from isocharge.simulate.forward.readout import ReadoutPoints, contact_charge, touch_charge
+from isocharge.simulate.forward.readout_rules import ReadoutRules
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.theory import Theory, theory_for
 from isocharge.simulate.mesh.blocks import Resolution
@@ -60,14 +50,6 @@ EVEN_FIELD = np.zeros(1, dtype=bool)
 SKIP_RATIO = 10.0
 """Ratio of the error to `INTERPOLATION_ERROR` above which the next entry of `NODE_COUNTS` is skipped, because it would
 not be sufficient either, dimensionless."""
-
-MIN_CLAMP_DISTANCE = 8.0
-"""Smallest distance of a press from the clamp for the rule for far electrodes, in units of the probe's reach."""
-
-MAX_RING_RATIO = 2.0
-"""Largest ratio of the radii of successive rings of the mesh at which the integration rule for far electrodes is used,
-dimensionless. On coarser meshes the stress is not smooth enough across an electrode. Meshes that are chosen
-automatically have a ratio of about 1.9."""
 
 CHECK_COUNT = 10
 """Number of direct solves with which a forward map is compared."""
@@ -275,7 +257,7 @@ class ForwardMap:
         x, y, force = contact.T
         position = x + 1j * y
         orientation = np.zeros(1)  # the same for all presses, because a circular probe has no orientation
-        rule = readout or self._coarse_readout
+        rule = readout or self._readout_rules.coarse
         all_pairs = np.ones((position.size, len(rule.count)), dtype=bool)
         charges = []
         with single_threaded_blas():
@@ -308,7 +290,7 @@ class ForwardMap:
         with single_threaded_blas():
             for start in range(0, complex_position.size, chunk_size):
                 chunk = complex_position[start : start + chunk_size]
-                rules = tuple((readout, pairs & is_needed) for readout, pairs in self._rules(chunk))
+                rules = tuple((readout, pairs & is_needed) for readout, pairs in self._readout_rules.select(chunk))
                 force = np.full(chunk.size, first_force)
                 charges.append(stacked_map._integrate_fields(chunk, force, orientation, is_odd, rules))
 
@@ -373,7 +355,7 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_electrode), pC.
         """
-        rules = self._rules(position)
+        rules = self._readout_rules.select(position)
         charge: Array = self._integrate_fields(position, force, orientation, EVEN_FIELD, rules)[..., 0]
         charge += force[:, None] * self._pressure_charges(position, orientation)
         return self.sensor.calibration.read(charge)
@@ -391,7 +373,7 @@ class ForwardMap:
         charge = np.zeros((position.size, len(self.electrodes)))
         if self.sensor.piezo.d33 == 0.0:
             return charge
-        presses_near_electrodes = np.flatnonzero(self._is_near(position).any(axis=1))
+        presses_near_electrodes = np.flatnonzero(self._readout_rules.is_near(position).any(axis=1))
         for press_index in presses_near_electrodes:
             probe = self.probe.rotated(float(orientation[press_index]))
             press_position = position[press_index]
@@ -444,46 +426,9 @@ class ForwardMap:
         return np.asarray(charge * stress_unit[:, None, None])
 
     @cached_property
-    def _fine_readout(self) -> ReadoutPoints:
-        """Integration rule for electrodes near the probe."""
-        return ReadoutPoints.of(self.sensor, FINE)
-
-    @cached_property
-    def _coarse_readout(self) -> ReadoutPoints:
-        """Integration rule for electrodes away from the probe."""
-        return ReadoutPoints.of(self.sensor, COARSE)
-
-    @cached_property
-    def _far_readout(self) -> ReadoutPoints:
-        """Integration rule for electrodes far from the probe."""
-        return ReadoutPoints.of(self.sensor, FAR)
-
-    def _rules(self, position: Complexes) -> tuple[tuple[ReadoutPoints, Booleans], ...]:
-        """Return the integration rules for presses, and the pairs of press and electrode that use each rule.
-
-        Args:
-            position: Positions x + iy, shape (n,), mm.
-
-        Returns:
-            Integration points and pairs of each rule. The pairs have the shape (n, n_electrode).
-        """
-        is_near = self._is_near(position)
-        is_distant = electrode_distances(self.sensor, position) > FAR_DISTANCE
-        clamp_distance = self.sensor.film.radius - np.abs(position)
-        is_inner = clamp_distance >= MIN_CLAMP_DISTANCE * self.probe.reach  # shape (n,)
-        is_far = ~is_near & is_distant & is_inner[:, None] & self._has_smooth_far_field
-        is_between = ~is_near & ~is_far
-        return (self._fine_readout, is_near), (self._coarse_readout, is_between), (self._far_readout, is_far)
-
-    @cached_property
-    def _has_smooth_far_field(self) -> bool:
-        """Whether the mesh is fine enough for the integration with few points over electrodes far from the probe."""
-        ring_ratio = (self.sensor.film.radius / self.probe.reach) ** (1.0 / self.resolution.rings)
-        return bool(ring_ratio <= MAX_RING_RATIO)
-
-    def _is_near(self, position: Complexes) -> Booleans:
-        """Return whether electrodes are so near to presses x + iy that they need the fine rule, (n, n_electrode)."""
-        return np.asarray(electrode_gaps(self.sensor, position) < self.probe.reach + NEAR)
+    def _readout_rules(self) -> ReadoutRules:
+        """Integration rules for the charges of single electrodes."""
+        return ReadoutRules(self.sensor, self.probe, self.resolution)
 
 
 def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check: CheckPress) -> Array:
