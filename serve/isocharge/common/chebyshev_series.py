@@ -80,8 +80,8 @@ def chebyshev_terms(coordinates: Array, degree: int, force_degree: int) -> tuple
         force_degree: Largest degree in the logarithm of the force.
 
     Returns:
-        The products of the polynomials in x and y, shape (n, n_term), in the order of `position_degrees`, and the
-        polynomials in the logarithm of the force, shape (n, force_degree + 1).
+        Products of the polynomials in x and y, in the order of `position_degrees`, shape (n, n_term). Polynomials in
+        the logarithm of the force, shape (n, force_degree + 1).
     """
     x, y, log_force = np.clip(coordinates, -1.0, 1.0).T
     x_polynomials = chebyshev.chebvander(x, degree).astype(float)  # shape (n, degree + 1)

@@ -98,8 +98,9 @@ class MeasuredPresses:
         ignored: Columns of the file that were not read.
         temperature_C: Temperature of the ring of the film, shape (n,), degrees Celsius; NaN if unknown, None if it is
             unknown for all presses.
-        film_temperature_C: Temperature of the film or of the air at its surface, shape (n,), degrees Celsius; NaN if
-            unknown, None if it is unknown for all presses. It is only allowed together with `temperature_C`.
+        film_temperature_C: Temperature of the film or of the air at its surface, shape (n,), degrees Celsius. An
+            unknown temperature is NaN. If all temperatures are unknown, the attribute is None. It is only allowed
+            together with `temperature_C`.
         row_noun: What `lines` counts, for messages: "line", "row" or "press".
 
     Raises:
@@ -334,7 +335,7 @@ def read_press_list(path: Path) -> Array:
             ignored.
 
     Returns:
-        (x_mm, y_mm, force_N) of each press, shape (n, 3), mm and N; NaN where the file has an empty cell.
+        Position and force (x, y, F) of each press, shape (n, 3), mm and N. Empty cells of the file are NaN.
 
     Raises:
         PressError: If the file cannot be read, or a row is not a press. The message names the line and the column.

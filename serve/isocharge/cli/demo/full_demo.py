@@ -154,8 +154,8 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
         seconds: Duration, s.
 
     Returns:
-        One row for each frame with a press, columns as in `FollowedPress`, shape (n, 7), mm and N; and the counts of
-        the stream.
+        Presses of all frames with a press, shape (n, 7), mm and N, with the columns of `FollowedPress`. Counts of the
+        stream.
     """
     touch = TouchStream(predictor)
     frame_count = round(seconds * RATE_HZ)

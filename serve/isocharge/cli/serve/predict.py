@@ -23,7 +23,7 @@ def predict_command(
         typer.Argument(
             metavar="FILE.csv",
             help="CSV or Parquet file with the electrodes' names in the header and a press in each row, charges in pC; "
-            "further columns are ignored. - reads CSV from stdin.",
+            "further columns are ignored. The file name - reads CSV from stdin.",
         ),
     ],
     json: Annotated[

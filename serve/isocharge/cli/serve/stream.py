@@ -145,10 +145,10 @@ def stream_command(
     """Follow a sensor live: read its port, and print position (mm) and force (N) for every frame of charges.
 
     The first 100 frames (0.5 s at 200 Hz) are the tare, the charges at rest: leave the film alone meanwhile. The signal
-    SIGUSR1 starts a new tare; SIGUSR2 goes back to the film as it was calibrated; SIGHUP takes the latest version of
-    MODEL, without losing a frame. Ctrl-C stops. If the reader of stdout is too slow for a sensor, the oldest lines are
-    dropped and counted in the summary; a recording (--record) is complete. Exit code 1 if no frames are recognised
-    within --seconds.
+    SIGUSR1 starts a new tare. SIGUSR2 discards the estimated changes of the film.
+    SIGHUP loads the latest version of MODEL without losing a frame. Ctrl-C stops. If the reader of stdout is too slow
+    for a sensor, the oldest lines are dropped and counted in the summary; a recording (--record) is complete. Exit
+    code 1 if no frames are recognised within --seconds.
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """

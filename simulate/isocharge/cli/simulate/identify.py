@@ -56,8 +56,8 @@ def identify_command(
     """Compute how well the charges determine a press: error limits over the film, ambiguities and working area.
 
     The errors are Cramer-Rao limits, in mm for the position and in percent for the force. No unbiased method has
-    smaller errors. The mirror region is the part of the film outside the working area where a press has the same
-    charges as a press inside the working area, so that the charges do not show that the press is outside.
+    smaller errors. The mirror region lies outside the working area. A press in the mirror region has the same charges
+    as a press inside the working area, so that the charges do not show where the press is.
 
     Example: isocharge simulate identify three-25um-biaxial --probe circle:1.0 --error 0.5 -o limits
     """

@@ -47,8 +47,9 @@ class Fix:
 
     Attributes:
         contact: Contacts (x, y, F), shape (n, 3), mm and N. The force is the given force or the estimated force.
-        spread: Largest distance of a crossing from the mean of its triple if the force is given; root mean square
-            distance of the contours from the position if the force is estimated; shape (n,), mm.
+        spread: Measure of the disagreement of the contours, shape (n,), mm. If the force is given, this is the largest
+            distance of a crossing from the mean of its triple. If the force is estimated, it is the root mean square
+            distance of the contours from the position.
         status: Value of `Meeting` for each press, shape (n,).
     """
 

@@ -324,8 +324,8 @@ class Triangulation:
             fixed: Whether the derivative with respect to the force is omitted.
 
         Returns:
-            Distances, shape (n, n_electrode), mm, and their derivatives with respect to x, y and, unless the force is
-            fixed, ln F times the radius, shape (n, n_electrode, 2 or 3), dimensionless.
+            Distances, shape (n, n_electrode), mm. Dimensionless derivatives of the distances, shape (n, n_electrode, 2
+            or 3): with respect to x and y, and with respect to ln F times the radius unless the force is fixed.
         """
         predicted, charge_derivatives = linearised(self._charges, contact)
         typical_slope = np.median(self._grid.slope, axis=0) * self._grid.growth(contact[:, 2])[:, None]

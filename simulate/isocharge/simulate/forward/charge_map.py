@@ -157,7 +157,8 @@ class ChargeMap(Protocol):
         """Contacts for which the map is valid."""
 
     def charges(self, contact: Array) -> Array:
-        """Compute the charges, shape (n, n_electrode), pC, of contacts (x, y, F), shape (n, 3), mm and N."""
+        """Compute the charges of contacts (x, y, F), shape (n, 3), mm and N. The result has the shape (n, n_electrode),
+        pC."""
 
     def derivatives(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F.
@@ -197,8 +198,8 @@ class FunctionMap:
     """A charge map that evaluates a function, with derivatives by central differences.
 
     Attributes:
-        function: Function that converts contacts (x, y, F), shape (n, 3), mm and N, into charges, shape
-            (n, n_electrode), pC.
+        function: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns charges, shape (n, n_electrode),
+            pC.
         electrodes: Names of the electrodes.
         domain: Contacts for which the function is valid. The differences evaluate it up to `STEPS` outside the domain.
     """
@@ -246,7 +247,7 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
     """Compute the derivatives of a function of contacts by central differences.
 
     Args:
-        function: Function that converts contacts (x, y, F), shape (n, 3), mm and N, into values, shape (n, k). It is
+        function: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns values, shape (n, k). It is
             called once for all steps.
         contact: Contacts at which the derivatives are computed, shape (n, 3), mm and N.
         steps: Steps in x and y, mm, and in ln F.

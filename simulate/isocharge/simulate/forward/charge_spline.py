@@ -205,8 +205,8 @@ class ChargeSpline:
             force: Forces, shape (n,) or a number, N.
 
         Returns:
-            Charges, shape (n, n_electrode), pC; their derivatives with respect to (x, y), shape (n, n_electrode, 2),
-            pC/mm; their derivatives with respect to ln F, shape (n, n_electrode), pC.
+            Charges, shape (n, n_electrode), pC. Derivatives with respect to (x, y), shape (n, n_electrode, 2), pC/mm.
+            Derivatives with respect to ln F, shape (n, n_electrode), pC.
         """
         # Each charge is a weighted sum over the forces of the splines. Derivatives of the weights with respect to ln F
         # are computed by central differences.

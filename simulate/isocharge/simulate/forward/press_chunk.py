@@ -68,8 +68,8 @@ class PressChunk:
             n_field: Number of fields.
 
         Returns:
-            Stress (s11, s22, s12) in the frame of the mesh, shape (n_pair, n_point, n_field, 3), and whether each point
-            was reflected, shape (n_pair, n_point).
+            Stress (s11, s22, s12) in the frame of the mesh, shape (n_pair, n_point, n_field, 3). Whether each point was
+            reflected, shape (n_pair, n_point).
         """
         # Find the points in the mesh after the press has been rotated onto the positive x axis.
         mesh = self.mesh

@@ -270,7 +270,7 @@ def electrode_rule(electrode: Electrode, readout: Readout, per_side: int) -> tup
         per_side: Number of Gauss points per side.
 
     Returns:
-        Points (x, y), shape (n, 2), mm, and their shares of the mean of (s11, s22, s12), shape (n, 3).
+        Points (x, y), shape (n, 2), mm. Weights of each point in the means of s11, s22 and s12, shape (n, 3).
     """
     if readout == "edge":
         return _edge_rule(electrode, per_side)
@@ -285,8 +285,8 @@ def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
         per_side: Number of points along a side of a square, or along the longest side of a part.
 
     Returns:
-        Points (x, y), shape (n, 2), mm, and the shares of each point in the means of s11, s22 and s12, which are equal,
-        shape (n, 3).
+        Points (x, y), shape (n, 2), mm. Weights of each point in the means of s11, s22 and s12, shape (n, 3). The three
+        weights of a point are equal.
     """
     if electrode.square:
         unit_points, shares = gauss_square(per_side)
@@ -312,7 +312,7 @@ def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
         per_side: Half of the number of points on each edge.
 
     Returns:
-        Points (x, y), shape (n, 2), mm, and the shares of each point in the means of s11, s22 and s12, shape (n, 3).
+        Points (x, y), shape (n, 2), mm. Weights of each point in the means of s11, s22 and s12, shape (n, 3).
     """
     # The corners start at the lower left one and go anticlockwise, and so do the edges from each corner to the next.
     relative_position, line_shares = gauss_line(2 * per_side)  # from 0 at the start of an edge to 1 at its end

@@ -156,8 +156,8 @@ def _candidates(
         min_distance: Smallest distance of the second contact from each first contact, shape (n,), mm.
 
     Returns:
-        Indices of first contacts, shape (m,), and a candidate (x, y, F) for each, shape (m, 3), mm and N. A first
-        contact with two candidates occurs twice.
+        Indices of first contacts, shape (m,). A candidate (x, y, F) for each first contact, shape (m, 3), mm and N. A
+        first contact with two candidates occurs twice.
     """
     profile, terms = _tabulate(charge_map, position)
     _, neighbours = cKDTree(position).query(position, min(NEIGHBOURS, len(position)))

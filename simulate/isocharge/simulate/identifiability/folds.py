@@ -3,8 +3,8 @@
 Charges determine a contact only where the map from (x, y, ln F) to the charges is one to one. The map is not one to one
 near a fold. At a fold, the derivative J = d(Q)/d(x, y, ln F) is singular, and the map reverses its orientation across
 the fold. With three electrodes, det J changes its sign, and folds are lines. With more electrodes, J is not square and
-is singular only at isolated points. At such a point the map intersects itself, so that contacts on both sides of the
-point have the same charges (Whitney 1944).
+is singular only at isolated points. At a point of this kind, the map intersects itself. Contacts on both sides of the
+point therefore have the same charges (Whitney 1944).
 
 The orientation is reversed between two contacts a and b if det(J(a)' W J(b)) < 0, with the weights W = 1 / sigma^2. For
 three electrodes, this determinant has the sign of det J(a) det J(b). With more electrodes, the criterion is reliable

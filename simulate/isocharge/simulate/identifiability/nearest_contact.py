@@ -44,7 +44,7 @@ def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, sta
         start: Contacts (x, y, F) from which the search starts, shape (n, 3), mm and N.
 
     Returns:
-        Contacts within the domain of the map, shape (n, 3), and the distance of their charges from the given charges in
+        Contacts within the domain of the map, shape (n, 3). Distances of their charges from the given charges, in
         standard deviations of the noise, shape (n,).
     """
 
@@ -72,7 +72,7 @@ def explain(
         min_change: Change of the squared distance below which the descent ends, relative to 1 + its value.
 
     Returns:
-        Contacts within the domain of the map, shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
+        Contacts within the domain of the map, shape (n, 3). Residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
 
     def given_sigma(rows: Integers, _: Array) -> Array:
@@ -103,7 +103,7 @@ def _descend(
         min_change: Change of the squared distance below which the descent ends, relative to 1 + its value.
 
     Returns:
-        Contacts (x, y, F), shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
+        Contacts (x, y, F), shape (n, 3). Residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
     # Centre and half width of the domain in (x, y, ln F)
     radius = INNER_RADIUS * charge_map.domain.radius

@@ -100,8 +100,8 @@ class ChargeTable:
         probe: Probe.
         piezo: Piezoelectric coefficients d31 and d32, pC/N.
         distance: Distances of the solved presses from the centre, shape (n_distance,), mm.
-        stress: Stress (s11, s22, s12), MPa, and its derivatives in the frame of the press, single precision, shape
-            (n_distance * 3, n_node * 6).
+        stress: Stress (s11, s22, s12), MPa, and its derivatives in the frame of the press, shape (n_distance * 3,
+            n_node * 6). The numbers have single precision.
     """
 
     film_radius: float

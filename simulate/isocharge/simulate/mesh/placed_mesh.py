@@ -51,8 +51,8 @@ class Geometry:
             copies of the mesh.
         mass: Lumped area of the nodes of each element, shape (n_element, n_local).
         constraint: Matrix for hanging nodes; see `Template.constraint`.
-        coat: Indices of the coated elements, shape (n,), and the addition of the coat to the elasticity matrix C over E
-            at their quadrature points, shape (n, n_point, 3, 3). None if there is no coat.
+        coat: Indices of the coated elements, shape (n,). Contribution of the coat to the elasticity matrix C / E at the
+            quadrature points of these elements, shape (n, n_point, 3, 3). None if there is no coat.
     """
 
     nodes: Integers
@@ -385,8 +385,8 @@ def _film_gradient(derivatives: Array, points: np.ndarray) -> tuple[Array, Array
         points: Film points of the nodes of every element, shape (n_element, n_local), in film radii.
 
     Returns:
-        Derivatives with respect to (X1, X2), shape (n_element, n_point, 2, n_local), and the determinant of the
-        Jacobian, shape (n_element, n_point).
+        Derivatives with respect to (X1, X2), shape (n_element, n_point, 2, n_local). Determinant of the Jacobian, shape
+        (n_element, n_point).
     """
     # Inverse of the 2 x 2 Jacobian: row X1 is (y_eta, -y_xi), and row X2 is (-x_eta, x_xi), over the determinant.
     jacobian = _jacobian(derivatives, points)

@@ -14,8 +14,8 @@ import numpy as np
 from isocharge.common.arrays import Array, Integers
 
 Residuals = Callable[[Integers, Array], tuple[Array, Array]]
-"""Function from indices of problems, shape (m,), and their points u, shape (m, 3), to the residuals r, shape (m, k),
-and the derivatives dr/du, shape (m, 3, k)."""
+"""Function of the indices of problems, shape (m,), and of their points u, shape (m, 3). It returns the residuals r,
+shape (m, k), and their derivatives dr/du, shape (m, 3, k)."""
 
 MAX_STEPS = 30
 """Default of the largest number of steps. Most problems converge in five."""

@@ -179,7 +179,7 @@ def tensor_basis(order: int, xi: Array, eta: Array) -> tuple[Array, Array]:
         eta: Second local coordinate of the points, shape (n,).
 
     Returns:
-        Values, shape (n, (order + 1)^2), and derivatives with respect to xi and eta, shape (2, n, (order + 1)^2).
+        Values, shape (n, (order + 1)^2). Derivatives with respect to xi and eta, shape (2, n, (order + 1)^2).
     """
     xi_values, xi_slopes = basis(order, xi)
     eta_values, eta_slopes = basis(order, eta)
@@ -259,8 +259,8 @@ def gauss_reference_square(count: int) -> tuple[Array, Array, Array]:
         count: Number of points in each direction.
 
     Returns:
-        Coordinates xi and eta of the points, where xi varies fastest, and weights, which add up to 4; each of shape
-        (count^2,).
+        Coordinates xi and eta of the points, and the weights of the points, each of shape (count^2,). The coordinate xi
+        varies fastest. The weights add up to 4.
     """
     line, weight = np.polynomial.legendre.leggauss(count)
     xi, eta = np.meshgrid(line, line)

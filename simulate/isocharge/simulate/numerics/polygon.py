@@ -200,8 +200,8 @@ def bilinear(corners: Complexes, s: Array, t: Array) -> Complexes:
     """Map points (s, t) of the unit square bilinearly into a quadrilateral, or into a triangle.
 
     Args:
-        corners: Corners x + iy of the images of (0, 0), (1, 0), (1, 1) and (0, 1), shape (4,). For a triangle, shape
-            (3,); its last corner is the image of (1, 1) and of (0, 1).
+        corners: Corners x + iy, shape (4,): the images of (0, 0), (1, 0), (1, 1) and (0, 1). A triangle has the shape
+            (3,), and its last corner is the image of both (1, 1) and (0, 1).
         s: First coordinate in the unit square.
         t: Second coordinate in the unit square, of a shape that can be broadcast with that of `s`.
 
