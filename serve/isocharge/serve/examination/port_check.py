@@ -330,8 +330,8 @@ def _rest_charges(
         until_s: Time until which the film is at rest, s from the first frame.
 
     Returns:
-        Charges, shape (n, n_electrode), in the order of `electrode_at`, in pC if the gain is known, otherwise in the
-        unit of the board; and times, shape (n,), s.
+        Charges in the order of `electrode_at`, shape (n, n_electrode). Their unit is pC if the gain is known, and the
+        unit of the board otherwise. Times, shape (n,), s.
     """
     values, times_s = capture.values()
     is_rest = times_s < until_s

@@ -81,8 +81,8 @@ class ChargeSeries:
             contact: Contacts (x, y, ln F), shape (n, 3), with x and y in mm and F in N.
 
         Returns:
-            The charges, shape (n, n_electrode), pC, and their derivatives with respect to x, y (pC/mm) and ln F (pC),
-            shape (n, n_electrode, 3).
+            Charges, shape (n, n_electrode), pC. Derivatives of the charges with respect to x and y (pC/mm) and ln F
+            (pC), shape (n, n_electrode, 3).
         """
         # The series is a function of coordinates between -1 and 1.
         min_log_force, max_log_force = np.log(self.force_N)

@@ -135,8 +135,8 @@ class Predictor:
         Args:
             charge_pC: Touch charges, shape (electrodes,), float32, pC, in the order of `metadata.electrodes`. If a
                 charge is NaN, the result is NaN.
-            out: Receives the values of a Contact in their order, shape (10,), float32, or only the first seven of them,
-                shape (7,). A model without correlations computes only seven values.
+            out: Array of float32 that receives the values of a Contact in their order, shape (10,), or only the first
+                seven values, shape (7,). A model without correlations computes only seven values.
 
         Raises:
             ChargeError: If an array is not float32 or has another shape. Nothing is written in this case.

@@ -47,8 +47,8 @@ class PressErrors:
         lines: Number of each press in its file.
         row_noun: What `lines` counts: "line" of a CSV file, "row" of a Parquet file, or "press".
         predicted: Values of a `Contact`, shape (n, 10); NaN where a charge is unknown.
-        error: Predicted minus measured x and y, mm, and force, relative to the measured force, shape (n, 3); NaN where
-            the measured value is unknown.
+        error: Errors of x, y (mm) and the force (relative to the measured force), shape (n, 3): predicted minus
+            measured values. The error is NaN if the measured value is unknown.
         noise_std: Standard deviations that the model reports for the noise, in the units of `error`, shape (n, 3).
         rig_std: Standard deviations of the measured values, in the units of `error`, shape (n, 3).
         flags: Flags of each press. `outside` is the flag of `Validity`. `misfit` means that the misfit is above

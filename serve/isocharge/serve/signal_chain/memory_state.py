@@ -89,8 +89,8 @@ def _relaxation(warmth_s: float) -> tuple[Array, Array]:
         warmth_s: Time constant with which the film follows the temperature of the air, s.
 
     Returns:
-        Time constant of each row of the state, shape (rows, 1), s; and the propagation over a very long time, shape
-        (rows, rows). After such a time, the creep terms and the thermoelastic term equal the touch charge. The slope of
+        Time constant of each row of the state, shape (rows, 1), s. Propagation over a very long time, shape (rows,
+        rows). After such a time, the creep terms and the thermoelastic term equal the touch charge. The slope of
         the warmth has decayed to zero, and has changed the warmth by `warmth_s` multiplied by the slope.
     """
     steady_state = np.zeros_like(INITIAL_PROPAGATION)

@@ -293,8 +293,8 @@ class FilmFilter:
         The offset is distributed as before any touch. The other unknowns are averaged over the previous levels.
 
         Returns:
-            Mean, which is equal at all new levels, shape (n_pretension, n_unknown), and covariance at each new level,
-            shape (n_level, n_pretension, n_unknown, n_unknown).
+            Mean, shape (n_pretension, n_unknown), which is equal at all new levels. Covariance at each new level, shape
+            (n_level, n_pretension, n_unknown, n_unknown).
         """
         offset = self._layout.offset
         level_weight = self._probability / self.probability
@@ -420,8 +420,8 @@ class FilmFilter:
                 (n_direction, n_electrode).
 
         Returns:
-            Misfit vectors, shape (n_pretension, n_electrode), and their Jacobian, shape (n_level, n_pretension,
-            n_electrode, n_unknown), both in units of the root mean square of good touches.
+            Misfit vectors, shape (n_pretension, n_electrode). Jacobian of the misfit vectors, shape (n_level,
+            n_pretension, n_electrode, n_unknown). The unit of both is the root mean square of good touches.
         """
         layout = self._layout
         offset_step_pC = self._offset_steps()

@@ -100,7 +100,8 @@ def posix_modules() -> tuple[Any, Any, Any]:
 
 
 Charges = Callable[[Array], Array]
-"""Forward map: function from contacts (x, y, F), shape (n, 3), mm and N, to charges, shape (n, electrodes), pC."""
+"""Forward map: function of contacts (x, y, F), shape (n, 3), mm and N. It returns charges, shape (n, n_electrode),
+pC."""
 
 Noise = Callable[..., Array]
 """Amplifier: function from charges and a random generator to measured charges, both of shape (n, electrodes), pC.

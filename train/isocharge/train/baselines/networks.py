@@ -143,8 +143,8 @@ class ReleasedModel(GivenMethod):
             charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
-            Contacts (x, y, F), shape (n, 3), mm and N; standard deviations of the contacts, shape (n, 3), mm and N; and
-            misfits, shape (n, 1).
+            Contacts (x, y, F), shape (n, 3), mm and N. Standard deviations of the contacts, shape (n, 3), mm and N.
+            Misfits, shape (n, 1).
         """
         answers = self.predictor.predict_batch(charge)
         contact = np.stack([answers.x_mm, answers.y_mm, answers.force_N], axis=1)

@@ -199,8 +199,8 @@ def _whitened_slopes(problem: CalibrationProblem, parameters: Array, contact: Ar
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
     Returns:
-        Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3), and derivatives with respect to the
-        unknowns of the film, shape (n, n_electrode, n_unknown).
+        Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3). Derivatives with respect to the unknowns of
+        the film, shape (n, n_electrode, n_unknown).
     """
     charges = problem.charges
     contact_slopes = charges.by_contact(parameters, contact)

@@ -184,7 +184,7 @@ def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tu
         contact: Contacts (x, y, F), shape (n, 3).
 
     Returns:
-        The values, shape (n, n_electrode), and the derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3).
+        Values, shape (n, n_electrode). Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3).
     """
     x_step, y_step, log_force_step = CONTACT_STEPS
     # One call for the contacts and for the three displaced copies of them.

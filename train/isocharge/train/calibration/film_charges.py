@@ -119,7 +119,8 @@ class FilmCharges(FilmMaps):
         Args:
             unknowns: Parameters and coefficients, as in `film`.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            charge: Charges without modes, traces and discrepancy, shape (n, n_electrode), pC; None to compute them.
+            charge: Charges without modes, traces and discrepancy, shape (n, n_electrode), pC. If None, they
+                are computed.
 
         Returns:
             Factors, shape (n, n_electrode), dimensionless.

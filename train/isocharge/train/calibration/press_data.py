@@ -31,8 +31,8 @@ class PressData:
         measured: Which charges and coordinates were measured, shape (n, n_electrode + 3).
         session_time: Time of each press, from -1/2 for the first press to 1/2 for the last, shape (n,), dimensionless.
         warming_K: Temperature of each press less the mean temperature, shape (n,), K.
-        film_excess_K: Temperature of the film above that of its ring during each press, less the mean of this
-            difference, shape (n,), K; zero if the temperature of the film was not measured.
+        film_excess_K: Temperature difference between film and ring during each press, minus the mean of this
+            difference, shape (n,), K. Zero if the temperature of the film was not measured.
         tension_change: Pretension during each press less that of the film, shape (n,), MPa.
         friction_charge: Charges by friction over the coefficient of friction, shape (n, n_electrode), pC; zero for
             presses without friction.

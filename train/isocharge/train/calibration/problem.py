@@ -266,8 +266,8 @@ class CalibrationProblem:
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
             added_variance: Variances that are added to those of the network.
-            factor: Function that returns the factors on the charges, shape (n, n_electrode), at contacts (x, y, F),
-                shape (n, 3), mm and N.
+            factor: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns factors on the charges, shape (n,
+                n_electrode).
             release: Whether the network will be released. Only a network that will be released learns correlations and
                 gets presses on which its errors are measured.
         """

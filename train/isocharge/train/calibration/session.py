@@ -98,7 +98,7 @@ def _with_unknown(temperatures_C: Array | None) -> Array | None:
         temperatures_C: Temperatures, shape (n,), degrees Celsius; None if no temperatures are measured.
 
     Returns:
-        Temperatures, shape (n + 1,), of which the last one is NaN; None if no temperatures are measured.
+        Temperatures, shape (n + 1,). The last one is NaN. None if no temperatures are measured.
     """
     if temperatures_C is None:
         return None
@@ -314,7 +314,7 @@ class PressSession:
 
 
 def describe_press(contact: Array) -> str:
-    """Describe a contact (x, y, F), shape (3,), mm and N, NaN where unknown, as in "1.65 N at (3.0, 2.5) mm"."""
+    """Describe a contact (x, y, F), shape (3,), mm and N, as in "1.65 N at (3.0, 2.5) mm". Unknown values are NaN."""
     x, y, force = contact.tolist()
     force_text = "an unknown force" if math.isnan(force) else f"{force:.2f} N"
     place_text = "an unknown place" if math.isnan(x) else f"({x:.1f}, {y:.1f}) mm"

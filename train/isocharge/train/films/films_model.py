@@ -176,9 +176,10 @@ class FilmsModel:
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
             provenance: Additional information for the release.
-            charge_factor: Function from contacts (x, y, F), shape (n, 3), mm and N, to factors of the charges, shape
-                (n, n_electrode), by which the film differs from the simulated film. The first and the last layer of the
-                network are then changed, and its standard deviations are fitted to the remaining errors.
+            charge_factor: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns factors, shape (n,
+                n_electrode), by which the charges of the film differ from those of the simulated film. The first and
+                the last layer of the network are then changed, and its standard deviations are fitted to the remaining
+                errors.
             added_variance: Variances that are added to those of the network, for example because the parameters of the
                 film are uncertain.
             correlation: Whether to fit the correlations, which takes one or two seconds.

@@ -117,7 +117,7 @@ def _draw_presses(films: FilmsModel, true_films: Array, n_press: int, rng: np.ra
         rng: Random number generator.
 
     Returns:
-        Contacts (x, y, F), shape (n_film, n_press, 3), mm and N, and charges, shape (n_film, n_press, n_electrode), pC.
+        Contacts (x, y, F), shape (n_film, n_press, 3), mm and N. Charges, shape (n_film, n_press, n_electrode), pC.
     """
     contacts = []
     noisy_charges = []

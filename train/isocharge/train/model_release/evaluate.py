@@ -15,8 +15,8 @@ from isocharge.train.training.fitted import Fitted
 Predict = Callable[[Array], tuple[Array, Array, Array]]
 """Function that estimates contacts from charges.
 
-The argument has the shape (n, n_electrode), pC. The results are contacts (x, y, F), shape (n, 3), mm and N, standard
-deviations of the contacts, shape (n, 3), and misfits, shape (n, 1)."""
+The argument has the shape (n, n_electrode), pC. The results are the contacts (x, y, F), shape (n, 3), mm and N, the
+standard deviations of the contacts, shape (n, 3), and the misfits, shape (n, 1)."""
 
 FALSE_ALARM_RATE = 0.01
 """Fraction of good presses whose misfit exceeds the threshold of the alarm, dimensionless."""

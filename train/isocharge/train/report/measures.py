@@ -60,7 +60,7 @@ class ContactErrors:
         """Compute the errors of estimated contacts.
 
         Args:
-            estimate: Estimated contacts (x, y, F), shape (n, 3), mm and N; NaN where there is no estimate.
+            estimate: Estimated contacts (x, y, F), shape (n, 3), mm and N. Presses without an estimate are NaN.
             truth: True contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:

@@ -35,8 +35,8 @@ class FittedMethod:
 
     Attributes:
         method: The fitted method.
-        estimate: Estimated contacts (x, y, F) of the test presses, shape (n, 3), mm and N; NaN where the method has no
-            estimate.
+        estimate: Estimated contacts (x, y, F) of the test presses, shape (n, 3), mm and N. Presses without an estimate
+            are NaN.
         fit_seconds: Duration of fitting, s.
     """
 
@@ -99,8 +99,8 @@ def measure_methods(
         fitted_methods: The fitted methods with their estimates.
         test: The test presses, with the noise in their charges.
         settings: Settings of the report: the time for timing and the size of a batch.
-        posterior_mean: Posterior means (x, y, F) of the first m test presses, shape (m, 3), mm and N, whose error is
-            the Bayes limit; None if the limit was not computed.
+        posterior_mean: Posterior means (x, y, F) of the first m test presses, shape (m, 3), mm and N. Their error is
+            the Bayes limit. None if the limit was not computed.
 
     Returns:
         The records of the methods, in the order of `fitted_methods`.
@@ -183,7 +183,7 @@ def _method_record(
         fitted: Fitted method and its estimates of the contacts.
         truth: True contacts, shape (n, 3), mm and N.
         posterior_mean: Posterior means of the first m contacts, shape (m, 3), mm and N, for the ratio of the error to
-            the Bayes limit; None if they are not computed.
+            the Bayes limit. None if the means are not computed.
         single_timing: Time of the prediction of one press.
         batch_timing: Time of the prediction of many presses.
     """

@@ -80,8 +80,8 @@ def errors_by_force(
     Args:
         domain: The range of forces.
         truth: True contacts (x, y, F), shape (n, 3), mm and N.
-        estimates: Estimated contacts of the first m presses, shape (m, 3), mm and N, by the name of the method; NaN
-            where there is no estimate.
+        estimates: Estimated contacts of the first m presses by the name of the method, shape (m, 3), mm and N. Presses
+            without an estimate are NaN.
         cramer_rao_mm: Cramér-Rao limit of the position, shape (n,), mm.
 
     Returns:

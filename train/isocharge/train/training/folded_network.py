@@ -100,8 +100,8 @@ class FoldedNetwork:
             charge: Shape (n, n_electrode), pC.
 
         Returns:
-            Contact and standard deviations as `predict` returns them; the correlations, shape (n, 3), if the network
-            gives them; the misfit, shape (n, 1).
+            Contacts and standard deviations as `predict` returns them. Correlations, shape (n, 3), if the network gives
+            them. Misfits, shape (n, 1).
         """
         return self.outputs_from_answers(self.answers(charge))
 

@@ -24,8 +24,8 @@ class Teacher:
     Attributes:
         label: Name and version of the model.
         sha256: Checksum of the model file.
-        answer: Function from charges, shape (n, n_electrode), pC, to contacts, shape (n, 3), mm and N, and their
-            standard deviations, shape (n, 3).
+        answer: Function of charges, shape (n, n_electrode), pC. It returns contacts, shape (n, 3), mm and N, and the
+            standard deviations of the contacts, shape (n, 3).
     """
 
     label: str

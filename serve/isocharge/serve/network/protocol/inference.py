@@ -388,8 +388,8 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
         names: Names of the requested outputs.
 
     Returns:
-        The outputs by name, each of shape (n, width); the number of presses whose misfit was not computed, because it
-        was not requested; and the number of presses whose misfit is NaN or above the limit of the model.
+        Outputs by name, each of shape (n, width). Number of presses whose misfit was not computed, because it was not
+        requested. Number of presses whose misfit is NaN or above the limit of the model.
 
     Raises:
         ModelError: If onnxruntime fails to run the graph.
