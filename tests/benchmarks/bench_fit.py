@@ -31,7 +31,6 @@ from isocharge.simulate import Circle, Domain, Sweep, load_sensor, noise_model
 from isocharge.train import LabelledPresses, NetworkConfig, TrainingConfig
 from isocharge.train.baselines.learned import SubsetProcess, on_logarithms
 from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
-from isocharge.train.films.muon import muon_and_adam
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fit import contact_stage, threads_and_seed
@@ -42,6 +41,12 @@ NOISE = noise_model("reference")
 FORMER_BATCH = 1024
 FORMER_RATE = 5e-3
 FORMER_WARM_UP_FRACTION = 0.15
+FORMER_MUON_RATE_FACTOR = 6.0
+"""Learning rate of Muon, relative to that of Adam. The size of a step of Muon does not depend on the gradient."""
+
+FORMER_ADAM_BETAS = (0.9, 0.98)
+"""Decay rates of Adam's moving averages of the gradient and of its square."""
+
 N_COPIES = 4
 """Number of copies of the presses with noise from which the regressors of scikit-learn learn."""
 
@@ -119,6 +124,25 @@ def present_training(case: Case, steps: int) -> Predict:
         stage = contact_stage(network, case.train, case.validation(), NOISE, config)
         Descent(stage, config.learning_rate, config.patience, config.seed).run()
     return predictor(network)
+
+
+def muon_and_adam(stage: TrainingStage) -> list[torch.optim.Optimizer]:
+    """Return Muon (Jordan et al., 2024) for the weights between hidden layers, and Adam for all other weights.
+
+    The learning rate of each optimiser is the rate of the stage times its `rate_factor`.
+
+    Args:
+        stage: The training of a `TrainablePerceptron`.
+    """
+    network = stage.network
+    assert isinstance(network, TrainablePerceptron)
+    hidden_matrices = network.hidden_matrices()
+    # Tensors are compared by identity, because == compares their elements.
+    hidden_ids = {id(matrix) for matrix in hidden_matrices}
+    other_parameters = [parameter for parameter in network.parameters() if id(parameter) not in hidden_ids]
+    muon = torch.optim.Muon([{"params": hidden_matrices, "rate_factor": FORMER_MUON_RATE_FACTOR}], weight_decay=0.0)
+    adam = torch.optim.Adam([{"params": other_parameters, "rate_factor": 1.0}], betas=FORMER_ADAM_BETAS)
+    return [muon, adam]
 
 
 def former_training(case: Case, steps: int) -> Predict:

@@ -180,11 +180,6 @@ class ConditionalPerceptron(nn.Module):
         *hidden, last = layers
         return Perceptron(tuple(hidden), last, skip, self.activation)
 
-    def hidden_matrices(self) -> list[Tensor]:
-        """Return the constant weights between hidden layers."""
-        _, *between, _ = self.constant
-        return between
-
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the weights by name, as `ConditionalWeights` takes them."""
         return {name: values.detach().double().numpy() for name, values in self.state_dict().items()}

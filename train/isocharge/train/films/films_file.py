@@ -40,7 +40,7 @@ FILE = "films.npz"
 FORMAT = 1
 """Version of the file's format."""
 
-BITS = 12
+BITS = 14
 """Number of bits of a weight, including its sign. The largest weight of a row has the largest integer."""
 
 FILE_UNITS = {"pretension": 1e6, "shift": 1e-3, "probe_radius": 1e-3}

@@ -32,7 +32,6 @@ from isocharge.train.films.films_data import (
     draw_near_films,
 )
 from isocharge.train.films.films_model import ConditionalWeights, FilmsModel
-from isocharge.train.films.muon import muon_and_adam
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fit import WARM_UP_FRACTION, threads_and_seed
 from isocharge.train.training.folded_network import LOG_STD, MEAN, N_CONTACT_ANSWERS
@@ -93,7 +92,7 @@ class FilmsConfig:
         misfit_steps: Number of optimiser steps of the misfit network.
         batch_films: Number of films in a batch.
         batch_presses: Number of presses on each film of a batch.
-        learning_rate: Largest learning rate of Adam; that of Muon is a multiple of it.
+        learning_rate: Largest learning rate of the optimiser SOAP.
         noise: Name of the noise model. The noise is drawn again in every step.
         seed: Seed of films, presses, weights, batches and noise.
     """
@@ -106,14 +105,14 @@ class FilmsConfig:
     films: int = 4096
     presses: int = 128
     watched: int = 64
-    steps: int = 22_000
+    steps: int = 8_000
     misfit_films: int = 320
     misfit_charges: int = 160
     near_films: int = 768
-    misfit_steps: int = 9_000
+    misfit_steps: int = 4_000
     batch_films: int = 32
     batch_presses: int = 64
-    learning_rate: float = 4e-3
+    learning_rate: float = 3e-3
     noise: str = "reference"
     seed: int = 0
 
@@ -234,7 +233,6 @@ def _new_perceptron(
 
 def _train_stage(stage: TrainingStage, config: FilmsConfig, run: ResumableRun | None) -> None:
     """Train without early stopping, because the last steps of the schedule have the smallest loss."""
-    stage = replace(stage, optimisers=muon_and_adam)
     Descent(stage, config.learning_rate, stage.steps, config.seed).run(run)
 
 
