@@ -61,6 +61,17 @@ def test_killed_worker_process_raises_workers_lost_and_the_run_can_be_resumed(tm
     assert sweep_with(None, tmp_path / "presses") == expected
 
 
+def test_pool_ends_if_its_workers_are_killed_while_large_jobs_are_being_sent():
+    """A pipe holds 64 KiB, so a job of 4 MiB is still being sent when the workers end."""
+    jobs = [bytes(4 << 20)] * 20
+    with pytest.raises(WorkersLost, match="a worker process ended unexpectedly"), local_workers(2) as executor:
+        list(in_order(executor, kill_this_process, jobs))
+
+
+def kill_this_process(_: bytes) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def test_in_order_returns_results_in_order_and_consumes_jobs_as_needed():
     drawn = []
 

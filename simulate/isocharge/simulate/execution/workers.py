@@ -14,7 +14,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future,
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import Connection
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from isocharge.common.errors import InputError, WorkersLost
 from isocharge.common.extras import require
@@ -134,11 +134,25 @@ def local_workers(count: int) -> Iterator[Executor | None]:
         yield pool
     except BaseException:
         parent_end.close()  # this also ends workers that are still computing
+        _close_job_pipe(pool)
         raise
     finally:
         pool.shutdown(cancel_futures=True)
         parent_end.close()
         worker_end.close()
+
+
+def _close_job_pipe(pool: ProcessPoolExecutor) -> None:
+    """Close the reading end of the pipe through which a process pool sends jobs to its workers.
+
+    If the workers end while a job that is larger than the pipe is being sent, `ProcessPoolExecutor.shutdown` waits
+    forever in early releases of Python 3.11, because this process itself holds a reading end
+    (https://github.com/python/cpython/issues/94777). After the reading end is closed, the sending fails and the
+    shutdown completes. Later releases of Python close it themselves.
+    """
+    job_queue: Any = getattr(pool, "_call_queue")  # noqa: B009 (mypy does not know this attribute)
+    if job_queue is not None:
+        job_queue._reader.close()
 
 
 def _initialise_worker(worker_end: Connection) -> None:
