@@ -176,16 +176,20 @@ def search(
         chunk = slice(chunk_start, chunk_start + CHUNK)
         nearest_candidates.append(_nearest_rows(charge[chunk], sigma[chunk], candidate_charges, is_neighbour, starts))
 
-    # One descent from the nearest candidate of each row of charges, one from the second nearest, and so on
+    # One descent from the nearest candidate of each row of charges, one from the second nearest, and so on. They run
+    # together, because the charge map is faster for many contacts at once.
     candidates_of_descents = np.concatenate(nearest_candidates).T  # shape (starts, n)
-    solutions = [
-        explain(charge_map, charge, sigma, candidate_contacts[index], min_change=min_change)
-        for index in candidates_of_descents
-    ]
+    contact, residual = explain(
+        charge_map,
+        np.tile(charge, (starts, 1)),
+        np.tile(sigma, (starts, 1)),
+        candidate_contacts[candidates_of_descents.ravel()],
+        min_change=min_change,
+    )
 
     # Choose the descent with the smallest residual for each row of charges.
-    contacts = np.stack([contact for contact, _ in solutions])  # shape (starts, n, 3)
-    residuals = np.stack([residual for _, residual in solutions])  # shape (starts, n, n_electrode)
+    contacts = contact.reshape(starts, len(charge), 3)
+    residuals = residual.reshape(starts, *charge.shape)
     best_start = (residuals**2).sum(axis=2).argmin(axis=0)
     row = np.arange(len(charge))
     return contacts[best_start, row], residuals[best_start, row]

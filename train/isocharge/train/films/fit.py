@@ -12,6 +12,7 @@ from torch import Tensor
 from isocharge.common.activations import ACTIVATIONS, TANH, Activation
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.progress import second_thread
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.simulate import Domain, NoiseModel, noise_model
 from isocharge.simulate.forward.film_family import FilmFamily
@@ -131,8 +132,9 @@ def fit_films(
 ) -> FilmsModel:
     """Train a network for films drawn from a prior.
 
-    The forward maps of the films are simulated first. The contact perceptron is then trained on presses on drawn films,
-    and the misfit perceptron on charges of every kind and on good presses.
+    The forward maps of the films are simulated first. A second thread then trains the contact perceptron on presses on
+    drawn films. At the same time, this thread draws charges of every kind and good presses, and trains the misfit
+    perceptron on them.
 
     Args:
         prior: Distribution of the films: the described sensor, the probe and the standard deviations of the parameters.
@@ -155,7 +157,7 @@ def fit_films(
         """Return an executor that saves the results of its tasks in the run, if there is a run."""
         return executor if run is None else run.storing_executor(name, executor)
 
-    with threads_and_seed(1, config.seed):
+    with threads_and_seed(1, config.seed), second_thread() as thread:
         domain = Domain(config.radius, config.force_range)
         family = _build_family(prior, config, saving_executor("family"))
         presses = draw_film_presses(
@@ -163,10 +165,16 @@ def fit_films(
         )
         inputs = FilmInputs.fit(FilmScaling(prior, domain), presses)
         activation = ACTIVATIONS[config.activation]
-
+        n_electrode = inputs.mean.size
         contact_perceptron = _new_perceptron(inputs, config.hidden, N_CONTACT_ANSWERS, activation)
-        _train_stage(contact_stage(contact_perceptron, inputs, presses, noise, config), config, run)
+        misfit_perceptron = _new_perceptron(inputs, config.misfit_hidden, n_electrode, activation)
 
+        # Second thread: train the contact perceptron
+        contact_training = thread.submit(
+            _train_stage, contact_stage(contact_perceptron, inputs, presses, noise, config), config, run
+        )
+
+        # This thread: draw the examples for the misfit perceptron, and train it
         source = FilmsSource(prior, family, domain, misfit_noise(noise))
         examples = draw_misfit_films(
             source, config.misfit_films, config.misfit_charges, config.seed, saving_executor("nearest-contacts")
@@ -174,9 +182,8 @@ def fit_films(
         good_presses = draw_near_films(
             source, config.near_films, config.presses, config.seed, saving_executor("good-presses")
         )
-        n_electrode = inputs.mean.size
-        misfit_perceptron = _new_perceptron(inputs, config.misfit_hidden, n_electrode, activation)
         _train_stage(misfit_stage(misfit_perceptron, inputs, examples, good_presses, source.noise, config), config, run)
+        contact_training.result()
     return FilmsModel(
         family=family,
         scaling=inputs.scaling,
