@@ -221,7 +221,7 @@ def _reassigned_settings(section: Any, source_electrode: Mapping[str, str]) -> A
 
 
 class _Blocks:
-    """Reader of a port that averages the values of some channels over blocks of `BLOCK_S`."""
+    """Reads a port, and averages the values of some channels over blocks of `BLOCK_S`."""
 
     def __init__(self, port: Port, device: Device, channels: list[str]) -> None:
         """Begin without data.

@@ -261,7 +261,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     def encode(self, frame: Frame) -> bytes:
         """Return the bytes that a board sends for a frame, with byte stuffing and delimiter.
 
-        The values are assigned to the channels in their order.
+        The first value of the frame belongs to the first channel, the second value to the second channel, and so on.
 
         Raises:
             ValueError: If the frame has another number of values than there are channels, or a value is not a number.
@@ -275,7 +275,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     def encode_unstuffed(self, frame: Frame) -> bytes:
         """Return the bytes of a frame without byte stuffing and without delimiter.
 
-        The values are assigned to the channels in their order.
+        The first value of the frame belongs to the first channel, the second value to the second channel, and so on.
 
         Raises:
             ValueError: If the frame has another number of values than there are channels, or a value is not a number.

@@ -170,7 +170,7 @@ class PressWatch:
         self._sizes: list[tuple[float, float]] = []  # time since the touch and mean charge of each calm window
 
     def arm(self) -> None:
-        """Ignore the present press, and accept only the next press."""
+        """Ignore the press that is in progress, and wait for the next press."""
         if self._phase is Phase.settling:
             self._phase = Phase.lift
 

@@ -1,9 +1,9 @@
 """ONNX sessions: opening them, checking their interface, running them, and converting charges for them.
 
 A network of this size takes microseconds. A session therefore uses one thread, because a second thread would cost more
-time than it saves. A session also does not spin between runs. With the default of onnxruntime, a stream of 100 frames
-per second would keep most of a core busy. `BoundPress` is the fastest way to compute one press, because its input and
-output memory is bound to the session once.
+time than it saves. Between two runs, the session sleeps. By default, onnxruntime would wait actively, and a stream of
+100 frames per second would keep most of a core busy. `BoundPress` is the fastest way to compute one press, because its
+input and output memory is bound to the session once.
 
 Charges must be finite numbers in the order of the electrodes. The fast checks are `write_finite` for plain numbers and
 `as_float32` for arrays. If a fast check fails, the numbers are checked one by one, so that the error names the

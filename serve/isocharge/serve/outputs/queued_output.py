@@ -41,7 +41,7 @@ class QueuedOutput:
         return self._queue.lost
 
     def write(self, record: PredictionRecord) -> None:
-        """Append a record to the queue. If an error of the other output ends the stream, raise this error."""
+        """Append a record to the queue, or raise the error of the other output if this error ends the stream."""
         self._queue.put(record)
 
     def close(self) -> None:

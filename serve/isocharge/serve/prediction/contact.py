@@ -52,8 +52,8 @@ class Contact(NamedTuple):
     def widened(self, shift: tuple[float, float, float]) -> "Contact":
         """Return the contact with larger standard deviations, which include an additional, independent error.
 
-        A single error changes x, y and the force, so their changes are fully correlated. The covariances of these
-        changes are therefore added, too.
+        A single error changes x, y and the force together, so their changes are fully correlated. The correlations of
+        the contact therefore change as well.
 
         Args:
             shift: Changes of x and y, mm, and of the force, N, that one standard deviation of the error causes.

@@ -2,8 +2,8 @@
 
 Every division of the bytes into fields has a score in bits. The score is the sum of two numbers: the bits that are
 needed to encode the values of a frame after the previous frame, and the `Weights` of the fields. The division with the
-lowest score is chosen. With these weights, simple divisions have lower scores than complicated ones. An example of a
-simple division is one whose channels are adjacent and have the same type.
+lowest score is chosen. With these weights, simple divisions have lower scores than complicated ones. For example, a
+division is simple if its channels are adjacent and have the same type.
 `tests/benchmarks/fit_recognition.py` fits the weights on random boards.
 """
 

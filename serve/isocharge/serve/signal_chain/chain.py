@@ -12,8 +12,8 @@
 - `PressFlags` flags saturated presses, and charges below zero.
 - `Warming` estimates the common charge of a warming film with the model, and subtracts it.
 
-A frame with a value that cannot be a charge is not processed by the stages. The time of such a frame is added to the
-time of the next frame.
+If a value of a frame cannot be a charge, the stages skip the frame. The time since the frame before it is then counted
+with the next frame.
 """
 
 import math

@@ -9,8 +9,9 @@ where i is the innovation and b is the inflow (pC/s), the current that flows in 
 warming. The inflow is estimated from the innovation. An estimate from the output v would diverge. The inflow is
 estimated only out of contact, where the innovation consists of b dt and noise.
 
-Three rules keep the frames of a touch from changing the inflow. Each innovation is clipped. During a touch, the inflow
-that was estimated `look_back_s` before the touch is used. After a release, the estimate pauses for `hold_off_s`.
+Frames of a touch must not change the estimated inflow, so there are three rules. Each innovation is clipped. During a
+touch, the inflow that was estimated `look_back_s` before the touch is used. After a release, the estimate pauses for
+`hold_off_s`.
 
 While nothing touches the film, the computed touch charge decays exponentially to zero. Any charge at that time is an
 error, or comes from a slow warming of the film.

@@ -178,8 +178,9 @@ def undo_memory(
 ) -> Memory:
     """Compute the touch charge of the next frame, and return the state after this frame.
 
-    The touch charge is `leak.charge_pC` of the state. During a touch, the remaining state is predicted. Out of contact,
-    the warmth and its slope, the inflow of the amplifiers, and the scale factors of the film are updated.
+    The touch charge is `leak.charge_pC` of the state. During a touch, the other parts of the state are only predicted.
+    Out of contact, the warmth and its slope, the inflow of the amplifiers, and the scale factors of the film are
+    updated.
 
     Args:
         rule: Memory of the film.

@@ -79,7 +79,7 @@ class ReaderEnd(LinkEnd):
             self.is_open = False
 
     def enable_waiting(self) -> None:
-        """Let sending wait while the pipe is full.
+        """Wait from now on, instead of discarding data, if the pipe is full when data are sent.
 
         The stream of a recording waits, so that all samples of the recording are shown.
         """

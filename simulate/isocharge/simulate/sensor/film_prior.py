@@ -176,7 +176,7 @@ class PretensionParameter(FilmParameter):
         return 0.5 * prior.spread.pretension
 
     def std(self, prior: "FilmPrior") -> float:
-        """Return the standard deviation of the uniform distribution."""
+        """Return the standard deviation of the pretension: the width of its range divided by the root of 12."""
         return prior.spread.pretension / float(np.sqrt(12.0))
 
     def bounds(self, prior: "FilmPrior") -> tuple[float, float]:

@@ -51,7 +51,7 @@ class StressField:
 def _tension(direction: tuple[float, float, float]) -> Change:
     """Return the function that adds a tension to the pretension of a film.
 
-    The unit of the tension is the sum of E A^2 and the mean pretension.
+    The tension is stated as a multiple of E A^2 plus the mean pretension.
 
     Args:
         direction: Components (T11, T22, T12) of one unit.

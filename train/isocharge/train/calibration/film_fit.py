@@ -226,7 +226,7 @@ def _degrees_of_freedom(data: PressData) -> Array:
 
 
 def _is_suspicious(chi2: Array, degrees_of_freedom: Array) -> bool:
-    """Return whether a single press or all presses together have larger residuals than noise explains.
+    """Return whether the residuals of a single press, or of all presses together, are too large to be noise.
 
     Args:
         chi2: Sum of squared residuals of each press, shape (n,).

@@ -458,7 +458,7 @@ class FitProblem:
     def _force_derivative(self, unknowns: Array, data: PressData, contacts: AdjustedContacts) -> Array:
         """Return the derivatives of the residuals with respect to the stated force, shape (n, n_electrode + 3).
 
-        The contacts are adjusted to the stated force.
+        If the stated force changes, the adjusted contacts change, too. The derivatives include this change.
 
         Args:
             unknowns: Unknowns of the film, shape (n_unknown,).

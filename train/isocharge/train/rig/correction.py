@@ -3,8 +3,8 @@
 The correction is a factor on the charge of each electrode. The logarithm of this factor is a sum of the polynomials of
 `calibration.discrepancy` in the place and the logarithm of the force. The covariance of the residuals contains the
 noise of the charges. The covariance also contains the errors of the measured places and forces, which are converted to
-charges with the derivatives of the map. The probability of several sizes of the correction is computed. If the size
-zero is the most probable, the charges are not corrected.
+charges with the derivatives of the map. Several sizes of the correction are tried, and the most probable size is used.
+If the most probable size is zero, the charges are not corrected.
 """
 
 from dataclasses import dataclass

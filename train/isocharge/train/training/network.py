@@ -209,8 +209,8 @@ class InverseNetwork(nn.Module):
     def posterior_with_angles(self, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Compute the posterior with the angles of its correlations (`isocharge.train.training.correlation`).
 
-        The angles are learned so that the hidden layers represent the correlations. The released angles are fitted to
-        the hidden layers after the training.
+        The angles are trained together with the network, so that the hidden layers contain the information about the
+        correlations. The angles of a released model are fitted to the hidden layers after the training.
 
         Args:
             charge: Shape (n, n_electrode), pC.

@@ -106,7 +106,7 @@ class Handler:
         self._service = Service(store, self.limits, metrics, partial(openapi_document, ROUTES, store))
 
     def may_block(self, path: str) -> bool:
-        """Return whether an answer to this path may take so long that other requests should not wait for it."""
+        """Return whether the response for this path may take long, so that it must not delay other requests."""
         route = match_path(path).route
         return route is not None and route.may_block
 

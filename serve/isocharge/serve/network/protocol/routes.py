@@ -277,9 +277,9 @@ def _infer(request: Request) -> Response:
 
 
 def model_paths(ending: str = "") -> tuple[str, str]:
-    """Return the two paths of a route for a model.
+    """Return the two paths at which a request for a model is accepted, as templates.
 
-    The first path contains the name of the model, and the second path also its version.
+    The first path contains the name of the model. The second path contains the name and the version.
     """
     return f"/v2/models/{{model}}{ending}", f"/v2/models/{{model}}/versions/{{version}}{ending}"
 
