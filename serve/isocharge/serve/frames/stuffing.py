@@ -64,7 +64,8 @@ def cobs_decode(data: bytes) -> bytes:
     """Decode bytes that `cobs_encode` has encoded.
 
     The data consist of blocks. Each block begins with a distance byte, which is followed by distance - 1 bytes of the
-    result. Between two blocks, the result has a zero, unless the first of them has the largest distance.
+    result. A zero is inserted between the contents of two blocks, unless the distance byte of the first block has its
+    largest value.
 
     Raises:
         ValueError: If a distance points beyond the end, or `data` contains a zero.

@@ -95,7 +95,7 @@ class ChannelPicker:
         )
 
     def _position(self, electrode: str, frame: Frame) -> int:
-        """Return the position of the channel that the device file assigns to an electrode.
+        """Return the index of the channel that the device file assigns to an electrode.
 
         Args:
             electrode: Name of the electrode.

@@ -45,7 +45,7 @@ class QueuedOutput:
         self._queue.put(record)
 
     def close(self) -> None:
-        """Write the waiting records for as long as the consumer accepts them, and close the other output.
+        """Write the waiting records until the consumer no longer accepts them, and close the other output.
 
         If the other output has failed, it is discarded instead.
         """

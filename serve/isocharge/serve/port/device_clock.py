@@ -122,8 +122,8 @@ class DeviceClock:
     def arrived(self, arrival_s: float) -> None:
         """Fit the clock to the arrival of a chunk. The last reading of the chunk must be the latest reading.
 
-        The chunks of a file all arrive at the same time, so an arrival is used only if it differs from the previous
-        arrival.
+        If the readings come from a file, all chunks have the same arrival time. An arrival time is therefore used only
+        if it differs from the previous one.
 
         Args:
             arrival_s: Arrival of the chunk, unix seconds.

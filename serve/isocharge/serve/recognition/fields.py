@@ -57,7 +57,7 @@ def steady_step(step: Array) -> float:
 
 
 def clock_of(step: Array, rate_Hz: float) -> tuple[str, float] | None:
-    """Return the name of a clock field, such as `t_us`, and the duration of one tick in the unit of this name.
+    """Return the name of a clock field, such as `t_us`, and the duration of one tick in the unit of the name, here us.
 
     Args:
         step: Differences of the values of consecutive frames, shape (n,).

@@ -168,7 +168,7 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
 
     @property
     def json_values(self) -> dict[str, Any]:
-        """The values of the record for JSON by name. Numbers are rounded to six decimals."""
+        """The values of the record by name, as they are written to JSON. Numbers are rounded to six decimals."""
         values = structs.asdict(self)
         if self.tracking is not None:
             values |= structs.asdict(self.tracking)

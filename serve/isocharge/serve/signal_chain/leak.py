@@ -139,8 +139,8 @@ def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array,
     """Return the state with a corrected inflow.
 
     The inflow follows the mean of the surplus over `settle_s`. Large surpluses are clipped, because touches cause large
-    surpluses. The latest inflow may contain the beginning of a touch. Every `look_back_s`, the inflow is therefore
-    stored as the candidate, and the previous candidate becomes the trusted inflow.
+    surpluses. The beginning of an undetected touch may have changed the latest inflow. Every `look_back_s`, the inflow
+    is therefore stored as the candidate, and the previous candidate becomes the trusted inflow.
 
     Args:
         rule: Settings of the estimate of the inflow.

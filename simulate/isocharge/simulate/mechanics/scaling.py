@@ -154,7 +154,7 @@ class DimensionlessGroups:
     def height(self) -> float:
         """Approximate deflection of the centre in units of a A.
 
-        The approximate deflection is one if the back of the film is vented and `of` computes the groups with bending.
+        The value is 1 if the back of the film is vented and the groups were computed by `of` with bending.
         """
         linear = MEMBRANE_STIFFNESS * max(self.tension, 0.0) + PLATE_STIFFNESS * self.bending
         air = AIR_SHAPE * self.ambient_pressure * self.compression

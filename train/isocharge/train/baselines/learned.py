@@ -1,8 +1,8 @@
 """Regressors of scikit-learn with common transformers of the charges and of the contacts.
 
 The inputs are whitened logarithms of the charges. The first principal axis is mostly the mean logarithm, which depends
-on the force. The next two axes are mostly logarithms of ratios, which depend on the position. A fourth charge adds an
-axis that is mostly noise. The targets are x, y and ln F, scaled to [-1, 1].
+on the force. The next two axes are mostly logarithms of ratios, which depend on the position. With a fourth electrode,
+there is one more axis, which is mostly noise. The targets are x, y and ln F, scaled to [-1, 1].
 """
 
 from typing import Any

@@ -1,8 +1,8 @@
 """Presses outside the working area, for training the misfit network and for measuring its detection rate.
 
 The charges come from the coarse map of the whole film. The error of this map is a few percent near the clamp and does
-not matter. The misfit network is trained with the exact misfit of these charges. The fractions of presses that are
-measured hardly depend on the error.
+not matter. The misfit network is trained with the exact misfit of these charges. The error hardly changes the measured
+fractions of presses without a flag.
 """
 
 import logging
