@@ -1,7 +1,7 @@
 """Measurement of the duration of calls.
 
-A contender is one way to predict, such as a method of the predictor. The contenders are measured in turns, so that all
-of them are affected equally if the machine becomes slower or faster.
+A contender is one of the ways to predict that are compared, such as a method of the predictor. The contenders are
+measured in turns, so that all of them are affected equally if the machine becomes slower or faster.
 """
 
 import os

@@ -22,7 +22,7 @@ contains the bits of `isocharge.serve.frames.frame`. All other fields are channe
 
 If the checksum of a frame with a sync pattern is wrong, the parser searches for the pattern again from the next byte.
 The pattern may have occurred by chance inside the data, and an intact frame may begin there. Stuffed frames end at
-their delimiter, and a datagram contains only whole frames. Damaged pieces and datagrams are dropped as a whole.
+their delimiter, and a datagram contains only whole frames. If a piece or a datagram is damaged, all of it is dropped.
 """
 
 import struct

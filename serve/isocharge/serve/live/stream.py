@@ -1,6 +1,6 @@
 """The stream that computes prediction records from chunks of bytes.
 
-Each record has the charges of a frame and its contact.
+Each record has the charges of a frame and the contact that was computed from them.
 """
 
 import math

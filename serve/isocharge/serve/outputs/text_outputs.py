@@ -68,7 +68,7 @@ class TextFile:
             self._write_line(header)
 
     def write(self, record: PredictionRecord) -> None:
-        """Write the line of a record; raise OutputError if the disk is full."""
+        """Write one line for a record. Raise OutputError if the disk is full."""
         self._write_line(self._line_of(record))
 
     def close(self) -> None:

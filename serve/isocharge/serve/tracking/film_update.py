@@ -26,7 +26,7 @@ class KalmanUpdate(NamedTuple):
 def kalman_update(
     misfit: Array, jacobian: Array, noise_covariance: Array, mean: Array, covariance: Array
 ) -> KalmanUpdate:
-    """Compute how a good touch changes the estimates of the linear unknowns.
+    """Compute how the charges of a touch that is not an outlier change the estimates of the linear unknowns.
 
     There is one estimate for each level and each pretension.
 

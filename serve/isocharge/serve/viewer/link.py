@@ -59,7 +59,7 @@ class LinkEnd:
 
 @dataclass
 class ReaderEnd(LinkEnd):
-    """The end in the process that reads the port.
+    """The end of the link that belongs to the process that reads the port.
 
     Attributes:
         dropped: Number of samples that were discarded because the pipe was full.

@@ -316,7 +316,7 @@ class Triangulation:
         return crossing
 
     def _distances(self, contact: Array, charge: Array | float, *, fixed: bool) -> tuple[Array, Array]:
-        """Estimate the signed distances of contacts from the contours of given charges, and their derivatives.
+        """Estimate the signed distances from contacts to the contours of given charges, and their derivatives.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.

@@ -83,8 +83,8 @@ class ForceProfile:
     def best(self, terms: Array, charge: Array, noise: NoiseModel) -> Array:
         """Find the force that explains the charges best, by weighted least squares.
 
-        Each step computes the factor by which the predicted charges fit the measured charges best. The exponent of the
-        profile converts this factor into a change of ln F.
+        In each step, the predicted charges are multiplied by the factor with which they fit the measured charges best.
+        The exponent of the profile converts this factor into a change of ln F.
 
         Args:
             terms: Terms of each position, shape (n, n_term, n_electrode).

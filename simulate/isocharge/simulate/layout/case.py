@@ -276,7 +276,7 @@ class DesignCase:
         return square_grid(self.radius, self.radius / FINE_GRID_STEPS)
 
     def weights(self, presses: Array) -> Array:
-        """Return the weights of presses in the goal, shape (n,), for positions of shape (n, 2), mm."""
+        """Return the weights of presses in the minimised quantity, shape (n,), for positions of shape (n, 2), mm."""
         return self.goal.weigh(presses) if isinstance(self.goal, WeightMap) else np.ones(len(presses))
 
     def clearance(self, positions: Array) -> Array:

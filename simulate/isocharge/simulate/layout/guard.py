@@ -53,7 +53,7 @@ LIMIT_ANGLES = 36
 
 @dataclass(frozen=True)
 class PositionLimits:
-    """Cramer-Rao limits of the position over the working area for presses with the force of the case.
+    """Cramer-Rao limits of the position over the working area, for presses with the force that the design case states.
 
     Attributes:
         rms: Root mean square over the working area, mm.

@@ -168,7 +168,10 @@ class Search:
 
     @cached_property
     def presses(self) -> Array:
-        """Presses at which layouts are evaluated, shape (n, 2), mm. Only the largest error needs a fine grid."""
+        """Positions of the presses for which a layout is evaluated, shape (n, 2), mm.
+
+        The grid is fine only if the largest error is minimised.
+        """
         return self.case.fine_grid if self.case.goal == "worst" else self.case.search_presses
 
     @cached_property

@@ -85,7 +85,7 @@ An absent key has the value of the level `like`.
 
 
 def load_amplifier(level: str) -> Amplifier:
-    """Return the amplifier of a level, or read it from a TOML file.
+    """Return the built-in amplifier of a noise level, or an amplifier that is described in a TOML file.
 
     Example of a file:
 
@@ -114,7 +114,7 @@ def load_amplifier(level: str) -> Amplifier:
 
 
 def noise_model(level: str) -> NoiseModel:
-    """Return the noise model of a level, or read it from a TOML file.
+    """Return the built-in noise model of a level, or a noise model that is described in a TOML file.
 
     The file may describe a complete measuring chain (`load_amplifier`). Only the memoryless noise is returned.
 

@@ -200,7 +200,7 @@ def scaled_stress(scaled_strain: Array, groups: DimensionlessGroups) -> Array:
 
 
 def _anisotropy(film: Film, amplitude2: float, angle: float) -> Anisotropy:
-    """Compute the direction-dependent properties of a film, in axes rotated with the press.
+    """Compute the direction-dependent properties of a film, in axes whose first one points to the press.
 
     Args:
         film: The film.

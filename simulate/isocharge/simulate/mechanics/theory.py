@@ -93,7 +93,7 @@ def bending_length(film: Film, force: float) -> float:
 
 
 def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
-    """Estimate the relative change of a charge by bending at the footprint, for a film with pretension.
+    """Estimate the relative change of a charge because the film with pretension bends at the footprint.
 
     The change is proportional to the squared ratio of the bending length to the reach of the footprint. The tension at
     the footprint is the sum of the pretension and of the stress S of a membrane without pretension. With the slope W'

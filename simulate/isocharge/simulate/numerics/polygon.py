@@ -127,7 +127,7 @@ def shared_area(first: Complexes, second: Complexes) -> float:
 
 
 def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float) -> Array:
-    """Compute the area that a polygon has in common with disks.
+    """Compute the area of the intersection of a polygon with each of several disks.
 
     Each edge of the polygon forms a triangle with the centre of the disk. The result is the sum of the signed areas
     that these triangles have in common with the disk. The part of an edge inside the circle contributes a triangle, and

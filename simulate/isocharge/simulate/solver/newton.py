@@ -288,7 +288,7 @@ def _stalled(step_sizes: list[float]) -> bool:
 def _energy_norm(elastic: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
     """Compute the size of a step.
 
-    The size is the square root of a ratio: the energy of the step, divided by the work of the load.
+    The size of a step is the square root of the energy of the step divided by the work of the load.
 
     Args:
         elastic: The discrete film.

@@ -194,8 +194,8 @@ class LocalPlanes:
     def residuals(self, values: Array) -> Array:
         """Compute the differences of values from the nearest point of any plane.
 
-        Only the `CANDIDATES` planes whose centres are nearest are examined for each value. A plane ends at the distance
-        of its farthest neighbour.
+        For each value, only the `CANDIDATES` planes whose centres are nearest to it are examined. A plane ends at the
+        distance of its farthest neighbour.
 
         Args:
             values: The values, shape (m, k).

@@ -68,7 +68,7 @@ ANGLE_SUMS = np.array([[1, 0, 1, 1, 1, 1, 1, 1], [0, 1, -1, 1, -1, -1, 1, 1], [0
 
 
 def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: NoiseModel, seed: int) -> FoldedNetwork:
-    """Add correlations to a network.
+    """Return a network with outputs for the correlations between the errors of x, y and the force.
 
     The network estimates the contacts of presses with noise, and the angles of the correlations are fitted to the
     errors of these estimates. The angles depend only on the input features and on hidden units that influence the

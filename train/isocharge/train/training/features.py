@@ -56,8 +56,8 @@ class WhitenedFeatures:
 def logarithmic_features(mean_logarithm: Array) -> ChargeFeatures:
     """Return features for positive charges.
 
-    The typical charge is the power of two next to the geometric mean. The division by a power of two is exact in
-    float32, and the logarithms are then small enough to keep their digits.
+    The typical charge is the power of two that is nearest to the geometric mean. The division by a power of two is
+    exact in float32, and the logarithms are then small enough to keep their digits.
 
     Args:
         mean_logarithm: Mean of the logarithms of the charges in pC, shape (n_electrode,).
@@ -70,7 +70,7 @@ def logarithmic_features(mean_logarithm: Array) -> ChargeFeatures:
 
 
 def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
-    """Return features for charges of both signs: inverse hyperbolic sines of the charges over typical charges.
+    """Return features for charges of both signs: inverse hyperbolic sines of the charges divided by typical charges.
 
     Charges are limited to the range of the given charges, enlarged by a margin on both sides.
 

@@ -313,7 +313,8 @@ def contact_stage(
         """Return the loss of a random batch with new noise.
 
         The first steps use the warm-up loss. The later steps use the loss of mean and standard deviations plus the loss
-        of the correlations. With a teacher, the targets are its outputs for the same charges.
+        of the correlations. If there is a teacher network, the targets are the outputs of the teacher for the same
+        charges.
         """
         rows = torch.randint(len(charge), (batch,), generator=random)
         noisy = with_fresh_noise(charge[rows], noise, random)

@@ -4,8 +4,8 @@ The inputs are whitened logarithms of the charges (`isocharge.train.training.fea
 nearly the same factor. The common factor therefore depends mostly on the force, and the ratios depend mostly on the
 position. One perceptron gives the mean and the logarithm of the standard deviation of (x, y, ln F). A second perceptron
 gives the vector (Q - Q(c)) / sigma at the contact c of the domain where this vector is shortest. The length of the
-vector is the misfit. Unlike its length, the vector is smooth where the charges Q are exactly those of a contact. The
-length of the vector ranges from a tenth to thousands, and is compressed by asinh.
+vector is the misfit. Where the charges Q are exactly those of a contact, the vector is smooth, but its length is not.
+The length of the vector ranges from a tenth to thousands, and is compressed by asinh.
 """
 
 from collections.abc import Sequence
