@@ -7,6 +7,7 @@ do not depend on the executor, on the number of workers, or on the order in whic
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -33,6 +34,9 @@ It is enough for about thirty workers and limits the memory that finished result
 
 CONNECT_TIMEOUT_s = 10.0
 """Longest time to wait for a connection to a Dask cluster, s."""
+
+BLOCKED_SENDING_s = 1.0
+"""Time after which the thread that manages a broken process pool counts as blocked, s."""
 
 
 def in_order(
@@ -134,7 +138,7 @@ def local_workers(count: int) -> Iterator[Executor | None]:
         yield pool
     except BaseException:
         parent_end.close()  # this also ends workers that are still computing
-        _close_job_pipe(pool)
+        _end_blocked_sending(pool)
         raise
     finally:
         pool.shutdown(cancel_futures=True)
@@ -142,17 +146,25 @@ def local_workers(count: int) -> Iterator[Executor | None]:
         worker_end.close()
 
 
-def _close_job_pipe(pool: ProcessPoolExecutor) -> None:
-    """Close the reading end of the pipe through which a process pool sends jobs to its workers.
+def _end_blocked_sending(pool: ProcessPoolExecutor) -> None:
+    """End the sending of a job to workers that have ended, so that `ProcessPoolExecutor.shutdown` can complete.
 
-    If the workers end while a job that is larger than the pipe is being sent, `ProcessPoolExecutor.shutdown` waits
-    forever in early releases of Python 3.11, because this process itself holds a reading end
-    (https://github.com/python/cpython/issues/94777). After the reading end is closed, the sending fails and the
-    shutdown completes. Later releases of Python close it themselves.
+    If the workers end while a job that is larger than the pipe is being sent, the shutdown waits forever in releases
+    of Python before 3.11.5, because this process itself holds a reading end of the pipe
+    (https://github.com/python/cpython/issues/94777). The sending fails when this end is closed.
+
+    Args:
+        pool: Process pool whose workers have ended, or are ending.
     """
-    job_queue: Any = getattr(pool, "_call_queue")  # noqa: B009 (mypy does not know this attribute)
-    if job_queue is not None:
-        job_queue._reader.close()
+    if sys.version_info >= (3, 11, 5):
+        return  # the pool closes the reading end itself, and closing it twice is an error
+    internals: Any = pool  # mypy does not know the private attributes
+    manager = internals._executor_manager_thread
+    if manager is None:
+        return  # no job was submitted
+    manager.join(BLOCKED_SENDING_s)
+    if manager.is_alive():
+        internals._call_queue._reader.close()
 
 
 def _initialise_worker(worker_end: Connection) -> None:
