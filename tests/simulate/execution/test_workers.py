@@ -3,12 +3,12 @@
 import os
 import re
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
-from threading import Barrier
 
 import pytest
 
@@ -68,6 +68,19 @@ def test_pool_ends_if_its_workers_are_killed_while_large_jobs_are_being_sent():
         list(in_order(executor, kill_this_process, jobs))
 
 
+def test_pool_with_cancelled_futures_can_be_abandoned(monkeypatch):
+    """The thread that manages the pool would fail if it found cancelled futures when the workers end."""
+    thread_errors = []
+    monkeypatch.setattr(threading, "excepthook", thread_errors.append)
+    with pytest.raises(KeyboardInterrupt), local_workers(2) as executor:
+        executor.submit(os.getpid).result()  # the workers have started
+        futures = [executor.submit(waited, 3600.0) for _ in range(20)]
+        for future in futures:
+            future.cancel()
+        raise KeyboardInterrupt
+    assert not thread_errors
+
+
 def kill_this_process(_: bytes) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -88,7 +101,7 @@ def test_in_order_returns_results_in_order_and_consumes_jobs_as_needed():
 
 
 def test_in_order_runs_jobs_in_parallel():
-    both = Barrier(2)
+    both = threading.Barrier(2)
     with ThreadPoolExecutor(2) as pool:
         assert sorted(in_order(pool, lambda _: both.wait(timeout=5.0), range(4))) == [0, 0, 1, 1]
 

@@ -7,8 +7,8 @@ do not depend on the executor, on the number of workers, or on the order in whic
 import multiprocessing
 import os
 import signal
-import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
@@ -35,8 +35,11 @@ It is enough for about thirty workers and limits the memory that finished result
 CONNECT_TIMEOUT_s = 10.0
 """Longest time to wait for a connection to a Dask cluster, s."""
 
-BLOCKED_SENDING_s = 1.0
-"""Time after which the thread that manages a broken process pool counts as blocked, s."""
+MANAGER_TIMEOUT_s = 2.0
+"""Longest time to wait for the thread that manages an abandoned process pool, s."""
+
+POLL_INTERVAL_s = 0.005
+"""Interval between two checks of the thread that manages an abandoned process pool, s."""
 
 
 def in_order(
@@ -137,8 +140,7 @@ def local_workers(count: int) -> Iterator[Executor | None]:
     try:
         yield pool
     except BaseException:
-        parent_end.close()  # this also ends workers that are still computing
-        _end_blocked_sending(pool)
+        _abandon(pool, parent_end)
         raise
     finally:
         pool.shutdown(cancel_futures=True)
@@ -146,25 +148,42 @@ def local_workers(count: int) -> Iterator[Executor | None]:
         worker_end.close()
 
 
-def _end_blocked_sending(pool: ProcessPoolExecutor) -> None:
-    """End the sending of a job to workers that have ended, so that `ProcessPoolExecutor.shutdown` can complete.
+def _abandon(pool: ProcessPoolExecutor, parent_end: Connection) -> None:
+    """End the workers of a pool although they are still computing, and wait until the pool has ended.
 
-    If the workers end while a job that is larger than the pipe is being sent, the shutdown waits forever in releases
-    of Python before 3.11.5, because this process itself holds a reading end of the pipe
-    (https://github.com/python/cpython/issues/94777). The sending fails when this end is closed.
+    The method `ProcessPoolExecutor.shutdown` is not sufficient, because the thread that manages the pool in this
+    process can fail or wait forever if the workers end unexpectedly. This function prevents two such cases:
+
+    - A future was cancelled before the workers end. The manager then fails with an InvalidStateError, unless it has
+      discarded the cancelled futures before.
+    - A job that is larger than the pipe is being sent when the workers end. The sending waits forever if this process
+      itself keeps a reading end of the pipe open (https://github.com/python/cpython/issues/94777).
 
     Args:
-        pool: Process pool whose workers have ended, or are ending.
+        pool: Process pool whose results are not needed.
+        parent_end: End of the pipe that keeps the workers running.
     """
-    if sys.version_info >= (3, 11, 5):
-        return  # the pool closes the reading end itself, and closing it twice is an error
-    internals: Any = pool  # mypy does not know the private attributes
-    manager = internals._executor_manager_thread
+    internals: Any = pool  # the attributes below are private, and mypy does not know them
+    manager: threading.Thread | None = internals._executor_manager_thread
+    job_queue = internals._call_queue
+    pool.shutdown(wait=False, cancel_futures=True)
     if manager is None:
-        return  # no job was submitted
-    manager.join(BLOCKED_SENDING_s)
-    if manager.is_alive():
-        internals._call_queue._reader.close()
+        return  # no job was submitted, so there are no workers
+
+    _wait_until(lambda: not internals._cancel_pending_futures or not manager.is_alive())
+    parent_end.close()
+    _wait_until(lambda: not manager.is_alive())
+    sender: threading.Thread | None = job_queue._thread
+    if sender is not None and sender.is_alive():
+        job_queue._reader.close()  # the sending fails
+    manager.join()
+
+
+def _wait_until(condition: Callable[[], bool]) -> None:
+    """Wait until a condition is true, but at most for MANAGER_TIMEOUT_s."""
+    end = time.monotonic() + MANAGER_TIMEOUT_s
+    while not condition() and time.monotonic() < end:
+        time.sleep(POLL_INTERVAL_s)
 
 
 def _initialise_worker(worker_end: Connection) -> None:
