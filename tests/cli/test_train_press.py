@@ -21,7 +21,7 @@ from isocharge.cli.train.press_dialogue import Dialogue, Screen
 from isocharge.cli.train.press_events import PressEvents, SessionEnd
 from isocharge.common.errors import OutputExists, PortLost, PressError
 from isocharge.serve import Chunk, Frame, PressWatch, ReadingStream, encode_frame, read_presses
-from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, WatchResult
+from isocharge.serve.live.steady_press import PORT_LOST, Phase, SteadyPress, WatchResult
 from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration.press_file import open_press_file
@@ -139,7 +139,7 @@ def test_what_is_typed_is_done(events, taken, message, capsys):
 
 
 def test_a_press_that_is_refused_is_asked_for_again(capsys):
-    session, script, _ = dialogue(refused("it moves"), refused(AWAY), STEADY, "", "q")
+    session, script, _ = dialogue(refused("it moves"), refused(PORT_LOST), STEADY, "", "q")
     assert (session.taken, script.armed) == ([FIRST], 4)
     assert "not taken: it moves; press again" in capsys.readouterr().err
 
@@ -162,7 +162,7 @@ def test_presses_of_a_machine_are_those_of_its_list(capsys):
 
 def test_a_port_that_goes_away_under_a_machine_ends_the_session():
     with pytest.raises(PortLost, match="continue with row 2 of its list"):
-        dialogue(TARED, STEADY, refused(AWAY), contacts=LIST)
+        dialogue(TARED, STEADY, refused(PORT_LOST), contacts=LIST)
 
 
 @pytest.fixture(scope="module")

@@ -227,7 +227,7 @@ def charge_of_a(radius: float, stress: Callable[[float], tuple[float, float]]) -
     return dblquad(density, 8.5, 11.5, -1.5, 1.5)[0]
 
 
-def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float, at: np.ndarray) -> np.ndarray:
+def axisymmetric(share: float, squared_amplitude: float, poisson: float, tension: float, at: np.ndarray) -> np.ndarray:
     """Return the scaled deflection and the radial and hoop stress of a membrane at radii in film radii, shape (3, n).
 
     The unknowns are u, phi = r S_r (1 + A^2 u') and w in the scaled variables of mechanics.energy, for the load one.
@@ -235,7 +235,7 @@ def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float
 
     Args:
         share: Radius R of the probe in film radii.
-        amplitude2: Square A^2 of the scale of the slope.
+        squared_amplitude: Square A^2 of the scale of the slope.
         poisson: Poisson's ratio.
         tension: Scaled pretension.
         at: Radii, shape (n,).
@@ -248,21 +248,23 @@ def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float
 
         The slope u' is the solution of one equation for each radius. Newton's method begins at u' = 0.
         """
-        hoop_strain = u / r + 0.5 * amplitude2 * (u / r) ** 2
+        hoop_strain = u / r + 0.5 * squared_amplitude * (u / r) ** 2
         tilt = -np.minimum(1.0, (r / share) ** 2) / (2.0 * np.pi * phi)  # w' over 1 + A^2 u'
         slope = np.zeros_like(r)
         for _ in range(30):
-            stretch = 1.0 + amplitude2 * slope
-            radial = plane * (slope + 0.5 * amplitude2 * slope**2 + 0.5 * (tilt * stretch) ** 2 + poisson * hoop_strain)
+            stretch = 1.0 + squared_amplitude * slope
+            radial = plane * (
+                slope + 0.5 * squared_amplitude * slope**2 + 0.5 * (tilt * stretch) ** 2 + poisson * hoop_strain
+            )
             radial += tension
-            by_slope = plane * stretch * (1.0 + amplitude2 * tilt**2)
-            slope -= (radial * stretch - phi / r) / (by_slope * stretch + amplitude2 * radial)
+            by_slope = plane * stretch * (1.0 + squared_amplitude * tilt**2)
+            slope -= (radial * stretch - phi / r) / (by_slope * stretch + squared_amplitude * radial)
         hoop = hoop_strain + poisson * (radial - tension) + tension
         return slope, tilt * stretch, radial, hoop
 
     def equations(r: np.ndarray, y: np.ndarray) -> np.ndarray:
         slope, fall, _, hoop = fields(r, y[0], y[1])
-        return np.stack([slope, hoop * (1.0 + amplitude2 * y[0] / r), fall])
+        return np.stack([slope, hoop * (1.0 + squared_amplitude * y[0] / r), fall])
 
     def ends(inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
         """Return the residuals of the boundary conditions.
@@ -292,16 +294,18 @@ def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float
     ],
 )
 def test_axisymmetric_membrane(share, force, poisson, tension):
-    amplitude2 = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
-    film = replace(SLACK, poisson=poisson, pretension=tension * SLACK.young * amplitude2)
+    squared_amplitude = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
+    film = replace(SLACK, poisson=poisson, pretension=tension * SLACK.young * squared_amplitude)
     solved = press(
         film, Circle(share * film.radius), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=REFINED)
     )
     at = np.array([0.005, 0.015, 0.1, 0.4, 0.8, 0.97])
-    for r, (depth, along, around) in zip(at, axisymmetric(share, amplitude2, poisson, tension, at).T, strict=True):
+    for r, (depth, along, around) in zip(
+        at, axisymmetric(share, squared_amplitude, poisson, tension, at).T, strict=True
+    ):
         points = ring(r * film.radius)
-        radial, hoop, shear = radial_and_hoop(touch_stress(solved, points) / (film.young * amplitude2), points)
-        sunk = deflection(solved, points) / (film.radius * np.sqrt(amplitude2))
+        radial, hoop, shear = radial_and_hoop(touch_stress(solved, points) / (film.young * squared_amplitude), points)
+        sunk = deflection(solved, points) / (film.radius * np.sqrt(squared_amplitude))
         np.testing.assert_allclose(sunk, depth, rtol=3e-6)
         np.testing.assert_allclose(radial, along, rtol=3e-5)
         np.testing.assert_allclose(hoop, around, rtol=1e-4)
@@ -328,9 +332,9 @@ def test_charge_of_a_centred_press_is_the_integral_of_the_boundary_value_problem
     """The charge of electrode A is the integral of the stress that scipy computes, without code of isocharge."""
     sensor = load_sensor("four-25um-uniaxial")
     force = 1.0
-    amplitude2 = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
+    squared_amplitude = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
     solved = press(sensor.film, Circle(1.0), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=REFINED))
     at = np.linspace(8.4, 11.7, 40) / 45.0
-    _, *stresses = axisymmetric(1.0 / 45.0, amplitude2, 0.34, 0.0, at)
-    expected = charge_of_a(45.0, CubicSpline(at, SLACK.young * amplitude2 * np.stack(stresses, axis=1)))
+    _, *stresses = axisymmetric(1.0 / 45.0, squared_amplitude, 0.34, 0.0, at)
+    expected = charge_of_a(45.0, CubicSpline(at, SLACK.young * squared_amplitude * np.stack(stresses, axis=1)))
     assert touch_charge(sensor, solved)[0] == pytest.approx(expected, rel=1e-5)

@@ -51,7 +51,7 @@ def test_strain_of_a_film_with_a_round_coat_is_the_closed_form(stiffening):
     pressure = geometry.weights * (1.0 - np.abs(mesh.points @ tensor_values(4, xi, eta).T) ** 2)
     force = np.einsum("ep,epan->ena", pressure, geometry.gradient)
     pressed = np.stack([*(geometry.gather(force[..., axis]) for axis in (0, 1)), 0.0 * geometry.load], axis=1)
-    flat = DimensionlessGroups(amplitude2=1e-12, load=1.0, tension=1.0, bending=0.0, poisson=nu)
+    flat = DimensionlessGroups(squared_amplitude=1e-12, load=1.0, tension=1.0, bending=0.0, poisson=nu)
     tangent = ElasticFilm(geometry, flat).tangent(np.zeros_like(pressed))
     field = -assembly(mesh.template, 3).factor(tangent).solve(pressed)
     outer = 1.0 / (1.0 - nu**2)

@@ -182,9 +182,10 @@ class _File(Struct):
 
         expected_count = math.prod(self.shape)
         expected_bytes = 2 * expected_count  # 16-bit integers
-        if expected_count > MAX_NUMBERS or len(self.deflection) != expected_bytes:
-            expected = f"{expected_count} numbers of 16 bits in base64, {MAX_NUMBERS} at most"
-            raise WrongKey("deflection", expected, len(self.deflection))
+        actual_bytes = len(self.deflection)  # decoded from base64
+        if expected_count > MAX_NUMBERS or actual_bytes != expected_bytes:
+            expected = f"{expected_count} integers of 2 bytes each, and at most {MAX_NUMBERS} integers"
+            raise WrongKey("deflection", expected, f"{actual_bytes} bytes")
 
     @property
     def shape(self) -> tuple[int, int, int, int]:

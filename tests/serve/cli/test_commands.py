@@ -267,7 +267,7 @@ def test_doctor_exit_code_if_no_frames_are_recognised(command):
     words = ("--seconds", 0.5, "--model", "three-25um-biaxial")
     code, out, err = command("serve", "doctor", "--port", silent.url, *words)
     silent.close()
-    assert (code, "not one byte came" in out, "listening for 0.5 s" in err) == (1, True, True)
+    assert (code, "no bytes were received" in out, "listening for 0.5 s" in err) == (1, True, True)
     assert "answered wrongly" not in out
     assert "held presses" not in out
 

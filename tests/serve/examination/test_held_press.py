@@ -88,4 +88,4 @@ def test_proposed_file_has_the_leak_and_the_offset_before_the_press():
     assert max(abs(channel.offset_pC) for channel in report.channels) < 1.0
     assert report.works
     assert report.missing == ()
-    assert report.missing_for_held_presses == ("[leak] tau_s = 10 in a device file",)
+    assert report.missing_for_held_presses == ("put [leak] tau_s = 10 into a device file",)

@@ -71,7 +71,7 @@ def test_check_uses_no_stage_that_is_switched_off():
     off = {"gain": {"on": False, "pC_per_unit": 2.0}, "leak": {"on": False, "tau_s": 10.0}}
     report = examine_received(received(charges()), device=device_from_table(off, "test"))
     assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]
-    assert "time constants ([leak] tau_s" in missing_for_held_presses(report)
+    assert "in a device file ([leak] tau_s)" in missing_for_held_presses(report)
     lines = list(report_lines(report))
     assert lines[-3:-1] == ["missing to get a touch: nothing", "missing for held presses:"]
 
@@ -81,8 +81,8 @@ def test_check_of_a_channel_without_a_number():
     report = examine_received(received(lambda _: b"A:nan,B:1.5,C:2.5\n"))
     assert [(c.name, c.offset_pC) for c in report.channels] == [("A", None), ("B", 1.5), ("C", 2.5)]
     assert report.channels[0].unusable == report.good == 400
-    assert "charges on channel A" in missing(report)
-    assert "life on channel B: every value is 1.5" in missing(report)
+    assert "400 values of channel A are not numbers" in missing(report)
+    assert "channel B is dead: every value is 1.5" in missing(report)
     assert {("A", "?"), ("B", "1.50")} <= {tuple(line.split()[:2]) for line in report_lines(report)}
     json.dumps(asdict(report), allow_nan=False)
 
@@ -91,14 +91,14 @@ def test_check_of_a_channel_without_a_number():
     ("board", "message"),
     [
         (charges(), "3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')"),
-        (charges(hum=9.0), "[hum] frequency_Hz = 50 (device file): channel 1 hums by 9 pC"),
-        (charges(drift=-4.0), "a steady channel 1: it drifts by -4 pC/s"),
-        (charges(offset=(0.0, 120.0, 0.0)), "rest near zero on channel 2: 120 pC, a tare takes 100"),
-        (charges(noise=8.0), "quiet on channel 1: "),
-        (lambda k: charges()(3 * k), "798 frames lost"),
-        (lambda k: charges()(k) + b"\x07\0" * (k % 4 == 0), "2.0% of the bytes are no good frames"),
-        (lambda _: b"", "not one byte came"),
-        (lambda _: b"\xf8\x80\xfe\xff" * 5, "bytes come, but no frames: another baud rate"),
+        (charges(hum=9.0), "channel 1 has a hum of 9 pC: put [hum] frequency_Hz = 50 into a device file"),
+        (charges(drift=-4.0), "channel 1 drifts by -4 pC/s"),
+        (charges(offset=(0.0, 120.0, 0.0)), "channel 2 has 120 pC at rest, but a tare accepts at most 100 pC"),
+        (charges(noise=8.0), "channel 1 has a noise of "),
+        (lambda k: charges()(3 * k), "798 frames were lost"),
+        (lambda k: charges()(k) + b"\x07\0" * (k % 4 == 0), "2.0% of the bytes do not belong to good frames"),
+        (lambda _: b"", "no bytes were received"),
+        (lambda _: b"\xf8\x80\xfe\xff" * 5, "no frames were recognised: try another baud rate"),
         (lambda k: f"{1e-3 * (k % 7):.4f};{1.65 + 1e-3 * (k % 5):.4f}\n".encode(), "feedback capacitance"),
     ],
 )
@@ -120,7 +120,7 @@ def test_unused_inputs_are_ignored():
     report = examine_received(received(row), electrodes=FOUR)
     assert report.device["channels"] == {"A": "1", "B": "3", "C": "4", "D": "6"}
     assert (report.unused, report.unit) == (("2", "5"), "counts")
-    assert "life" not in missing(report)
+    assert "dead" not in missing(report)
     assert "--pc-per-unit" in missing(report)
     text = "\n".join(report_lines(report))
     assert "the channels are counts, not pC" in text
@@ -188,7 +188,7 @@ def test_proposed_file_of_a_board_far_from_zero_works():
     board = lambda _: b"%.2f;%.2f;%.2f\n" % tuple(rng.normal((312.0, -128.0, 3.0), 1.0))  # noqa: E731
     report = examine_received(received(board))
     assert report.device["gain"]["offset"] == pytest.approx({"A": 312.0, "B": -128.0, "C": 3.0}, abs=0.3)
-    assert "rest near zero on channel 1: 311.9 pC" in missing(report)
+    assert "channel 1 has 311.9 pC at rest" in missing(report)
     assert report.works
     assert not examine_received(received(row)).works  # counts of which nobody has said what they are
 
@@ -219,7 +219,7 @@ def test_check_with_a_wrong_device_file_still_reports():
     table = {"frames": {"format": "described", "sync": "AA", "length": 5, "fields": fields}}
     report = examine_received(received(row), device=device_from_table(table, "test"))
     assert report.good == 0
-    assert "bytes come, but no frames" in missing(report)
+    assert "no frames were recognised" in missing(report)
 
 
 def test_offset_drift_hum_and_noise_of_a_channel():

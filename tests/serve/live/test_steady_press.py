@@ -195,7 +195,7 @@ def test_press_is_refused_after_the_port_was_lost():
         "lift",
     ]
     (reason,) = reasons_of(results)
-    assert "the port was away" in reason
+    assert "the port was lost" in reason
 
 
 def test_an_armed_watch_takes_no_press_that_has_begun():

@@ -70,12 +70,12 @@ def test_holding_force_and_slip_are_reciprocal_to_the_deflection():
     def along_film(solved: Equilibrium) -> float:
         geometry = solved.mesh.geometry
         mean = solved.mesh.template.copies * geometry.load @ solved.field[:, 0]
-        return float(film.radius * solved.groups.amplitude2 * mean)
+        return float(film.radius * solved.groups.squared_amplitude * mean)
 
     def into_film(solved: Equilibrium) -> float:
         geometry = solved.mesh.geometry
         mean = solved.mesh.template.copies * geometry.load @ solved.field[:, 2]
-        return float(film.radius * np.sqrt(solved.groups.amplitude2) * mean)
+        return float(film.radius * np.sqrt(solved.groups.squared_amplitude) * mean)
 
     step = 0.01
     by_force = [along_film(press(film, PROBE, at, 0.5 + sign * step, FULL)) for sign in (1.0, -1.0)]

@@ -12,11 +12,11 @@ from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 
 GROUPS = {
-    "membrane": DimensionlessGroups(amplitude2=0.02, load=1.0, tension=0.0, bending=0.0, poisson=0.34),
-    "taut membrane": DimensionlessGroups(amplitude2=0.7, load=2.0, tension=0.6, bending=0.0, poisson=0.0),
-    "von Karman": DimensionlessGroups(amplitude2=0.0, load=1.0, tension=0.0, bending=0.02, poisson=0.34),
-    "plate": DimensionlessGroups(amplitude2=1e-4, load=1.0, tension=0.0, bending=5.0, poisson=0.49),
-    "taut plate": DimensionlessGroups(amplitude2=0.3, load=1.0, tension=0.4, bending=0.1, poisson=0.3),
+    "membrane": DimensionlessGroups(squared_amplitude=0.02, load=1.0, tension=0.0, bending=0.0, poisson=0.34),
+    "taut membrane": DimensionlessGroups(squared_amplitude=0.7, load=2.0, tension=0.6, bending=0.0, poisson=0.0),
+    "von Karman": DimensionlessGroups(squared_amplitude=0.0, load=1.0, tension=0.0, bending=0.02, poisson=0.34),
+    "plate": DimensionlessGroups(squared_amplitude=1e-4, load=1.0, tension=0.0, bending=5.0, poisson=0.49),
+    "taut plate": DimensionlessGroups(squared_amplitude=0.3, load=1.0, tension=0.4, bending=0.1, poisson=0.3),
 }
 STENCIL = ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12))
 

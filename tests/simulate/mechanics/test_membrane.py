@@ -9,19 +9,19 @@ from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mechanics.stress import stress
 
 
-def groups(amplitude2: float, tension: float, poisson: float = 0.34) -> DimensionlessGroups:
-    return DimensionlessGroups(amplitude2, 0.0, tension, 0.0, poisson)
+def groups(squared_amplitude: float, tension: float, poisson: float = 0.34) -> DimensionlessGroups:
+    return DimensionlessGroups(squared_amplitude, 0.0, tension, 0.0, poisson)
 
 
-def physical(slope: np.ndarray, amplitude2: float) -> np.ndarray:
+def physical(slope: np.ndarray, squared_amplitude: float) -> np.ndarray:
     """F = dx/dX, shape (3, 2), of the scaled gradient d(U1, U2, W)/d(X1, X2), shape (2, 3)."""
-    return np.eye(3, 2) + (slope * np.array([amplitude2, amplitude2, np.sqrt(amplitude2)])).T
+    return np.eye(3, 2) + (slope * np.array([squared_amplitude, squared_amplitude, np.sqrt(squared_amplitude)])).T
 
 
-def green(slope: np.ndarray, amplitude2: float) -> np.ndarray:
+def green(slope: np.ndarray, squared_amplitude: float) -> np.ndarray:
     """Scaled Green-Lagrange strain, shape (2, 2)."""
-    f = physical(slope, amplitude2)
-    return 0.5 * (f.T @ f - np.eye(2)) / amplitude2
+    f = physical(slope, squared_amplitude)
+    return 0.5 * (f.T @ f - np.eye(2)) / squared_amplitude
 
 
 @pytest.mark.parametrize("poisson", [0.0, 0.34, 0.49])
@@ -37,11 +37,11 @@ def test_stress_solves_the_plane_stress_compliance(poisson):
 # Rigid motions
 
 
-def moved(points: np.ndarray, rotation: np.ndarray, shift: tuple[float, ...], amplitude2: float) -> np.ndarray:
+def moved(points: np.ndarray, rotation: np.ndarray, shift: tuple[float, ...], squared_amplitude: float) -> np.ndarray:
     """The scaled field of a rigid motion x = R X + shift."""
     flat = np.pad(points, ((0, 0), (0, 1)))
     displacement = flat @ rotation.T + np.array(shift) - flat
-    return displacement / np.array([amplitude2, amplitude2, np.sqrt(amplitude2)])
+    return displacement / np.array([squared_amplitude, squared_amplitude, np.sqrt(squared_amplitude)])
 
 
 MOTIONS = {
@@ -53,12 +53,12 @@ MOTIONS = {
 
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
-@pytest.mark.parametrize("amplitude2", [1e-3, 0.5])
-def test_rigid_motion_has_no_energy(mesh, motion, amplitude2):
+@pytest.mark.parametrize("squared_amplitude", [1e-3, 0.5])
+def test_rigid_motion_has_no_energy(mesh, motion, squared_amplitude):
     rotation, shift = motion
-    membrane = Membrane(mesh.geometry, groups(amplitude2, 0.0))
-    field = moved(mesh.points, rotation.as_matrix(), shift, amplitude2)
-    round_off = 3e-13 / amplitude2
+    membrane = Membrane(mesh.geometry, groups(squared_amplitude, 0.0))
+    field = moved(mesh.points, rotation.as_matrix(), shift, squared_amplitude)
+    round_off = 3e-13 / squared_amplitude
     assert abs(membrane.energy(field)) < round_off**2
     assert np.abs(membrane.forces(field)).max() < 30.0 * round_off * np.abs(field).max()
 
@@ -73,7 +73,7 @@ def test_patch_of_uniform_strain_is_exact(mesh, tension):
     scene = groups(0.2, tension)
     membrane = Membrane(mesh.geometry, scene)
     field = mesh.points @ gradient
-    e = green(gradient, scene.amplitude2)
+    e = green(gradient, scene.squared_amplitude)
     nu = scene.poisson
     density = 0.5 / (1 - nu**2) * ((1 - nu) * np.sum(e * e) + nu * np.trace(e) ** 2)
     density += tension * (np.trace(e) - gradient[0, 0] - gradient[1, 1])

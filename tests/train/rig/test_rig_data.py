@@ -32,7 +32,7 @@ def solved_once():
 @pytest.fixture(scope="module")
 def model(truth, tmp_path_factory):
     """A released model of the described film, corrected by measured presses, after a short training."""
-    data = rig_data(Rig(measured_presses(truth, 300), DESCRIBED, PROBE), drawn=4000)
+    data = rig_data(Rig(measured_presses(truth, 300), DESCRIBED, PROBE), training_presses=4000)
     return release(fit(data, TINY), tmp_path_factory.mktemp("models") / "rig")
 
 
@@ -79,7 +79,7 @@ def test_unusable_presses_are_logged_and_too_few_presses_are_refused(truth, capl
     presses = measured_presses(truth, 60)
     presses.contact[:3, 0] = 30.0
     presses.charge_pC[3, 1] = np.nan
-    assert len(rig_data(Rig(presses, DESCRIBED, PROBE), drawn=1000).test) >= 10
+    assert len(rig_data(Rig(presses, DESCRIBED, PROBE), training_presses=1000).test) >= 10
     assert "4 of 60 presses are left out: 1 with an unknown place, force or charge; 3 beyond 8 mm" in caplog.text
     with pytest.raises(PressError, match=r"at least 50 presses .* got 49 of 53.*isocharge train calibrate"):
         rig_data(Rig(presses[:53], DESCRIBED, PROBE))

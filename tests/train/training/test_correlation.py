@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 
 from isocharge.simulate import noise_model
 from isocharge.train import LabelledPresses
-from isocharge.train.training.correlation import ANGLE_SUMS, correlation_loss, with_correlation
+from isocharge.train.training.correlation import ANGLES_TO_COSINE_ARGUMENTS, correlation_loss, with_correlation
 from isocharge.train.training.folded_network import COSINES_TO_CORRELATIONS
 from isocharge.train.training.network import fold_network
 
@@ -36,7 +36,7 @@ def correlation_matrices(correlations):
 
 def matrices_of_angles(angles):
     """Return the correlation matrices, shape (n, 3, 3), of angles of shape (n, 3), rad."""
-    return correlation_matrices(np.cos(angles @ ANGLE_SUMS) @ COSINES_TO_CORRELATIONS)
+    return correlation_matrices(np.cos(angles @ ANGLES_TO_COSINE_ARGUMENTS) @ COSINES_TO_CORRELATIONS)
 
 
 def test_any_angles_give_the_gram_matrix_of_unit_vectors(angles):

@@ -7,7 +7,7 @@ import typer
 
 from isocharge.cli.shared.terminal import say
 from isocharge.common.measured_presses import MeasuredPresses, read_presses
-from isocharge.common.tables.number_table import ignored_words
+from isocharge.common.tables.number_table import ignored_columns_message
 
 PositionStdOption = Annotated[
     float,
@@ -39,5 +39,5 @@ def read_press_file(
     """
     presses = read_presses(file, electrodes, position_std_mm=position_std_mm, force_std=force_std)
     if presses.ignored:
-        say(ignored_words(str(file), presses.ignored))
+        say(ignored_columns_message(str(file), presses.ignored))
     return presses

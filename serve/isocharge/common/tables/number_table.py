@@ -220,7 +220,7 @@ def _listed(names: Sequence[str]) -> str:
     return f"{listed} and {len(names) - MAX_LISTED_NAMES} more"
 
 
-def ignored_words(where: str, names: Sequence[str]) -> str:
+def ignored_columns_message(where: str, names: Sequence[str]) -> str:
     """Return a message that lists the ignored columns of a file.
 
     Args:

@@ -21,10 +21,10 @@ DRIFT_LIMIT_PC_PER_S = 2.0
 """Largest harmless drift, pC/s."""
 
 GAIN_REQUESTS = {
-    "counts": "the charge of one count, pC: --pc-per-unit NUMBER, negative where the amplifier inverts (1 if these are "
-    "pC)",
-    "V": "the amplifier's feedback capacitance, if these are volts: --v-per-unit 1 --feedback-pf NUMBER; or the charge "
-    "of one unit, pC: --pc-per-unit NUMBER (1 if these are pC)",
+    "counts": "state the charge of one count in pC with --pc-per-unit NUMBER; the number is negative if the amplifier "
+    "inverts, and 1 if the channels are already in pC",
+    "V": "if the channels are volts, state the feedback capacitance of the amplifier with --v-per-unit 1 --feedback-pf "
+    "NUMBER; otherwise state the charge of one unit in pC with --pc-per-unit NUMBER",
 }
 """Request to the user for the gain, by the unit of the channels."""
 
@@ -58,12 +58,16 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
     """Yield one sentence for each setting or property that is missing before contacts can be computed."""
     capture = findings.capture
     if not capture.bytes_seen:
-        yield "not one byte came: check power and cable, and whether the board sends unasked (if not: --request)"
+        yield (
+            "no bytes were received: check the power and the cable; if the board sends only after a request, state the "
+            "request with --request"
+        )
         return
     if not capture.frames:
         yield (
-            "bytes come, but no frames: another baud rate (--baud), or a format for a device file (--device); a board "
-            "without noise shows its channels only while the film is touched"
+            "bytes were received, but no frames were recognised: try another baud rate with --baud, or describe the "
+            "format in a device file (--device); a board without noise shows its channels only while the film is "
+            "touched"
         )
         return
     if findings.touch:
@@ -74,7 +78,7 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
         yield GAIN_REQUESTS[findings.unit]
     for channel in findings.channels:
         if channel.span_pC == 0.0:
-            yield f"life on channel {printable(channel.name)}: every value is {channel.offset_pC:g}"
+            yield f"channel {printable(channel.name)} is dead: every value is {channel.offset_pC:g}"
         if findings.unit == "pC":
             yield from _charge_sentences(channel, findings.device.tare or TareRule())
 
@@ -83,9 +87,12 @@ def _transmission_sentences(capture: Capture) -> Iterator[str]:
     """Yield a sentence if bytes are damaged, and another sentence if frames are missing."""
     if capture.intact_share < CLEAN_SHARE:
         damaged_share = 1.0 - capture.intact_share
-        yield f"{damaged_share:.1%} of the bytes are no good frames: a bad cable, or a rate that is a little off"
+        yield (
+            f"{damaged_share:.1%} of the bytes do not belong to good frames: check the cable, and whether the baud "
+            "rate of the board is exact"
+        )
     if capture.gaps.lost:
-        yield f"{capture.gaps.lost} frames lost: a slower rate, or a faster link"
+        yield f"{capture.gaps.lost} frames were lost: send fewer frames per second, or use a faster link"
 
 
 def _channel_count_sentences(findings: BoardFindings) -> Iterator[str]:
@@ -97,10 +104,10 @@ def _channel_count_sentences(findings: BoardFindings) -> Iterator[str]:
         return
     channels = f"{channel_count} channels"
     if findings.unused:
-        channels += f" that live, of {len(findings.capture.names)}"
+        channels = f"{channel_count} of {len(findings.capture.names)} channels"
     yield (
-        f"{channels}, but the model has the electrodes {electrodes}: another model (--model), or [channels] in a "
-        "device file"
+        f"the board uses {channels}, but the model has the electrodes {electrodes}: choose another model with --model, "
+        "or assign the channels in the section [channels] of a device file"
     )
 
 
@@ -116,19 +123,26 @@ def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
     offset_pC = channel.offset_pC or 0.0
     drift_pC_per_s = channel.drift_pC_per_s or 0.0
     if channel.unusable:
-        yield f"charges on channel {name}: {channel.unusable} values are no numbers, or absurd"
+        yield f"{channel.unusable} values of channel {name} are not numbers, or impossibly large"
     if noise_pC > rule.noise_limit_pC:
-        yield f"quiet on channel {name}: {noise_pC:.3g} pC rms, for a tare {rule.noise_limit_pC:g}"
+        yield (
+            f"channel {name} has a noise of {noise_pC:.3g} pC rms, but a tare needs less than "
+            f"{rule.noise_limit_pC:g} pC"
+        )
     if abs(offset_pC) > rule.offset_limit_pC:
         yield (
-            f"rest near zero on channel {name}: {offset_pC:.4g} pC, a tare takes {rule.offset_limit_pC:g} (is "
-            "something lying on the film? or does the amplifier rest there? then [gain] offset, as --write has it)"
+            f"channel {name} has {offset_pC:.4g} pC at rest, but a tare accepts at most {rule.offset_limit_pC:g} pC: "
+            "remove what lies on the film; if the amplifier rests at this value, subtract it with [gain] offset, which "
+            "--write puts into the device file"
         )
     if abs(drift_pC_per_s) > DRIFT_LIMIT_PC_PER_S:
-        yield f"a steady channel {name}: it drifts by {drift_pC_per_s:.2g} pC/s"
+        yield f"channel {name} drifts by {drift_pC_per_s:.2g} pC/s: let the amplifier warm up, and check its leak"
     for frequency_Hz, hum_pC in zip(MAINS_HZ, channel.hum_pC, strict=True):
         if hum_pC is not None and hum_pC > HUM_LIMIT_PC:
-            yield f"[hum] frequency_Hz = {frequency_Hz:g} (device file): channel {name} hums by {hum_pC:.2g} pC"
+            yield (
+                f"channel {name} has a hum of {hum_pC:.2g} pC: put [hum] frequency_Hz = {frequency_Hz:g} into a device "
+                "file"
+            )
 
 
 def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
@@ -144,13 +158,17 @@ def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
     device = findings.device
     held = findings.held
     if findings.capture.frames[0].t_us is None and device.leak is not None:
-        yield "a device clock (t_us, t_ms or t_s): without it the leak is undone by arrival times, which jitter"
+        yield (
+            "send the time of a device clock in each frame (t_us, t_ms or t_s): without it the leak is corrected with "
+            "the arrival times, which jitter"
+        )
     if held is not None:
         for name, section in held.sections.items():
             if name not in device.table:
-                yield f"{section_text(name, section)} in a device file"
+                yield f"put {section_text(name, section)} into a device file"
     elif device.leak is None:
         yield (
-            "the amplifier's time constants ([leak] tau_s in a device file), of its circuit: without them held presses "
-            "fade. To measure them, listen for 20 s (--seconds 20), and from the third on hold a press with a weight"
+            "state the time constants of the amplifiers in a device file ([leak] tau_s): without them the force of a "
+            "held press seems to decrease. The time constants follow from the circuit. To measure them instead, listen "
+            "for 20 s with --seconds 20, and hold a press with a weight from the third second on"
         )

@@ -22,14 +22,14 @@ from isocharge.serve.signal_chain.chain import Reading
 CHECKS_PER_WINDOW = 10
 """Number of checks in the length of a window. A board may send thousands of frames per second."""
 
-AWAY = "the port was away: leave the film alone until it is tared"
+PORT_LOST = "the port was lost: do not touch the film until it is tared"
 """Reason why a press is refused if the port was lost."""
 
-TOO_SOON = (
-    "pressed too soon after the last touch: leave the film alone for half a second before; if that does not help, the "
-    "amplifier leaks: a device file needs [leak] with the time constant of its circuit"
+NO_REST_BEFORE_PRESS = (
+    "pressed too soon after the last touch: do not touch the film for half a second before a press; if that does not "
+    "help, the amplifier leaks: state its time constant in the section [leak] of a device file"
 )
-"""Reason why a press is refused if there was no rest before it."""
+"""Reason why a press is refused if the film was not at rest before the press."""
 
 MIN_REST_FRAMES = 3
 """Smallest number of frames at rest before a touch."""
@@ -187,7 +187,7 @@ class PressWatch:
         t_s = timed.time.clock_s
         if RECONNECTED in reading.flags or RESTART in reading.flags:
             self._rest.clear()
-            return self._refuse(AWAY, Phase.taring)
+            return self._refuse(PORT_LOST, Phase.taring)
         if reading.charge_pC is None:  # there is no tare yet, or the frame is invalid
             if TARE in reading.flags:
                 self._phase = Phase.taring
@@ -270,7 +270,7 @@ class PressWatch:
         if SATURATED in reading.flags:
             return self._refuse("an amplifier is at its limit: press less hard", Phase.lift)
         if not self._has_rest and held_s >= rule.min_held_s:
-            return self._refuse(TOO_SOON, Phase.lift)
+            return self._refuse(NO_REST_BEFORE_PRESS, Phase.lift)
 
         self._window.append(WindowFrame(t_s, charge_pC, reading.flags))
         while self._window[0].t_s < t_s - rule.window_s:

@@ -130,7 +130,7 @@ def make_golden(
 
 
 def read_golden(path: Path) -> Golden:
-    """Read the golden vectors of a model from its file `golden.json`.
+    """Read the golden vectors of a model, which are stored charges and outputs, from its file `golden.json`.
 
     Raises:
         ModelError: If the file is missing or damaged.
@@ -138,18 +138,18 @@ def read_golden(path: Path) -> Golden:
     if not path.exists():
         raise ModelError(f"{path}: missing; every model has this file: copy the whole folder of the model again")
     try:
-        file = read_json(path, "golden vectors", ModelError, _File)
+        content = read_json(path, "golden vectors", ModelError, _GoldenFile)
     except ModelError as error:
         raise ModelError(f"{error}; the file is damaged: copy or export the model again") from error
     # The correlations are an output of newer models only.
-    present_outputs = [name for name in OUTPUTS if getattr(file.outputs, name) is not None]
+    present_outputs = [name for name in OUTPUTS if getattr(content.outputs, name) is not None]
     return Golden(
-        sha256=file.sha256,
-        charge_pC=_float32_array(file.inputs.charge_pC),
-        outputs={name: _float32_array(getattr(file.outputs, name)) for name in present_outputs},
-        relative=file.tolerance.relative,
-        floors={name: getattr(file.tolerance.floor, name) for name in present_outputs},
-        companion_sha256=file.files,
+        sha256=content.sha256,
+        charge_pC=_float32_array(content.inputs.charge_pC),
+        outputs={name: _float32_array(getattr(content.outputs, name)) for name in present_outputs},
+        relative=content.tolerance.relative,
+        floors={name: getattr(content.tolerance.floor, name) for name in present_outputs},
+        companion_sha256=content.files,
     )
 
 
@@ -193,7 +193,7 @@ class _Tolerance(Struct):
     floor: _Floors
 
 
-class _File(Struct):
+class _GoldenFile(Struct):
     """The content of `golden.json`. The number of rows of the outputs is checked when the model is read."""
 
     sha256: Text

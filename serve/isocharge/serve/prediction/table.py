@@ -16,7 +16,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError
 from isocharge.common.tables.csv_table import CsvTable
-from isocharge.common.tables.number_table import CHARGE_RULE, NumberTable, ignored_words
+from isocharge.common.tables.number_table import CHARGE_RULE, NumberTable, ignored_columns_message
 from isocharge.common.tables.table_file import open_table
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 from isocharge.serve.prediction.contact import Contact, Contacts, Validity
@@ -88,12 +88,12 @@ def _charges(table: NumberTable, electrodes: tuple[str, ...], warn: Callable[[st
         electrodes: Names of the electrodes.
         warn: Function that is called with a message about columns that are ignored.
     """
-    rule = replace(CHARGE_RULE, may_be_empty=False)
-    charge_columns = table.choose_columns(dict.fromkeys(electrodes, rule))
+    charge_rule = replace(CHARGE_RULE, may_be_empty=False)
+    column_rules = table.choose_columns(dict.fromkeys(electrodes, charge_rule))  # the same rule for each electrode
     ignored_names = [name for name in table.header if name not in electrodes]
     if ignored_names:
-        warn(ignored_words(table.where, ignored_names))
-    content = table.read(charge_columns, MAX_CHARGE_ROWS)
+        warn(ignored_columns_message(table.where, ignored_names))
+    content = table.read(column_rules, MAX_CHARGE_ROWS)
     return np.column_stack([content.values[name] for name in electrodes])
 
 
@@ -171,12 +171,16 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
         block_is_touch = predictor.validity.is_touch(block)
         for row, charges in enumerate(block.tolist()):
             is_touch = bool(block_is_touch[row])
-            contact = Contact(*(float(column[row]) for column in contacts))
+            contact_fields = NO_CONTACT
+            if is_touch:
+                # `contacts` has one column for each attribute of a contact.
+                contact = Contact(*(float(column[row]) for column in contacts))
+                contact_fields = contact.fields()
             yield PredictionRecord(
                 timestamp=None,
                 t_device_us=None,
                 seq=None,
-                **(contact.fields() if is_touch else NO_CONTACT),
+                **contact_fields,
                 contact=is_touch,
                 charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
                 charge_raw_pC=None,

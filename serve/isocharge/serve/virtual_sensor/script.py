@@ -219,6 +219,9 @@ def wander(
 def _random_path(rng: np.random.Generator, t_s: Array) -> Complexes:
     """Draw a smooth random path inside the unit disk.
 
+    The path is the sum of a random starting point and three circular movements. The circles pass through the origin and
+    have random directions. Each movement begins at the origin and has a random speed.
+
     Args:
         rng: Source of the random numbers.
         t_s: Times since the start of the press, shape (n,), s.
@@ -226,14 +229,17 @@ def _random_path(rng: np.random.Generator, t_s: Array) -> Complexes:
     Returns:
         Points x + i y, shape (n,).
     """
-    # The path is a random point plus three circles of random speed and direction, all of which begin at 0.
-    start = np.sqrt(rng.uniform()) * np.exp(2j * np.pi * rng.uniform())
+    start_distance = np.sqrt(rng.uniform())  # the square root distributes the points evenly over the disk
+    start = start_distance * np.exp(2j * np.pi * rng.uniform())
+
     turns_per_s = rng.uniform(-0.5, 0.5, size=(3, 1))
-    circles = 0.25 * (np.exp(2j * np.pi * turns_per_s * t_s) - 1.0)
+    circles = 0.25 * (np.exp(2j * np.pi * turns_per_s * t_s) - 1.0)  # shape (3, n)
     directions = np.exp(2j * np.pi * rng.uniform(size=(3, 1)))
     path = start + (directions * circles).sum(axis=0)
-    # The division keeps the path inside the disk and hardly moves points that are well inside.
-    return np.asarray(path / (1.0 + np.abs(path) ** 8) ** (1 / 8))
+
+    # A distance r becomes r / (1 + r^8)^(1/8), which is less than 1, and nearly r if r is small.
+    divisor = (1.0 + np.abs(path) ** 8) ** (1 / 8)
+    return np.asarray(path / divisor)
 
 
 def _force_level(rng: np.random.Generator, t_s: Array, duration_s: float) -> Array:

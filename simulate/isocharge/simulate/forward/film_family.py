@@ -115,7 +115,7 @@ class FilmFamily:
             executor: Executor that runs the solves; None for this process.
 
         Raises:
-            SceneError: If some presses cannot exist.
+            SceneError: If the force, the radius or the probe of a press is impossible for one of the films.
             SolveError: If a press has no equilibrium, or the interpolation error exceeds `MAX_FAMILY_ERROR`.
         """
         domain = Domain(radius, force_range)

@@ -327,28 +327,34 @@ class FilmModes:
         return ModeMap(tuple(names), film, fields, field_numbers)
 
     def _field_map(self, forward_map: ForwardMap, field_numbers: tuple[int, ...]) -> ForwardMap:
-        """Return a copy of a forward map whose table contains some of the stress fields in place of the stress.
+        """Interpolate stress fields for one film, and return them as a forward map.
+
+        A forward map interpolates a table of the stress between presses. The returned map has a table of the fields
+        instead, so that the fields are interpolated in the same way.
 
         Args:
             forward_map: Forward map of the film.
             field_numbers: Numbers of the fields, in the order of `FIELDS`.
 
         Returns:
-            The map. Its table contains the values of all fields at one node, then those at the next node.
+            Map with one row of the table for each press of the grid. A row contains the values of all fields at the
+            first node of the mesh, then those at the next node, and so on.
         """
         film = forward_map.sensor.film
-        tension_weights = self.grid.weights("tension", film.pretension / film.young)
-        # Weighted sum over the tensions t, for each distance d, load l and component m of the decomposition. The axes
-        # of the thickness and the reach have one node each.
-        press_coefficients = np.einsum("t,dltm->dlm", tension_weights, self.coefficients[:, :, :, 0, 0])
-
-        # Select the fields, and order their values by node: (component, element, local node, field, stress component).
         n_component = len(self.parts)
+
+        # Interpolate the coefficients at the tension of the film. The grid has one thickness and one reach only.
+        tension_weights = self.grid.weights("tension", film.pretension / film.young)
+        grid_coefficients = self.coefficients.reshape(*self.grid.shape[:3], n_component)  # distance, load and tension
+        press_coefficients = np.moveaxis(grid_coefficients, 2, -1) @ tension_weights  # (distance, load, component)
+
+        # Select the fields, and order their values by node.
         mesh = template_for(forward_map.probe, forward_map.resolution)
-        all_fields = self.parts.reshape(n_component, IS_ODD.size, mesh.n_element, -1, 3)
-        fields = all_fields[:, list(field_numbers)]
-        node_values = np.moveaxis(fields, 1, 3).reshape(n_component, -1)
-        table = press_coefficients.reshape(-1, n_component) @ node_values
+        n_field = IS_ODD.size
+        all_fields = self.parts.reshape(n_component, n_field, mesh.n_element, -1, 3)
+        fields = all_fields[:, list(field_numbers)]  # (component, field, element, local node, stress component)
+        fields_by_node = np.moveaxis(fields, 1, 3)  # (component, element, local node, field, stress component)
+        table = press_coefficients.reshape(-1, n_component) @ fields_by_node.reshape(n_component, -1)
 
         # Convert the dimensionless distances, loads and probe radius of the grid into those of this film.
         force_unit = film.young * film.thickness * film.radius

@@ -90,10 +90,12 @@ def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel)
 
 
 def singular_values(scaled: Array) -> Array:
-    """Compute the singular values of J / sigma with respect to the position, for an unknown force.
+    """Compute how strongly the charges depend on the position if the force is unknown.
 
-    The inverses of the singular values are the standard deviations of the position in the best and in the worst
-    direction. At a fold the second singular value is zero.
+    A change of the charges that the force could also cause contains no information about the position. It is therefore
+    removed from the derivatives with respect to x and y. The singular values of the remaining derivatives are the
+    inverse standard deviations of the position in the best and in the worst direction. At a fold the second singular
+    value is zero.
 
     Args:
         scaled: J / sigma: the derivatives of the charges with respect to x, y and ln F, divided by the standard
@@ -105,11 +107,11 @@ def singular_values(scaled: Array) -> Array:
     position_derivative = scaled[:, :, :2]
     force_derivative = scaled[:, :, 2]
     force_length = np.linalg.norm(force_derivative, axis=1, keepdims=True)
-    force_direction = force_derivative / np.maximum(force_length, np.finfo(float).tiny)
+    force_direction = force_derivative / np.maximum(force_length, np.finfo(float).tiny)  # unit vectors
 
-    # A change of the charges along `force_direction` may be caused by the force, so this component is removed.
-    along_force = np.einsum("ne,nei->ni", force_direction, position_derivative)  # sum over the electrodes e
-    across_force = position_derivative - force_direction[:, :, None] * along_force[:, None]
+    # Subtract the component along `force_direction`, which is a sum over the electrodes e.
+    component = np.einsum("ne,nei->ni", force_direction, position_derivative)
+    across_force = position_derivative - force_direction[:, :, None] * component[:, None, :]
     return np.asarray(np.linalg.svd(across_force, compute_uv=False))
 
 

@@ -170,7 +170,9 @@ class Membrane:
         """
         self.geometry = geometry
         self.groups = groups
-        self._scale = np.array([groups.amplitude2, groups.amplitude2, 1.0])  # weights of the squares of U1, U2 and W
+        self._scale = np.array(
+            [groups.squared_amplitude, groups.squared_amplitude, 1.0]
+        )  # weights of the squares of U1, U2 and W
 
     @property
     def _deviator(self) -> Array | None:
@@ -228,7 +230,7 @@ class Membrane:
             Energy of the meshed part of the film, dimensionless.
         """
         slope = self._slope(field)  # shape (n_element, n_point, 2, 3): the derivative, then the component
-        elastic_strain = strain(slope, self.groups.amplitude2)
+        elastic_strain = strain(slope, self.groups.squared_amplitude)
         energy_density = 0.5 * np.sum(elastic_strain * self._stress(elastic_strain), axis=-1)
 
         # Without div U, the term of the pretension is quadratic in the slopes.
@@ -248,7 +250,7 @@ class Membrane:
         """
         geometry = self.geometry
         slope = self._slope(field)
-        elastic_stress = self._stress(strain(slope, self.groups.amplitude2))
+        elastic_stress = self._stress(strain(slope, self.groups.squared_amplitude))
 
         # Derivative of the energy density with respect to the slopes, shape (n_element, n_point, 2, 3)
         traction = _tensor(elastic_stress) @ self._stretch(slope)
@@ -277,7 +279,7 @@ class Membrane:
         stretch = self._stretch(slope)
 
         # Total stress (S11, S22, S12) with the pretension, times the integration weights
-        total_stress = self._stress(strain(slope, self.groups.amplitude2))
+        total_stress = self._stress(strain(slope, self.groups.squared_amplitude))
         total_stress[..., :2] += self.groups.tension
         if self.groups.anisotropy is not None:
             total_stress += self.groups.anisotropy.tension

@@ -59,7 +59,7 @@ class DimensionlessGroups:
     E is Young's modulus, h the thickness and a the radius of the film.
 
     Attributes:
-        amplitude2: Square A^2 of the amplitude A, which scales the deflection in film radii.
+        squared_amplitude: Square A^2 of the amplitude A, which scales the deflection in film radii.
         load: Force over E h a A^3.
         tension: Mean pretension over E A^2.
         bending: Bending stiffness over E h a^2 A^2, which is b / A^2. Zero omits bending.
@@ -72,7 +72,7 @@ class DimensionlessGroups:
             over the film. Zero if the back is vented.
     """
 
-    amplitude2: float
+    squared_amplitude: float
     load: float
     tension: float
     bending: float
@@ -106,29 +106,29 @@ class DimensionlessGroups:
             The groups, which describe the press completely.
         """
         # Units of the force and of the pressure: E h a A^3 and E h A^3 / a
-        amplitude2 = float(amplitude_squared(film, force))
-        force_unit = film.young * film.thickness * film.radius * amplitude2**1.5
-        pressure_unit = film.young * film.thickness * amplitude2**1.5 / film.radius
+        squared_amplitude = float(amplitude_squared(film, force))
+        force_unit = film.young * film.thickness * film.radius * squared_amplitude**1.5
+        pressure_unit = film.young * film.thickness * squared_amplitude**1.5 / film.radius
 
         side_load = (0.0, 0.0)
         if any(side_force):  # rotated into the axes of the press
             side_x, side_y = side_force
             along_press = side_x * np.cos(angle) + side_y * np.sin(angle)
             across_press = side_y * np.cos(angle) - side_x * np.sin(angle)
-            side_unit = side_force_unit(film, amplitude2)
+            side_unit = side_force_unit(film, squared_amplitude)
             side_load = (float(along_press / side_unit), float(across_press / side_unit))
 
         # Ratio of the unit of the displaced volume, a^3 A, to the volume of the trapped air
         compression = 0.0
         if film.back_volume is not None:
-            compression = film.radius**3 * amplitude2**0.5 / film.back_volume
+            compression = film.radius**3 * squared_amplitude**0.5 / film.back_volume
         return cls(
-            amplitude2=amplitude2,
+            squared_amplitude=squared_amplitude,
             load=force / force_unit,
-            tension=film.pretension / (film.young * amplitude2),
-            bending=slenderness(film) / amplitude2 if bending else 0.0,
+            tension=film.pretension / (film.young * squared_amplitude),
+            bending=slenderness(film) / squared_amplitude if bending else 0.0,
             poisson=film.poisson,
-            anisotropy=_anisotropy(film, amplitude2, angle) if film.is_anisotropic else None,
+            anisotropy=_anisotropy(film, squared_amplitude, angle) if film.is_anisotropic else None,
             side_load=side_load,
             static_pressure=film.static_pressure / pressure_unit,
             ambient_pressure=AMBIENT_PRESSURE / pressure_unit if compression else 0.0,
@@ -199,25 +199,27 @@ def scaled_stress(scaled_strain: Array, groups: DimensionlessGroups) -> Array:
     return stress(scaled_strain, groups.poisson, moduli)
 
 
-def _anisotropy(film: Film, amplitude2: float, angle: float) -> Anisotropy:
+def _anisotropy(film: Film, squared_amplitude: float, angle: float) -> Anisotropy:
     """Compute the direction-dependent properties of a film, in axes whose first one points to the press.
 
     Args:
         film: The film.
-        amplitude2: Square A^2 of the amplitude.
+        squared_amplitude: Square A^2 of the amplitude.
         angle: Direction of the press from the centre of the film, rad.
 
     Returns:
         Differences from the isotropic elasticity matrix and from the mean pretension.
     """
-    # The moduli are given in the axes of the film, and the tension in the axes x and y.
-    rotation = stress_rotation(film.axis - angle)
+    # The moduli refer to the axes of the material, which lie at this angle to the direction of the press.
+    material_angle = film.axis - angle
+    rotation = stress_rotation(material_angle)
     moduli = rotation @ orthotropic_moduli(film) @ rotation.T
 
+    # The pretension refers to the axes x and y. The x axis lies at the angle -angle to the direction of the press.
     half_difference, shear_tension = film.deviator
-    uneven_tension = np.array([half_difference, -half_difference, shear_tension])  # (T11, T22, T12) minus the mean
-    scaled_tension = rotate_stress(uneven_tension, -angle) / (film.young * amplitude2)
-    return Anisotropy(moduli, scaled_tension)
+    tension_difference = np.array([half_difference, -half_difference, shear_tension])  # (T11, T22, T12) minus the mean
+    rotated_difference = rotate_stress(tension_difference, -angle)
+    return Anisotropy(moduli, rotated_difference / (film.young * squared_amplitude))
 
 
 def orthotropic_moduli(film: Film) -> Array:
@@ -242,17 +244,17 @@ def orthotropic_moduli(film: Film) -> Array:
     return np.diag([difference_11, difference_22, difference_12])
 
 
-def side_force_unit(film: Film, amplitude2: Array | float) -> Any:
+def side_force_unit(film: Film, squared_amplitude: Array | float) -> Any:
     """Compute the side force that corresponds to a scaled side load of one, E h a A^2.
 
     Args:
         film: The film.
-        amplitude2: Square A^2 of the amplitude, a number or an array of any shape.
+        squared_amplitude: Square A^2 of the amplitude, a number or an array of any shape.
 
     Returns:
-        Force, N, of the shape and type of `amplitude2`.
+        Force, N, of the shape and type of `squared_amplitude`.
     """
-    return film.young * film.thickness * film.radius * amplitude2
+    return film.young * film.thickness * film.radius * squared_amplitude
 
 
 def slenderness(film: Film) -> float:

@@ -22,12 +22,12 @@ def principal_stresses(stresses: Array) -> tuple[float, float]:
     return float((mean - radius).min()), float((mean + radius).max())
 
 
-def strain(slope: Array, amplitude2: float) -> Array:
+def strain(slope: Array, squared_amplitude: float) -> Array:
     """Compute the scaled Green-Lagrange strain E' from the derivatives of the scaled displacements.
 
     Args:
         slope: Derivatives d(U1, U2, W)/d(X1, X2), shape (..., 2, 3): the derivative, then the component.
-        amplitude2: Square A^2 of the amplitude.
+        squared_amplitude: Square A^2 of the amplitude.
 
     Returns:
         (E11, E22, 2 E12), shape (..., 3).
@@ -36,7 +36,7 @@ def strain(slope: Array, amplitude2: float) -> Array:
     slope_2 = slope[..., 1, :]  # derivatives of (U1, U2, W) with respect to X2
 
     # The squares of the in-plane slopes are smaller than that of W by the factor A^2.
-    square_weights = np.array([amplitude2, amplitude2, 1.0])
+    square_weights = np.array([squared_amplitude, squared_amplitude, 1.0])
     strain_11 = slope_1[..., 0] + 0.5 * (slope_1**2) @ square_weights
     strain_22 = slope_2[..., 1] + 0.5 * (slope_2**2) @ square_weights
     double_strain_12 = slope_2[..., 0] + slope_1[..., 1] + (slope_1 * slope_2) @ square_weights

@@ -33,10 +33,11 @@ BISECTION_STEPS = 40
 
 
 def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
-    """Compute the parameters of the conformal map that maps the circle |z| = rho onto a given circle; see `placement`.
+    """Compute the conformal map of the unit disk that maps a circle about the origin onto a given circle.
 
-    The map (z + c) / (1 + c z) adds arctanh(c) to arctanh(z) for points on the x axis. The map must convert -rho and
-    rho into the two points of the given circle on the x axis.
+    The conformal map is (z + c) / (1 + c z); see `placement`. The circle about the origin has the radius rho. For
+    points on the x axis, the map adds arctanh(c) to arctanh(z). It must map -rho and rho to the two points at which the
+    given circle intersects the x axis. These two conditions determine c and rho.
 
     Args:
         centre: Centre of the circle on the x axis, any shape, in film radii.
@@ -45,6 +46,7 @@ def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
     Returns:
         The parameter c of the map and rho, each of the shape of `centre`.
     """
+    # The conditions are right_end = arctanh(c) + arctanh(rho) and left_end = arctanh(c) - arctanh(rho).
     right_end = np.arctanh(centre + radius)
     left_end = np.arctanh(centre - radius)
     c = np.tanh(0.5 * (right_end + left_end))

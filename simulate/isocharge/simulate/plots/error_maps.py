@@ -34,7 +34,7 @@ FORCE_COLOURS = ("#8fb8de", "#3a7ca5", INK)
 
 
 def identification_picture(identification: Identification) -> Figure:
-    """Draw the maps for the smallest and the largest force, and the error as a function of the distance.
+    """Draw maps of the position error for the smallest and the largest force, and the error against the distance.
 
     Args:
         identification: The identification.
@@ -43,18 +43,18 @@ def identification_picture(identification: Identification) -> Figure:
         Figure with two maps and the errors against the distance.
     """
     figure = new_figure(16.0, 5.2)
-    weak, strong, curves = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
-    for axes, limit_map in ((weak, identification.maps[0]), (strong, identification.maps[-1])):
-        shades = draw_limit_map(axes, identification, limit_map)
-    figure.colorbar(
-        shades,
-        ax=[weak, strong],
+    smallest_force_axes, largest_force_axes, distance_axes = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
+    draw_limit_map(smallest_force_axes, identification, identification.maps[0])
+    coloured_areas = draw_limit_map(largest_force_axes, identification, identification.maps[-1])
+    figure.colorbar(  # both maps have the same colours
+        coloured_areas,
+        ax=[smallest_force_axes, largest_force_axes],
         label="lower limit of the position error (rms), mm",
         ticks=TICKS,
         format="%g",
         pad=0.01,
     )
-    _draw_distance(curves, identification)
+    _draw_distance(distance_axes, identification)
     title = f"{identification.sensor.name}, {identification.probe.notation}, noise {identification.noise.name}"
     figure.suptitle(title, fontsize=13)
     return figure

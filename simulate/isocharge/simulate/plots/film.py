@@ -79,8 +79,10 @@ def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> Non
         radius: Radius of the circle, mm.
         title: Title of the axes.
     """
-    corners = np.concatenate([polygon for electrode in sensor.electrodes for polygon in electrode.front])
-    corner_x, corner_y = sensor.calibration.place(corners).T
+    # The drawing contains the electrodes as polygons. `place` converts points of the drawing into points on the film.
+    polygons = [polygon for electrode in sensor.electrodes for polygon in electrode.front]
+    drawn_corners = np.concatenate(polygons)
+    corner_x, corner_y = sensor.calibration.place(drawn_corners).T
     outermost = float(np.hypot(corner_x, corner_y).max())
     margin_mm = 0.7
     half_width = max(radius, outermost) + margin_mm

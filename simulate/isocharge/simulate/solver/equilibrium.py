@@ -102,7 +102,7 @@ def deflection(equilibrium: Equilibrium, points: Array) -> Array:
     basis_values = tensor_values(mesh.resolution.order, xi, eta)  # shape (n, n_local)
     nodal_field = equilibrium.field[mesh.template.nodes[element]]  # (U1, U2, W), shape (n, n_local, 3)
     scaled_deflection = (basis_values * nodal_field[..., 2]).sum(axis=1)
-    deflection_unit = equilibrium.film.radius * np.sqrt(equilibrium.groups.amplitude2)
+    deflection_unit = equilibrium.film.radius * np.sqrt(equilibrium.groups.squared_amplitude)
     return np.asarray(deflection_unit * scaled_deflection)
 
 
@@ -128,7 +128,7 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     # Strain of the mid-surface
     gradient = mesh.gradient(element, xi, eta)  # derivatives of the basis functions, shape (n, 2, n_local)
     nodal_displacement = equilibrium.field[mesh.template.nodes[element]]
-    total_strain = strain(gradient @ nodal_displacement, groups.amplitude2)
+    total_strain = strain(gradient @ nodal_displacement, groups.squared_amplitude)
 
     # Strain of bending from the second derivatives of W, and jump of the strain at the edges of a coat
     if surface != "middle":
@@ -139,7 +139,7 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
         total_strain = mesh.coat.film_strain(_rotated(equilibrium, points), total_strain)
 
     # Stress in the frame of the press, with s12 reversed in the reflected half, and then in the axes of the film
-    press_stress = equilibrium.film.young * groups.amplitude2 * scaled_stress(total_strain, groups)
+    press_stress = equilibrium.film.young * groups.squared_amplitude * scaled_stress(total_strain, groups)
     press_stress[is_reflected, 2] *= -1.0
     x, y = equilibrium.at
     film_stress = rotate_stress(press_stress, np.arctan2(y, x))
@@ -174,7 +174,7 @@ def _induced_stress(equilibrium: Equilibrium, surface: Surface) -> Array:
         (S11, S22, S12) at the nodes in units of E_young A^2, shape (n_element, n_local, 3).
     """
     slope = node_slope(equilibrium)  # of (U1, U2, W)
-    total_strain = strain(slope, equilibrium.groups.amplitude2)
+    total_strain = strain(slope, equilibrium.groups.squared_amplitude)
     if surface != "middle":
         slope_of_deflection = slope[..., 2]
         second_derivatives = equilibrium.mesh.node_derivatives(slope_of_deflection)
@@ -203,7 +203,7 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
             _, largest_at_surface = principal_stresses(_induced_stress(equilibrium, surface) + uneven_pretension)
             largest = max(largest, largest_at_surface)
 
-    stress_unit = equilibrium.film.young * groups.amplitude2
+    stress_unit = equilibrium.film.young * groups.squared_amplitude
     mean_pretension = equilibrium.film.pretension
     return stress_unit * smallest + mean_pretension, stress_unit * largest + mean_pretension
 
@@ -233,7 +233,7 @@ def _bending_strain(equilibrium: Equilibrium, surface: Surface, hessian: Array) 
         (E11, E22, 2 E12), shape (..., 3), in units of A^2.
     """
     film = equilibrium.film
-    half_thickness = 0.5 * film.thickness / (film.radius * np.sqrt(equilibrium.groups.amplitude2))
+    half_thickness = 0.5 * film.thickness / (film.radius * np.sqrt(equilibrium.groups.squared_amplitude))
     curvature = np.stack(
         [hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1] + hessian[..., 1, 0]],
         axis=-1,

@@ -54,7 +54,7 @@ WRINKLE_SHARE = 1e-3
 """Ratio of the compression to the largest stress above which a warning is given, dimensionless."""
 
 
-GROUPS = ("amplitude2", "load", "tension", "bending", "poisson")
+GROUPS = ("squared_amplitude", "load", "tension", "bending", "poisson")
 """Attributes of `DimensionlessGroups` that the JSON output contains."""
 
 

@@ -64,7 +64,7 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
     scaled_force[:n_direction] = -np.linalg.solve(compliance, slip)
     x, y = solved.at
     rotation = np.exp(1j * np.arctan2(y, x))
-    force = complex(*scaled_force) * side_force_unit(solved.film, groups.amplitude2) * rotation  # Fx + i Fy
+    force = complex(*scaled_force) * side_force_unit(solved.film, groups.squared_amplitude) * rotation  # Fx + i Fy
     return float(force.real), float(force.imag)
 
 

@@ -130,11 +130,11 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
             f"expected at least {min_rim_distance:.3g} mm, because the mesh around the footprint would be too thin; "
             "press farther inside"
         )
-    amplitude2 = amplitude_squared(film, force)
-    if amplitude2 > MAX_AMPLITUDE2:
+    squared_amplitude = amplitude_squared(film, force)
+    if squared_amplitude > MAX_AMPLITUDE2:
         raise SceneError(
             f"force {force:.4g} N stretches a film of {film.thickness:.4g} mm beyond small strains: expected "
-            f"(F / (E h a))^(2/3) up to {MAX_AMPLITUDE2:g}, got {amplitude2:.3g}"
+            f"(F / (E h a))^(2/3) up to {MAX_AMPLITUDE2:g}, got {squared_amplitude:.3g}"
         )
 
 

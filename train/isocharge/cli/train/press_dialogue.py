@@ -12,7 +12,7 @@ from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_events import PressEvents, SessionEnd
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, PortLost, PressError
-from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, WatchResult
+from isocharge.serve.live.steady_press import PORT_LOST, Phase, SteadyPress, WatchResult
 from isocharge.train.calibration.session import Answer, PressSession, describe_press, read_answer
 
 LINE_INTERVAL_s = 1.0
@@ -164,9 +164,10 @@ class Dialogue:
         if event.press is not None:
             self._screen.show_steady(event.press)
             self._take(event.press, contact)
-        elif event.reason == AWAY:
+        elif event.reason == PORT_LOST:
             raise PortLost(
-                f"{AWAY}; run the same command again, and let the machine continue with row {row_number} of its list"
+                f"{PORT_LOST}; run the same command again, and let the machine continue with row {row_number} of its "
+                "list"
             )
         else:
             self._screen.say(f"   row {row_number} is left out: {event.reason}")

@@ -108,13 +108,13 @@ def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[No
                 for draft in folder.glob(".*.draft"):
                     shutil.rmtree(draft, ignore_errors=True)  # removes a folder, and ignores a file
                     draft.unlink(missing_ok=True)  # removes a file
-                _publish(folder)
+                _copy_last_version(folder)
                 yield
         finally:
             remove_empty(folder_and_new_parents)
 
 
-def _publish(folder: Path) -> None:
+def _copy_last_version(folder: Path) -> None:
     """Copy the readable files of the last version to the folder above it, if they differ.
 
     Args:
@@ -154,13 +154,13 @@ def write_calibration(result: CalibrationResult, folder: Path, command: str = ""
     """
     check_calibration_folder(folder, result.problem.electrodes)
     with threadpool_limits(1):  # the matrices are small, so a second thread would only wait
-        version = _release(result, folder, command)
-    _publish(folder)
+        version = _write_version(result, folder, command)
+    _copy_last_version(folder)
     return version
 
 
-def _release(result: CalibrationResult, folder: Path, command: str) -> Path:
-    """Write the next version folder with the model and all files of a calibration; see `write_calibration`.
+def _write_version(result: CalibrationResult, folder: Path, command: str) -> Path:
+    """Write the model and all files of a calibration into the next version folder.
 
     The presses are not written if the calibration was moved to another temperature, because no presses were made at
     this temperature. The files for following the pretension are written only if the pretension can be followed.

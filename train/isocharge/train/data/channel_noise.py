@@ -70,17 +70,17 @@ class ChannelNoise:
 
     @classmethod
     def of(cls, charge: Array, unit: Array) -> "ChannelNoise":
-        """Estimate the noise from measured presses.
+        """Estimate the noise of each channel from measured presses.
 
         A plane through the neighbours of each press gives the charge without noise and the residual. The white noise
-        and the noise of the gain of each channel are fitted to the residuals. Both are limited from below.
+        and the noise of the gain are fitted to the residuals. Both have lower limits.
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.
             unit: Contacts in unit coordinates, shape (n, 3).
 
         Returns:
-            White noise and noise of the gain of each channel.
+            Noise model with the white noise and the noise of the gain of each channel.
         """
         planes = LocalPlanes.through(unit, charge)
         channel_variances = [
@@ -124,6 +124,8 @@ class ChannelNoise:
 
     def bend(self, charge: Array) -> Array:
         """Return the charges above which the features are logarithmic, shape (n_electrode,), pC.
+
+        The features are asinh(Q / charge). They are linear for smaller charges.
 
         Args:
             charge: Charges of presses, shape (n, n_electrode), pC.
@@ -173,28 +175,29 @@ class LocalPlanes:
         Returns:
             The planes, one for each press.
         """
-        distance, nearest = cKDTree(unit).query(unit, NEIGHBOURS + 1)
+        distance, nearest = cKDTree(unit).query(unit, NEIGHBOURS + 1)  # both of shape (n, NEIGHBOURS + 1)
         neighbours = nearest[:, 1:]  # the nearest point is the press itself
-        offsets = unit[neighbours] - unit[:, None]
+        offsets = unit[neighbours] - unit[:, None]  # shape (n, NEIGHBOURS, 3)
         # The constant and the offsets of the neighbours, shape (n, NEIGHBOURS, 1 + number of coordinates)
         columns = np.concatenate([np.ones((*neighbours.shape, 1)), offsets], axis=2)
         # The pseudoinverse contains the weights of the neighbours in the least-squares solution.
         neighbour_weights = np.linalg.pinv(columns)
-        coefficients = neighbour_weights @ values[neighbours]  # the value at the press, and then the slopes
+        # The first coefficient is the value at the press, and the others are the slopes; shape (n, 4, k).
+        coefficients = neighbour_weights @ values[neighbours]
         value = coefficients[:, 0]
-        slope = coefficients[:, 1:].swapaxes(1, 2)
+        slope = coefficients[:, 1:].swapaxes(1, 2)  # shape (n, k, 3)
 
         # The plane is itself uncertain, by the sum of the squared weights of its neighbours.
         value_weights = neighbour_weights[:, :1]  # weights in the value of the plane, shape (n, 1, NEIGHBOURS)
         residual_std = np.sqrt(1.0 + (value_weights**2).sum(axis=2))
         residual = (values - value) / residual_std
-        reach = distance[:, -1]
+        reach = distance[:, -1]  # the distances are sorted
         return cls(value, slope, residual, reach)
 
     def residuals(self, values: Array) -> Array:
-        """Compute the differences of values from the nearest point of any plane.
+        """Compute the difference of each value from the nearest point of all planes.
 
-        For each value, only the `CANDIDATES` planes whose centres are nearest to it are examined. A plane ends at the
+        Each value is compared with the `CANDIDATES` planes whose centres are nearest to the value. A plane ends at the
         distance of its farthest neighbour.
 
         Args:
@@ -203,16 +206,21 @@ class LocalPlanes:
         Returns:
             Differences, shape (m, k).
         """
-        _, candidate_planes = cKDTree(self.value).query(values, CANDIDATES)
-        inverse_slope = np.linalg.pinv(self.slope)
+        _, candidate_planes = cKDTree(self.value).query(values, CANDIDATES)  # indices, shape (m, CANDIDATES)
+        inverse_slope = np.linalg.pinv(self.slope)  # shape (n, 3, k)
         smallest_residual = np.full(values.shape, np.inf)
         for planes in candidate_planes.T:  # one plane for each value
-            # Project each value onto a plane, and limit the distance of the projection from the centre of the plane.
+            # Project each value onto its plane. The step leads from the centre of the plane to the projection, in unit
+            # coordinates, shape (m, 3). The additional last axis makes each difference a column vector.
             difference = values - self.value[planes]
             step = (inverse_slope[planes] @ difference[..., None])[..., 0]
+
+            # Shorten steps that end beyond the farthest neighbour.
             length = np.linalg.norm(step, axis=1)
-            step *= np.minimum(1.0, self.reach[planes] / np.maximum(length, TINY))[:, None]
-            residual = difference - (self.slope[planes] @ step[..., None])[..., 0]
+            factor = np.minimum(1.0, self.reach[planes] / np.maximum(length, TINY))
+            limited_step = step * factor[:, None]
+            residual = difference - (self.slope[planes] @ limited_step[..., None])[..., 0]
+
             is_nearer = (residual**2).sum(axis=1) < (smallest_residual**2).sum(axis=1)
             smallest_residual[is_nearer] = residual[is_nearer]
         return smallest_residual

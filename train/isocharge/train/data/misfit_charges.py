@@ -22,9 +22,6 @@ from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, Labelled
 KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}
 """Share of each kind of charges in the training examples, dimensionless."""
 
-FARTHEST = 2.5
-"""Decimal logarithm of the largest shift of charges of any sign, in standard deviations of the noise."""
-
 PAIR_EXPONENTS = (1.0, 1.75)
 """Smallest and largest exponent p with which the charges of two presses are combined, (Q1^p + Q2^p)^(1/p).
 
@@ -39,10 +36,13 @@ The misfits of 99 % of the examples then differ by less than 0.001 from those of
 """
 
 MOVED_LOG_STDS = (-3.0, 0.3)
-"""Decimal logarithms of the smallest and the largest standard deviation by which ln Q of moved charges varies."""
+"""Decimal logarithms of the smallest and the largest standard deviation of ln Q for moved positive charges."""
 
-SMALLEST_MOVE = -1.0
-"""Decimal logarithm of the smallest distance of moved charges of any sign, in standard deviations of their noise."""
+MOVED_LOG_DISTANCES = (-1.0, 2.5)
+"""Decimal logarithms of the smallest and the largest distance by which charges of any sign are moved.
+
+The unit of the distance is the standard deviation of the noise.
+"""
 
 WRONG_GAIN_STD = 0.15
 """Standard deviation of the logarithm of a wrong gain."""
@@ -65,8 +65,8 @@ The factor fills the gaps between the given presses.
 LARGEST_FACTOR = 2.0
 """Largest factor by which the charge map is scaled at a press. A quotient of charges near zero is meaningless."""
 
-FAR = 6.0
-"""Misfit above which the contact of a press may not be the nearest one, so that the nearest one is searched."""
+MAX_NEAR_MISFIT = 6.0
+"""Misfit at the contact of a press above which another contact may be nearer, so that a search is made."""
 
 
 def misfit_noise(noise: NoiseModel) -> NoiseModel:
@@ -74,12 +74,13 @@ def misfit_noise(noise: NoiseModel) -> NoiseModel:
 
     This unit is the noise of the training, or the noise `reference` if the training has no noise.
     """
-    return noise if noise.white > 0.0 else noise_model("reference")
+    has_noise = noise.white > 0.0
+    return noise if has_noise else noise_model("reference")
 
 
 @dataclass(frozen=True)
 class ExampleOptions:
-    """Limits of the charges of examples, and settings of the search for the nearest contact.
+    """Options for drawing examples.
 
     Attributes:
         candidates: Number of contacts among which the starts of a search are chosen.
@@ -203,19 +204,19 @@ def _residuals(
     residual = np.zeros_like(charge)
     near_rows = np.flatnonzero(is_near)
     start = chosen.contact[near_rows]
-    map_error = chosen.charge[near_rows] / charge_map.charges(start)
-    map_factor = np.clip(map_error, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
-    # Instead of the map, the charges and their noise are scaled, which gives the same residuals.
+    exact_factor = chosen.charge[near_rows] / charge_map.charges(start)
+    map_factor = np.clip(exact_factor, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
+    # To divide the charges and their noise by a factor gives the same residuals as to multiply the map by this factor.
     _, residual[near_rows] = explain(
         charge_map, charge[near_rows] / map_factor, sigma[near_rows] / map_factor, start, min_change=MIN_CHANGE
     )
 
     # A large residual near the press may be a local minimum, so a search is made for these charges, too.
-    is_far = np.linalg.norm(residual, axis=1) > FAR
-    searched_rows = np.flatnonzero(~is_near | is_far)
+    has_large_residual = np.linalg.norm(residual, axis=1) > MAX_NEAR_MISFIT
+    searched_rows = np.flatnonzero(~is_near | has_large_residual)
     _, searched_residual = find_nearest(charge_map, charge[searched_rows], sigma[searched_rows])
 
-    # Of both residuals, the smaller one is kept.
+    # Keep the smaller one of both residuals. Rows that are not near a press have only the residual of the search.
     near_residual = residual[searched_rows]
     is_near_smaller = (near_residual**2).sum(axis=1) < (searched_residual**2).sum(axis=1)
     keeps_near_residual = is_near[searched_rows] & is_near_smaller
@@ -223,19 +224,22 @@ def _residuals(
     return residual
 
 
-def draw_charges(rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> tuple[NDArray[Any], Array]:
-    """Draw a kind of charges for each press, and create charges of this kind.
+def draw_charges(
+    rng: np.random.Generator, charge: Array, other_charge: Array, noise: Noise
+) -> tuple[NDArray[Any], Array]:
+    """Draw a kind for each press, and change the charges of the press in the way of this kind.
 
     `KINDS` contains the probability of each kind.
 
     Args:
         rng: Random number generator.
         charge: Charges of presses, shape (n, n_electrode), pC.
-        others: Charges of further presses, for two presses at the same time and for the box, shape (m, n_electrode).
+        other_charge: Charges of further presses, shape (m, n_electrode), pC. The kind "two" adds one of these presses
+            as the second press. The kind "any" draws charges from a box around all of these presses.
         noise: Noise of good presses.
 
     Returns:
-        The kinds, shape (n,), and the charges, shape (n, n_electrode), pC.
+        Names of the kinds, shape (n,), and charges, shape (n, n_electrode), pC.
     """
     kind_names = np.array(list(KINDS))
     kind_index = rng.choice(len(KINDS), size=len(charge), p=list(KINDS.values()))
@@ -243,18 +247,18 @@ def draw_charges(rng: np.random.Generator, charge: Array, others: Array, noise: 
     drawn = np.empty_like(charge)
     for kind in KINDS:
         rows = kinds == kind
-        drawn[rows] = _draw_kind(kind, rng, charge[rows], others, noise)
+        drawn[rows] = _draw_kind(kind, rng, charge[rows], other_charge, noise)
     return kinds, drawn
 
 
-def _draw_kind(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> Array:
-    """Draw charges of one kind.
+def _draw_kind(kind: str, rng: np.random.Generator, charge: Array, other_charge: Array, noise: Noise) -> Array:
+    """Return the charges of presses, changed in the way of one kind.
 
     Args:
         kind: Name of the kind; see `KINDS`.
         rng: Random number generator.
         charge: Charges of presses, shape (n, n_electrode), pC.
-        others: Charges of further presses, shape (m, n_electrode), pC.
+        other_charge: Charges of further presses, shape (m, n_electrode), pC.
         noise: Noise of good presses.
 
     Returns:
@@ -272,19 +276,19 @@ def _draw_kind(kind: str, rng: np.random.Generator, charge: Array, others: Array
         case "scaled":
             return charge * _common_factors(rng, charge.shape)
         case "two":
-            second_charge = others[rng.integers(len(others), size=len(charge))]
+            second_charge = other_charge[rng.integers(len(other_charge), size=len(charge))]
             exponent = rng.uniform(*PAIR_EXPONENTS, (len(charge), 1))
             return combined_charge(charge, second_charge, exponent)
         case _:
-            return _any_charges(rng, charge.shape, others, noise)
+            return _any_charges(rng, charge.shape, other_charge, noise)
 
 
 def _moved_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Array:
     """Move charges in random directions by random distances.
 
-    Charges of any sign are moved by up to 10^FARTHEST standard deviations of their noise. Positive charges are
-    multiplied by factors whose logarithms are normally distributed. The standard deviation of the logarithms is between
-    0.001 and 2.
+    Charges of any sign are moved by a multiple of the standard deviation of their noise; see `MOVED_LOG_DISTANCES`.
+    Positive charges are multiplied by factors whose logarithms are normally distributed. The standard deviation of the
+    logarithms is between 0.001 and 2.
 
     Args:
         rng: Random number generator.
@@ -296,7 +300,7 @@ def _moved_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Arr
     """
     one_per_press = (len(charge), 1)  # the shape of an array with one number for each press
     if isinstance(noise, ChannelNoise):
-        distance = 10.0 ** rng.uniform(SMALLEST_MOVE, FARTHEST, one_per_press)
+        distance = 10.0 ** rng.uniform(*MOVED_LOG_DISTANCES, one_per_press)
         moved_level = noise.level(charge) + distance * rng.standard_normal(charge.shape)
         return noise.charge(moved_level)
     log_std = 10.0 ** rng.uniform(*MOVED_LOG_STDS, one_per_press)
@@ -329,7 +333,7 @@ def _common_factors(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
     return np.asarray(common_factor * np.exp(COMMON_FACTOR_SCATTER * rng.standard_normal(shape)))
 
 
-def _any_charges(rng: np.random.Generator, shape: tuple[int, ...], others: Array, noise: Noise) -> Array:
+def _any_charges(rng: np.random.Generator, shape: tuple[int, ...], other_charge: Array, noise: Noise) -> Array:
     """Draw charges from a box that contains the charges of all presses.
 
     Charges of any sign are uniformly distributed in units of their noise. The logarithms of positive charges are
@@ -338,14 +342,14 @@ def _any_charges(rng: np.random.Generator, shape: tuple[int, ...], others: Array
     Args:
         rng: Random number generator.
         shape: Shape of the charges, (n, n_electrode).
-        others: Charges of presses, which determine the box for charges of any sign, shape (m, n_electrode), pC.
+        other_charge: Charges of presses, which determine the box for charges of any sign, shape (m, n_electrode), pC.
         noise: Noise of good presses; a `ChannelNoise` for charges of any sign.
 
     Returns:
         Charges, shape (n, n_electrode), pC.
     """
     if isinstance(noise, ChannelNoise):
-        level = noise.level(others)
+        level = noise.level(other_charge)
         lowest = level.min(axis=0)
         highest = level.max(axis=0)
         margin = 0.5 * (highest - lowest)  # on both sides, so the box is twice as wide as the range of the charges

@@ -18,8 +18,10 @@ from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
 from isocharge.train.data.channel_noise import Noise
 
 LOWEST_CHARGE = 1.0
+"""Smallest positive charge, pC. Smaller charges are set to this value before the logarithm, which is then finite."""
+
 HIGHEST_CHARGE = 1e6
-"""Limits to which charges are clipped before the logarithm, pC, so that every charge gives a finite answer."""
+"""Largest positive charge, pC. Larger charges are set to this value before the logarithm."""
 
 SOLVER = "solver"
 """Name of an entry that the manifest of every simulated dataset has, and that of a measured dataset does not have."""

@@ -34,6 +34,16 @@ is much less than the statistical error of the correlation.
 N_COMPARED = 10_000
 """Number of presses with noise on which the graph and the network are compared."""
 
+EXTREME_CHARGES_pC = (-LARGEST, LOWEST_CHARGE, LARGEST)
+"""Charges for which every output must be finite, pC.
+
+`LARGEST` is the largest float32 number. Smaller positive charges than `LOWEST_CHARGE` are set to this value before the
+logarithm, so it gives the smallest logarithm.
+"""
+
+EXTREME_SEED = 4
+"""Seed of the combinations of extreme charges. Every check of a graph uses the same combinations."""
+
 QUANTILE = 0.999
 """Fraction of the presses that must meet the tolerances.
 
@@ -74,7 +84,7 @@ def check_graph(
     """
     session = open_session(graph, "the exported graph")
     ordinary, extreme = _golden_charges(exact, presses, noise)
-    _check_finite(session, presses.charge.shape[1])
+    _check_finite_outputs(session, n_electrode=presses.charge.shape[1])
     _compare(session, exact, extreme, floors, tolerance_factor=EXTREME_FACTOR)
     repeated_rows = np.arange(N_COMPARED) % len(presses)
     noisy = presses[repeated_rows].noisy(noise, seed=3).astype(np.float32)
@@ -101,35 +111,37 @@ def _golden_charges(exact: OutputFunction, presses: LabelledPresses, noise: Nois
     position_std = std[:, 0] + std[:, 1]
     well_determined = presses[np.flatnonzero(position_std <= np.median(position_std))]
 
-    # Half of the golden charges are those of presses without noise, and a quarter those of presses with noise.
+    # Half of the charges belong to presses without noise, and a quarter to every second of these presses with noise.
     chosen_rows = np.linspace(0, len(well_determined) - 1, N_GOLDEN // 2).astype(int)
     chosen = well_determined[chosen_rows]
     every_second = chosen[np.arange(0, len(chosen), 2)]
     press_charge = np.concatenate([chosen.charge, every_second.noisy(noise, seed=2)])
 
-    # The last quarter are very small and very large charges, zero charges, and negative charges.
+    # The last quarter has charges from 0.001 to 1000 times those of the presses, zero charges and negative charges.
     extreme_charge = every_second.charge * np.geomspace(1e-3, 1e3, len(every_second))[:, None]
     extreme_charge[0] = 0.0
     extreme_charge[1] = -extreme_charge[1]
     return press_charge.astype(np.float32), extreme_charge.astype(np.float32)
 
 
-def _check_finite(session: ort.InferenceSession, n_electrode: int) -> None:
-    """Check that the outputs are finite for the largest and smallest charges, for which the network extrapolates.
+def _check_finite_outputs(session: ort.InferenceSession, n_electrode: int) -> None:
+    """Check that all outputs are finite for random combinations of `EXTREME_CHARGES_pC`.
+
+    The network was not trained with such charges, so it extrapolates.
 
     Args:
         session: The exported graph.
-        n_electrode: Number of charges.
+        n_electrode: Number of charges of a press.
 
     Raises:
-        TrainingError: If an output is not finite.
+        TrainingError: If an output is infinite or NaN.
     """
-    random = np.random.default_rng(4)
-    charges = random.choice([-LARGEST, LOWEST_CHARGE, LARGEST], (N_COMPARED, n_electrode)).astype(np.float32)
+    rng = np.random.default_rng(EXTREME_SEED)
+    charges = rng.choice(EXTREME_CHARGES_pC, (N_COMPARED, n_electrode)).astype(np.float32)
     for name, output in run(session, charges).items():
-        infinite_rows = np.flatnonzero(~np.isfinite(output).all(axis=1))
-        if infinite_rows.size:
-            row = infinite_rows[0]
+        is_finite = np.isfinite(output).all(axis=1)  # one value for each row of charges
+        if not is_finite.all():
+            row = int(np.argmin(is_finite))  # the first row that is not finite
             raise TrainingError(
                 f"the network answers {name} = {output[row]} to the charges {charges[row]} pC; expected finite "
                 "numbers for any charges: train with more steps or another seed"
@@ -152,7 +164,7 @@ def _compare(
         session: The graph.
         exact: The outputs of the network in double precision.
         charge: Charges, shape (n, n_electrode), pC.
-        floors: Values of x, y and the force below which differences count as absolute differences.
+        floors: Values of x and y, mm, and of the force, N, below which differences count as absolute differences.
         tolerance_factor: Factor on the tolerances.
 
     Raises:
@@ -161,10 +173,10 @@ def _compare(
     expected_outputs = exact(charge.astype(float))
     _, expected_std, *_ = expected_outputs
     contact_floor = np.maximum(floors, STD_FACTOR * expected_std)
-    for expected, (name, given) in zip(expected_outputs, run(session, charge).items(), strict=True):
-        # Differences are relative to the expected value, but at least to the floor.
+    for expected, (name, graph_output) in zip(expected_outputs, run(session, charge).items(), strict=True):
+        # A difference is divided by the magnitude of the expected value, or by the floor if the floor is larger.
         floor = contact_floor if name in ("contact", "contact_std") else 1.0
-        relative_difference = np.abs(expected - given) / np.maximum(np.abs(expected), floor)
+        relative_difference = np.abs(expected - graph_output) / np.maximum(np.abs(expected), floor)
         press_difference = relative_difference.max(axis=1)
         quantile = float(np.quantile(press_difference, QUANTILE))
         largest = float(press_difference.max())

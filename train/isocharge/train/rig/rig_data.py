@@ -40,11 +40,11 @@ HELD_OUT = "held_out.csv"
 SENSOR = "sensor.toml"
 """File beside the model that contains the description of the sensor."""
 
-DRAWN_PRESSES = 24_000
+TRAINING_PRESSES = 24_000
 """Number of presses of the corrected map on which the network is trained."""
 
 MAP_MARGIN = 1.01
-"""Factor by which a forward map exceeds the distances and forces of its contacts.
+"""Factor by which the radius and the range of the forces of a forward map exceed those of its domain, dimensionless.
 
 The margin is needed for finite differences at the edge of the domain."""
 
@@ -66,19 +66,22 @@ class Rig:
     radius: float = DEFAULT_RADIUS
 
 
-def rig_data(rig: Rig, *, drawn: int = DRAWN_PRESSES, seed: int = 0) -> TrainingData:
-    """Make the training data of a sensor from measured presses on it.
+def rig_data(rig: Rig, *, training_presses: int = TRAINING_PRESSES, seed: int = 0) -> TrainingData:
+    """Create the training data of a sensor from measured presses on it.
 
-    A warning is logged about presses that are left out, and about a scatter that the noise and the errors of the
-    contacts do not explain.
+    The forward map of the described sensor is corrected by the measured presses. The network is trained on random
+    presses whose charges the corrected map computes. A fifth of the measured presses is held out as test data.
+
+    A warning is logged if presses are left out. Another warning is logged if the measured presses differ from the
+    corrected map by more than their noise and the errors of their contacts.
 
     Args:
-        rig: The presses, 50 or more. A fifth of the presses is held out, and the errors are measured on these presses.
-        drawn: Number of presses of the corrected map on which the network is trained.
-        seed: Seed of these presses.
+        rig: The measured presses, 50 or more, with their sensor and probe.
+        training_presses: Number of random presses for the training.
+        seed: Seed of the random presses.
 
     Returns:
-        Presses of the corrected map for the training, and the held-out presses for the test.
+        The random presses for the training, and the held-out presses for the test.
 
     Raises:
         PressError: If there are too few presses.
@@ -87,10 +90,12 @@ def rig_data(rig: Rig, *, drawn: int = DRAWN_PRESSES, seed: int = 0) -> Training
     presses = _usable_presses(rig, domain)
     is_held_out = held_out(presses.contact)
 
-    # The map is solved with a margin around the domain, for the derivatives at its edge.
+    # Finite differences at the edge of the domain need the map a little beyond the edge.
     min_force, max_force = domain.force_range
+    map_radius = domain.radius * MAP_MARGIN
     map_force_range = (min_force / MAP_MARGIN, max_force * MAP_MARGIN)
-    forward_map = ForwardMap.build(rig.sensor, rig.probe, domain.radius * MAP_MARGIN, map_force_range)
+    forward_map = ForwardMap.build(rig.sensor, rig.probe, map_radius, map_force_range)
+
     film = correct_film(presses[~is_held_out], forward_map, domain, noise_model("reference"))
     if film.is_scattered:
         _log.warning(
@@ -99,11 +104,9 @@ def rig_data(rig: Rig, *, drawn: int = DRAWN_PRESSES, seed: int = 0) -> Training
             "--config)",
             film.scatter,
         )
-    return replace(
-        TrainingData.of(_draw_dataset(film, drawn, seed)),
-        test=LabelledPresses(presses.contact[is_held_out], presses.charge_pC[is_held_out], measured=True),
-        provenance=_provenance(film, presses, is_held_out),
-    )
+    training_data = TrainingData.of(_draw_dataset(film, training_presses, seed))
+    test_presses = LabelledPresses(presses.contact[is_held_out], presses.charge_pC[is_held_out], measured=True)
+    return replace(training_data, test=test_presses, provenance=_provenance(film, presses, is_held_out))
 
 
 def _usable_presses(rig: Rig, domain: Domain) -> MeasuredPresses:

@@ -63,27 +63,37 @@ MAX_DEVIATION = 5.0
 MIN_SINE = 1e-4
 """Smallest absolute value of the sine of an angle, so that quotients stay within the range of float32."""
 
-ANGLE_SUMS = np.array([[1, 0, 1, 1, 1, 1, 1, 1], [0, 1, -1, 1, -1, -1, 1, 1], [0, 0, 0, 0, -1, 1, -1, 1]], dtype=float)
-"""Matrix from the angles (a, b, c) to the arguments of the eight cosines."""
+ANGLES_TO_COSINE_ARGUMENTS = np.array(
+    [
+        [1, 0, 1, 1, 1, 1, 1, 1],  # coefficients of a
+        [0, 1, -1, 1, -1, -1, 1, 1],  # coefficients of b
+        [0, 0, 0, 0, -1, 1, -1, 1],  # coefficients of c
+    ],
+    dtype=float,
+)
+"""Matrix, shape (3, 8), from the angles (a, b, c) to the arguments of the eight cosines.
+
+The arguments are a, b, a - b, a + b, a - b - c, a - b + c, a + b - c and a + b + c.
+"""
 
 
 def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: NoiseModel, seed: int) -> FoldedNetwork:
-    """Return a network with outputs for the correlations between the errors of x, y and the force.
+    """Return a network that also estimates the correlations between its errors of x, y and ln F.
 
-    The network estimates the contacts of presses with noise, and the angles of the correlations are fitted to the
-    errors of these estimates. The angles depend only on the input features and on hidden units that influence the
-    contact.
+    Three angles a, b and c determine the correlations; see the description of this module. Each angle is a linear
+    function of the input features and of the hidden units that influence the contact. The linear functions are fitted
+    to the errors of the network for presses with noise. The other outputs do not change.
 
     Args:
         network: The trained network.
         presses: Presses on which the network was trained.
-        noise: Noise that is added to their charges.
+        noise: Noise that is added to the charges of the presses.
         seed: Seed of the noise.
 
     Returns:
-        The network with additional answers, the angles of the correlations.
+        Network with eight additional answers: the arguments of the cosines from which the correlations are computed.
     """
-    # Errors of (x, y, ln F) and their stated standard deviations, each of shape (n, 3)
+    # Errors of (x, y, ln F) and their estimated standard deviations, each of shape (n, 3)
     layers = network.layers
     examples = presses.repeated(N_EXAMPLES)
     features = network.features.evaluate(examples.noisy(noise, seed))
@@ -93,32 +103,38 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
     error = np.column_stack([truth[:, :2] - contact[:, :2], np.log(truth[:, 2] / contact[:, 2])])
     error_std = np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]])
 
-    is_contact_unit = np.any(layers.last.weight[:, :N_CONTACT_ANSWERS] != 0.0, axis=1)
+    # Fit the angles a, b and c.
+    contact_weight = layers.last.weight[:, :N_CONTACT_ANSWERS]  # shape (n_hidden, N_CONTACT_ANSWERS)
+    is_contact_unit = np.any(contact_weight != 0.0, axis=1)
     inputs = np.hstack([hidden_output[:, is_contact_unit], features])
     with threadpool_limits(1):  # the steps are small: two threads would take three times as long
         angles = _fit_angles(inputs, error / error_std)
 
-    # The first rows of the weights belong to the hidden units of the contact, the others to the features. All other
-    # hidden units get the weight zero. The output layer contains the sums of angles whose cosines are needed.
-    hidden_weight, skip_weight = np.split(angles.weight, [np.count_nonzero(is_contact_unit)])
-    last_weight = np.zeros((hidden_output.shape[1], 3))
-    last_weight[is_contact_unit] = hidden_weight
-    last = Layer(last_weight @ ANGLE_SUMS, angles.bias @ ANGLE_SUMS)
-    return network.with_angles(last, skip_weight @ ANGLE_SUMS)
+    # The inputs of the fit were the hidden units of the contact, followed by the features. The hidden units of the
+    # misfit get the weight zero.
+    n_contact_unit = np.count_nonzero(is_contact_unit)
+    contact_unit_weight, skip_weight = np.split(angles.weight, [n_contact_unit])
+    hidden_weight = np.zeros((hidden_output.shape[1], 3))
+    hidden_weight[is_contact_unit] = contact_unit_weight
+
+    # The correlations are weighted sums of cosines of a, b, a - b, a + b and so on. The new output layer computes these
+    # eight arguments instead of the three angles.
+    argument_layer = Layer(hidden_weight @ ANGLES_TO_COSINE_ARGUMENTS, angles.bias @ ANGLES_TO_COSINE_ARGUMENTS)
+    return network.with_angles(argument_layer, skip_weight @ ANGLES_TO_COSINE_ARGUMENTS)
 
 
 def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
-    """Fit the linear layer that gives the angles.
+    """Fit the linear layer that computes the angles a, b and c.
 
-    The inputs are whitened for the fit, and the whitening is included in the returned layer. The loss is that of
+    The inputs are whitened for the fit. The returned layer includes this whitening. The loss is that of
     `correlation_loss` plus a penalty on the squared weights.
 
     Args:
         inputs: Inputs of the layer, shape (n, k).
-        deviation: Errors of (x, y, ln F) over their standard deviations, shape (n, 3).
+        deviation: Errors of (x, y, ln F) divided by their standard deviations, shape (n, 3).
 
     Returns:
-        Layer with weight of shape (k, 3) and bias of shape (3,).
+        Layer from the inputs to the angles: weight, shape (k, 3), and bias, shape (3,).
     """
     mean, matrix = whitening(inputs[::WHITENING_STRIDE], MIN_RELATIVE_STD)
     white_inputs = np.ascontiguousarray((inputs - mean) @ matrix, dtype=np.float32)
@@ -130,7 +146,7 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
         """Return the loss and its gradient with respect to bias and weights in units of FIRST_STEP.
 
         Args:
-            scaled: Bias and weights of the three angles over FIRST_STEP, flattened, shape (3 (1 + n_input),).
+            scaled: Bias and weights of the three angles divided by FIRST_STEP, flattened, shape (3 (1 + n_input),).
         """
         bias, weight = np.split(FIRST_STEP * scaled.reshape(-1, 3), [1])  # shapes (1, 3) and (n_input, 3)
         single_weight = weight.astype(np.float32)
@@ -148,7 +164,7 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
     start[0] = 0.5 * np.pi / FIRST_STEP
     scaled_solution = _minimise(loss, start.ravel())
     bias, white_weight = np.split(FIRST_STEP * scaled_solution.reshape(start.shape), [1])
-    # ((inputs - mean) @ matrix) @ white_weight + bias, as a layer of the inputs themselves
+    # ((inputs - mean) @ matrix) @ white_weight + bias = inputs @ weight + (bias - mean @ weight)
     weight = matrix @ white_weight
     return Layer(weight, bias[0] - mean @ weight)
 
@@ -191,10 +207,10 @@ def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tup
 
     Args:
         angles: Angles a, b and c, shape (3, n), rad.
-        deviation: Errors of x, y and ln F over their standard deviations, shape (3, n).
+        deviation: Errors of x, y and ln F divided by their standard deviations, shape (3, n).
 
     Returns:
-        Mean over the n errors, and its derivatives with respect to the angles, shape (3, n).
+        Mean of the loss over the n errors, and the derivatives of the mean with respect to the angles, shape (3, n).
     """
     sine = np.sin(angles)
     cos_a, cos_b, cos_c = np.cos(angles)

@@ -138,11 +138,11 @@ class FoldedNetwork:
         return replace(self, layers=replace(self.layers, last=Layer(weight, bias + added)))
 
     def with_angles(self, last: Layer[Array], skip: Array) -> "FoldedNetwork":
-        """Return the network with additional answers, the angles of the correlations.
+        """Return the network with eight additional answers, from whose cosines the correlations are computed.
 
         Args:
-            last: Output layer of the angles: weight, shape (n_hidden, 8), and bias, shape (8,).
-            skip: Weights of the skip layer to the angles, shape (n_electrode, 8).
+            last: Output layer of these angles: weight, shape (n_hidden, 8), and bias, shape (8,).
+            skip: Weights from the input features to these angles, shape (n_electrode, 8).
         """
 
         def with_columns(values: Array, angle_values: Array) -> Array:

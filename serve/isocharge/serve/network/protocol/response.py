@@ -77,11 +77,12 @@ def refusal(status: int, message: str, error: str | None = None) -> Response:
 def error_response(error: Exception) -> Response:
     """Return the response to a request that raised an error.
 
-    The body contains the message. If the method is wrong, a header names the allowed method. If the token is missing or
-    wrong, a header names the required authentication.
+    The body contains the message. If the HTTP method is wrong, the header `Allow` names the allowed method. If the
+    token is missing or wrong, the header `WWW-Authenticate` names the required authentication.
     """
-    http_status, _ = statuses(error)
-    response = refusal(http_status, client_message(error), type(error).__name__)
+    http_status, _ = statuses(error)  # the second status is that of gRPC
+    error_class = type(error).__name__
+    response = refusal(http_status, client_message(error), error_class)
     if isinstance(error, errors.WrongMethod):
         response.headers.append((b"allow", error.allowed.encode()))
     if isinstance(error, errors.TokenError):
