@@ -43,7 +43,7 @@ from isocharge.train.calibration.result import film_without_presses
 from isocharge.train.films.films_file import _checksum as films_checksum
 from isocharge.train.films.films_file import films_from_bytes
 from isocharge.train.training.config import load_config
-from isocharge.train.training.descent import tensors
+from isocharge.train.training.descent import tensors_from_bytes
 
 ROOT = Path(__file__).parents[2]
 
@@ -422,7 +422,7 @@ def test_parts_of_runs_with_faults(tmp_path, attack):
 
         def read_state(data):
             run.save("weights", data)
-            run.load("weights", tensors)
+            run.load("weights", tensors_from_bytes)
 
         attack("files part", read_array, lambda rng: mutated(rng, array.getvalue()), 2_000)
         attack("files checkpoint", read_state, lambda rng: mutated(rng, state.getvalue()), 2_000)

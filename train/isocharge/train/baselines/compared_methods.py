@@ -155,27 +155,28 @@ class ComparedMethod:
         presses = task.presses(self.copies)
         true_contact = task.validation.contact
         validation_inputs = self.inputs(task.validation_charge, true_contact[:, 2])  # with the true force if it is used
-        grid = list(ParameterGrid(dict(self.candidates)))
+        parameter_sets = list(ParameterGrid(dict(self.candidates)))
         if task.quick:
-            grid = grid[:1]
+            parameter_sets = parameter_sets[:1]
 
         regressors = []
         errors_mm = []
-        for parameters in grid:
+        for parameters in parameter_sets:
             regressor = clone(self.regressor).set_params(**parameters)
             regressor.fit(presses.charge, presses.contact)
             estimate = regressor.predict(validation_inputs)
             regressors.append(regressor)
             errors_mm.append(rms(position_error(estimate, true_contact)))
-        best = int(np.argmin(errors_mm))
+        best_index = int(np.argmin(errors_mm))
 
         # The text that describes the chosen parameters
-        descriptions = [describe_parameter(name, value) for name, value in grid[best].items()]
-        kind = "noisy" if self.copies else "clean"
-        descriptions.append(f"{len(presses)} {kind} presses")
-        if len(grid) > 1:
-            descriptions.append(f"best of {len(grid)} by validation ({errors_mm[best]:.3f} mm rms)")
-        return replace(self, regressor=regressors[best], choice=self.choice or ", ".join(descriptions))
+        descriptions = [describe_parameter(name, value) for name, value in parameter_sets[best_index].items()]
+        noise_word = "noisy" if self.copies else "clean"
+        descriptions.append(f"{len(presses)} {noise_word} presses")
+        if len(parameter_sets) > 1:
+            best_error_mm = errors_mm[best_index]
+            descriptions.append(f"best of {len(parameter_sets)} by validation ({best_error_mm:.3f} mm rms)")
+        return replace(self, regressor=regressors[best_index], choice=self.choice or ", ".join(descriptions))
 
 
 def describe_parameter(name: str, value: object) -> str:
@@ -226,7 +227,7 @@ def compared_methods(task: FittingTask, charge_map: ChargeMap | None = None) -> 
     domain = task.domain
     return [
         *_triangulations(charge_map),
-        ComparedMethod(LINEAR_BAND, "paper", KD_TREE, LinearBand(domain.radius), 0, {"degree": (6, 10, 14)}),
+        ComparedMethod(LINEAR_BAND, "paper", KD_TREE, LinearBand(domain.radius), candidates={"degree": (6, 10, 14)}),
         ComparedMethod(
             "lookup table, nearest entry", "paper", SKLEARN, on_logarithms(domain, entry=KNeighborsRegressor(1))
         ),
@@ -272,7 +273,7 @@ def polynomial_ridge(task: FittingTask) -> ComparedMethod:
         "regressor__monomials__degree": degrees,
         "regressor__ridge__alpha": penalties,
     }
-    return ComparedMethod(POLYNOMIAL, "learnt", SKLEARN, regressor, copies, candidates)
+    return ComparedMethod(POLYNOMIAL, "learnt", SKLEARN, regressor, copies=copies, candidates=candidates)
 
 
 def _triangulations(charge_map: ChargeMap | None) -> list[ComparedMethod]:
@@ -298,15 +299,16 @@ def _scaled_axes() -> FunctionTransformer:
 
 
 def _axis_scale_candidates(task: FittingTask) -> dict[str, Sequence[Any]]:
-    """Return the candidates for the factors of the principal axes."""
-    return {"regressor__scales__kw_args": AXIS_SCALES[1:2] if task.quick else AXIS_SCALES}
+    """Return the candidates for the factors of the principal axes; a quick task has only one candidate."""
+    candidates = AXIS_SCALES[1:2] if task.quick else AXIS_SCALES
+    return {"regressor__scales__kw_args": candidates}
 
 
 def _interpolated_table(task: FittingTask) -> ComparedMethod:
     """Return the lookup table with affine maps."""
     regressor = on_logarithms(task.domain, scales=_scaled_axes(), table=AffineTable())
     candidates = _axis_scale_candidates(task) | {"regressor__table__neighbours": (64, 128)}
-    return ComparedMethod(TABLE, "paper", KD_TREE, regressor, 5, candidates)
+    return ComparedMethod(TABLE, "paper", KD_TREE, regressor, copies=5, candidates=candidates)
 
 
 def _nearest_neighbours(task: FittingTask) -> ComparedMethod:
@@ -337,6 +339,7 @@ def _gradient_boosting(task: FittingTask) -> ComparedMethod:
 
 def _gaussian_process(task: FittingTask) -> ComparedMethod:
     """Return a Gaussian process on a subset of the presses."""
-    process = SubsetProcess(300, 150, task.seed) if task.quick else SubsetProcess(2000, 500, task.seed)
+    points, kernel_points = (300, 150) if task.quick else (2000, 500)
+    process = SubsetProcess(points, kernel_points, task.seed)
     regressor = on_logarithms(task.domain, process=process)
-    return ComparedMethod("Gaussian process", "learnt", SKLEARN, regressor, 1)
+    return ComparedMethod("Gaussian process", "learnt", SKLEARN, regressor, copies=1)

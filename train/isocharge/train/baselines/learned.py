@@ -56,7 +56,7 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Transformer that computes ln(max(Q, 1 pC)), or asinh(2 Q / usual size) if the charges have both signs."""
 
     def fit(self, charge: Array, target: object = None) -> "Logarithms":
-        """Determine the scale of the charges; None if no electrode has charges of both signs.
+        """Compute the scale of the charges. If no electrode has charges of both signs, the scale is None.
 
         The charges of an electrode have both signs if more than the fraction `BOTH_SIGNS` of them is not positive. A
         smaller fraction can be due to noise alone.
@@ -69,8 +69,9 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
             This transformer.
         """
         del target
-        is_negative = charge <= 0.0
-        has_both_signs = (is_negative.mean(axis=0) > BOTH_SIGNS).any()
+        is_not_positive = charge <= 0.0
+        not_positive_fraction = is_not_positive.mean(axis=0)  # one value for each electrode
+        has_both_signs = (not_positive_fraction > BOTH_SIGNS).any()
         self.scale_ = LEAST_BEND * usual_size(charge) if has_both_signs else None
         return self
 
@@ -82,12 +83,15 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def scale_axes(values: Array, force: float, rest: float) -> Array:
-    """Transformer that multiplies the principal axes of whitened logarithms by factors.
+    """Multiply the principal axes of whitened logarithms by factors. The axes of the position remain as they are.
 
     Args:
         values: Whitened logarithms, shape (n, n_electrode).
         force: Factor of the first axis, which carries the force.
         rest: Factor of the axes after the third, which carry mostly noise.
+
+    Returns:
+        Scaled values, shape (n, n_electrode).
     """
     factors = np.full(values.shape[1], rest)
     factors[:N_POSITION_AND_FORCE_AXES] = 1.0
@@ -123,7 +127,9 @@ class ResidualRegressor(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
 
 class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """Gaussian process on a random subset of the presses, because its cost grows with the cube of their number.
+    """Gaussian process that is fitted to a random subset of the presses.
+
+    The cost of a Gaussian process grows with the cube of the number of presses.
 
     Args:
         points: Number of presses of the process.

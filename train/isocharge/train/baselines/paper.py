@@ -134,7 +134,7 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         axis = np.linspace(-1.0, 1.0, GRID_POINTS)
         square_grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
         is_in_disk = np.hypot(square_grid[:, 0], square_grid[:, 1]) <= 1.0
-        grid = square_grid[is_in_disk]  # positions over the radius
+        grid = square_grid[is_in_disk]  # positions divided by the radius, shape (n_grid, 2)
 
         charge_per_force = np.exp(self._terms(grid) @ coefficients)
         value_and_slopes = [charge_per_force]
@@ -143,7 +143,10 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
             value_and_slopes.append(charge_per_force * log_difference / (2.0 * DIFFERENCE_STEP * self.radius))
 
         self.position_ = grid * self.radius
-        self.inverse_ = np.linalg.pinv(np.stack(value_and_slopes, axis=2))
+        linear_map = np.stack(
+            value_and_slopes, axis=2
+        )  # from (F, F dx, F dy) to charges, shape (n_grid, n_electrode, 3)
+        self.inverse_ = np.linalg.pinv(linear_map)
         self.tree_ = cKDTree(unit_vectors(charge_per_force))
 
     def predict(self, charge: Array) -> Array:
@@ -191,7 +194,10 @@ CHUNK = 100_000
 """Number of neighbours that are gathered at once."""
 
 RIDGE = 1e-6
-"""Ridge of an affine map, relative to the trace of the normal matrix; neighbours can lie in a plane."""
+"""Ridge of an affine map, relative to the trace of the normal matrix.
+
+Without a ridge, neighbours that lie in a plane would not determine the map.
+"""
 
 
 class AffineTable(BaseEstimator, RegressorMixin):  # type: ignore[misc]

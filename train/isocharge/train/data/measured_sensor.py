@@ -28,6 +28,10 @@ LONGEST_MITRE = 2.0
 """Largest ratio of the distance by which a corner is moved outwards to the distance by which the sides are moved."""
 
 
+MIN_TURN_rad = 1e-6
+"""Smallest angle between two neighbouring sides of an outline, rad. A corner with a smaller angle is left out."""
+
+
 @dataclass(frozen=True)
 class MeasuredSensor:
     """Description of a sensor in the metadata of a model of measured presses.
@@ -147,14 +151,14 @@ def outline(places: Array) -> Array:
         PressError: If the places lie on a line, or almost.
     """
     # The singular values are proportional to the extents of the places along their principal axes.
-    on_a_line = f"expected presses over an area, got {len(places)} places on one line; press beside it, too"
+    line_message = f"expected presses over an area, got {len(places)} places on one line; press beside it, too"
     length, width = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
     if width <= LEAST_WIDTH * length:
-        raise PressError(on_a_line)
+        raise PressError(line_message)
     try:
         triangles = Delaunay(places).simplices
     except QhullError as error:
-        raise PressError(on_a_line) from error
+        raise PressError(line_message) from error
 
     # The nearest place is the place itself, and the second nearest is its nearest neighbour.
     distances, _ = cKDTree(places).query(places, 2)
@@ -264,7 +268,7 @@ def _enlarged_polygon(corners: Array, distance: float) -> Array:
     all_points = to_complex(corners if is_anticlockwise else corners[::-1])
     all_sides = np.roll(all_points, -1) - all_points  # from each point to the next one
     turning_angle = np.angle(all_sides / np.roll(all_sides, 1))
-    points = all_points[np.abs(turning_angle) > 1e-6]
+    points = all_points[np.abs(turning_angle) > MIN_TURN_rad]
 
     # A corner moves along the bisector of the normals of both sides. The normal of a side points to the right.
     sides = np.roll(points, -1) - points

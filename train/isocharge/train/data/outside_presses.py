@@ -27,9 +27,13 @@ FORCE_RATIO = 10.0
 """Ratio of the largest to the smallest force of the presses whose answers are measured, dimensionless."""
 
 N_FORCES = 5
+"""Number of forces of the presses at each place where answers are measured."""
+
 N_RINGS = 24
+"""Number of rings into which the area outside the working area is divided."""
+
 N_SECTORS = 36
-"""Numbers of forces, rings and sectors of the presses whose answers are measured."""
+"""Number of sectors into which each ring is divided."""
 
 SHARE_DECIMALS = 2
 """Decimals of the measured shares."""
@@ -98,16 +102,16 @@ class OutsidePresses:
         angle = rng.uniform(0.0, 2.0 * np.pi, count)
         min_log_force, max_log_force = np.log(self.charge_map.domain.force_range)
         force = np.exp(rng.uniform(min_log_force, max_log_force, count))
-        return self._presses(distance, angle, force)
+        return self._simulate(distance, angle, force)
 
     def grid(self) -> LabelledPresses:
-        """Return presses at the middle of every ring and sector, with `N_FORCES` forces each."""
+        """Return presses at the middle of each sector of each ring, with `N_FORCES` forces at each place."""
         edges = np.linspace(self.inner, self.outer, N_RINGS + 1)
         distance = 0.5 * (edges[1:] + edges[:-1])
         angle = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
         # All combinations of distance, angle and force
         distances, angles, forces = np.meshgrid(distance, angle, self._measured_forces(), indexing="ij")
-        return self._presses(distances.ravel(), angles.ravel(), forces.ravel())
+        return self._simulate(distances.ravel(), angles.ravel(), forces.ravel())
 
     def unnoticed(self, is_unnoticed: Booleans) -> UnnoticedPresses:
         """Compute the share of unnoticed presses in each ring and sector of `grid`.
@@ -115,8 +119,9 @@ class OutsidePresses:
         Args:
             is_unnoticed: Whether each press of `grid` is answered wrongly without a flag, shape (n,).
         """
-        by_place = is_unnoticed.reshape(N_RINGS, N_SECTORS, N_FORCES)
-        shares = by_place.mean(axis=2).round(SHARE_DECIMALS)  # over the forces
+        is_unnoticed_at_place = is_unnoticed.reshape(N_RINGS, N_SECTORS, N_FORCES)
+        share_of_forces = is_unnoticed_at_place.mean(axis=2)  # shape (N_RINGS, N_SECTORS)
+        shares = share_of_forces.round(SHARE_DECIMALS)
         forces = self._measured_forces()
         return UnnoticedPresses(
             from_mm=round(self.inner, 4),
@@ -127,11 +132,19 @@ class OutsidePresses:
 
     def _measured_forces(self) -> Array:
         """Return the forces of the presses of `grid`, shape (N_FORCES,), N."""
-        low, high = self.charge_map.domain.force_range
-        return np.geomspace(max(low, high / FORCE_RATIO), high, N_FORCES)
+        min_force, max_force = self.charge_map.domain.force_range
+        smallest_measured = max(min_force, max_force / FORCE_RATIO)
+        return np.geomspace(smallest_measured, max_force, N_FORCES)
 
-    def _presses(self, distance: Array, angle: Array, force: Array) -> LabelledPresses:
-        """Return presses at polar coordinates, each of shape (n,), mm, rad and N."""
-        contact = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), force])
-        contact[:, 2] = np.clip(contact[:, 2], *self.charge_map.domain.force_range)
+    def _simulate(self, distance: Array, angle: Array, force: Array) -> LabelledPresses:
+        """Return presses with their charges.
+
+        Args:
+            distance: Distances of the presses from the centre, shape (n,), mm.
+            angle: Angles of the positions from the x axis, anticlockwise, shape (n,), rad.
+            force: Forces, shape (n,), N.
+        """
+        min_force, max_force = self.charge_map.domain.force_range
+        limited_force = np.clip(force, min_force, max_force)  # rounding errors can exceed the range
+        contact = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), limited_force])
         return LabelledPresses(contact, self.charge_map.charges(contact))

@@ -304,19 +304,19 @@ def complete(presses: MeasuredPresses) -> Booleans:
     return presses.placed & np.isfinite(presses.charge_pC).all(axis=1)
 
 
-def check_enough(count: int, of: int, sensor: str) -> None:
+def check_enough(count: int, total_count: int, sensor: str) -> None:
     """Raise PressError if there are too few measured presses for training and for measuring errors.
 
     Args:
         count: Number of presses that can be used.
-        of: Number of all presses.
+        total_count: Number of all presses.
         sensor: Name of the sensor, for the message.
     """
     if count < FEWEST_MEASURED:
         raise PressError(
             f"expected at least {FEWEST_MEASURED} presses with known place, force and charges, within the "
-            f"model's forces and radius, got {count} of {of}; fewer calibrate a film: isocharge train calibrate "
-            f"PRESSES.csv --sensor {sensor} -o FOLDER"
+            f"model's forces and radius, got {count} of {total_count}; fewer calibrate a film: isocharge train "
+            f"calibrate PRESSES.csv --sensor {sensor} -o FOLDER"
         )
 
 

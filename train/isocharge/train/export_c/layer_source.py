@@ -103,21 +103,21 @@ def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Bloc
         Blocks of each layer.
     """
     blocks: list[tuple[Block, ...]] = []
-    column = first_width  # number of outputs of the present layer that belong to the first perceptron
+    n_first_output = first_width  # number of outputs of the examined layer that belong to the first perceptron
     for matrix in reversed(weights):
         # The inputs of the second perceptron follow those of the first perceptron. They begin at the first row with a
         # weight for the outputs of the second perceptron.
-        is_used_by_second = matrix[:, column:].any(axis=1)
-        row = int(is_used_by_second.argmax())
-        is_block_diagonal = row > 0 and not matrix[row:, :column].any()
+        is_used_by_second = matrix[:, n_first_output:].any(axis=1)
+        n_first_input = int(is_used_by_second.argmax())
+        is_block_diagonal = n_first_input > 0 and not matrix[n_first_input:, :n_first_output].any()
         if is_block_diagonal:
-            first = (slice(0, row), slice(0, column))
-            second = (slice(row, None), slice(column, None))
+            first = (slice(0, n_first_input), slice(0, n_first_output))
+            second = (slice(n_first_input, None), slice(n_first_output, None))
             blocks.append((first, second))
-            column = row
+            n_first_output = n_first_input  # the inputs of this layer are the outputs of the layer before it
         else:
             blocks.append((WHOLE_MATRIX,))
-            column = 0
+            n_first_output = 0
     return blocks[::-1]
 
 

@@ -77,8 +77,8 @@ class FilmScaling:
     def offset(self, parameters: Array) -> Array:
         """Compute the vector o of `to_film` in unit coordinates.
 
-        The first two components of o are the displacement of the electrodes without their rotation about the origin.
-        The third component is the logarithm of the stiffness.
+        The electrodes are rotated about the origin and then displaced. The first two components of o are this
+        displacement. The third component is the logarithm of the stiffness relative to the described film.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
@@ -103,7 +103,7 @@ class FilmScaling:
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
-            unit: Unit coordinates u with the scales divided out, shape (..., 3).
+            unit: Unit coordinates u on the described film, shape (..., 3).
 
         Returns:
             Unit coordinates on the other film, shape (..., 3).

@@ -46,8 +46,8 @@ BITS = 14
 FILE_UNITS = {"pretension": 1e6, "shift": 1e-3, "probe_radius": 1e-3}
 """Factors that convert quantities to the units of the file, Pa and m, by the name of the quantity."""
 
-FILE_PC = 1e-12
-"""Factor from the white noise in pC to that in the file, C."""
+COULOMB_PER_PC = 1e-12
+"""Factor that converts the white noise from pC into the unit of the file, C."""
 
 MAX_LAYER_WIDTH = 2048
 """Largest number of nodes of a layer."""
@@ -178,7 +178,7 @@ def _about_table(films: FilmsModel) -> dict[str, Any]:
         "spread": spread,
         "radius_mm": films.domain.radius,
         "force_range_N": list(films.domain.force_range),
-        "noise": {**asdict(films.noise), "white": _converted(films.noise.white, FILE_PC)},
+        "noise": {**asdict(films.noise), "white": _converted(films.noise.white, COULOMB_PER_PC)},
     }
     if activation != TANH:
         about["activation"] = activation.name
@@ -210,7 +210,7 @@ def _model_from_arrays(about: dict[str, Any], arrays: Mapping[str, np.ndarray], 
         whitening=arrays["whitening"],
         contact=_unpacked(_arrays_of_part(arrays, "contact"), activation),
         misfit=_unpacked(_arrays_of_part(arrays, "misfit"), activation),
-        noise=NoiseModel(**{**noise, "white": _converted(noise["white"], 1.0 / FILE_PC)}),
+        noise=NoiseModel(**{**noise, "white": _converted(noise["white"], 1.0 / COULOMB_PER_PC)}),
         sha256=sha256,
     )
 

@@ -63,7 +63,7 @@ MAX_NOISE_FACTOR = 8.0
 GOOD_PRESS_WEIGHT = 10.0
 """Weight of good presses in the loss of the misfit network.
 
-They determine the rate of false alarms, and their misfits are small.
+Good presses determine the rate of false alarms. The misfits of these presses are small, so they need a large weight.
 """
 
 MISFIT_VALIDATION_FRACTION = 0.06
@@ -81,15 +81,15 @@ class FilmsConfig:
         radius: Largest distance of a press from the film's centre, mm.
         force_range: Smallest and largest force, N.
         hidden: Widths of the hidden layers of the contact network.
-        misfit_hidden: Widths of the hidden layers of the misfit network, which has as many.
+        misfit_hidden: Widths of the hidden layers of the misfit network. Both networks have the same number of layers.
         activation: Name of the activation of the hidden layers (`isocharge.common.activations`).
         films: Number of films for the contact network, including those for validation.
-        presses: Number of presses on each of these films.
+        presses: Number of presses on each film, for the contact network and for the good presses of the misfit network.
         watched: Number of films for the validation of the contact network.
         steps: Number of optimiser steps of the contact network.
-        misfit_films: Number of films for the misfit network.
-        misfit_charges: Number of charges on each of these films.
-        near_films: Number of films with good presses for the misfit network; each has as many presses as above.
+        misfit_films: Number of films with charges of every kind for the misfit network.
+        misfit_charges: Number of sets of charges on each of the `misfit_films`.
+        near_films: Number of films with good presses for the misfit network.
         misfit_steps: Number of optimiser steps of the misfit network.
         batch_films: Number of films in a batch.
         batch_presses: Number of presses on each film of a batch.
@@ -147,7 +147,8 @@ def fit_films(
 
     Raises:
         InputError: If the noise model is unknown.
-        SceneError, SolveError: If some presses cannot exist or cannot be solved.
+        SceneError: If the force, the radius or the probe is impossible for one of the films.
+        SolveError: If a press has no equilibrium, or the forward maps are not accurate enough.
         DatasetError: If too many charges are not positive.
         TrainingError: If the loss is not finite.
     """

@@ -49,7 +49,7 @@ class FilmsErrors:
         with_assumed_film: Errors on the same films if each of them is taken for the assumed film.
         parameters: Parameters of the assumed film, shape (n_parameter,). The assumed film is the described film or the
             mean of the prior, whichever gives the smaller errors.
-        description: The assumed film in words, with the errors of both.
+        description: Text that names the assumed film, and states the errors with the described film and with the mean.
     """
 
     with_known_film: Mapping[str, float]

@@ -381,7 +381,8 @@ class _PlainNode:
 
     Attributes:
         operator: The operator.
-        inputs: For each input the graph's input, the number of the result, or the numbers of the constant.
+        inputs: Description of each input: the name of an input of the graph, the node that computes the tensor, or the
+            values of a constant.
         outputs: Name of each output of the graph, or None for other results.
         attributes: Attributes by name.
     """

@@ -37,9 +37,9 @@ N_CORNERS = 64
 """Number of corners of the polygon that represents a round working area."""
 
 CORNER_TOLERANCE_mm = 2e-3
-"""Largest distance of the corners of such a polygon from their ideal places, mm.
+"""Largest distance of a corner from its ideal place for which a polygon represents a round working area, mm.
 
-The metadata round them to 0.0001 mm.
+The corners in the metadata are rounded to 0.0001 mm.
 """
 
 CardWriter = Callable[[ModelMetadata, Fitted], str]
@@ -377,7 +377,7 @@ def _yield_force(fitted: Fitted) -> float | None:
 def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
     """Return the smallest regular polygon that contains a disk about the origin: corners (x, y), mm."""
     angle = 2.0 * np.pi * np.arange(N_CORNERS) / N_CORNERS
-    corner_radius = radius / np.cos(np.pi / N_CORNERS)
+    corner_radius = radius / np.cos(np.pi / N_CORNERS)  # the sides touch the disk
     corners: Array = np.round(corner_radius * np.stack([np.cos(angle), np.sin(angle)], axis=1), 4)
     return tuple((x, y) for x, y in corners.tolist())
 

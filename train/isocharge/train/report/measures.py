@@ -206,7 +206,7 @@ def pareto_front(cost: Array, error: Array) -> Booleans:
     Returns:
         Whether each method is on the front, shape (n,).
     """
-    # The entry (i, j) of each matrix compares method j with method i.
+    # The entry (i, j) of each matrix, shape (n, n), states whether method j is better than method i, or as good.
     is_no_worse = (cost[None] <= cost[:, None]) & (error[None] <= error[:, None])
     is_better_in_one = (cost[None] < cost[:, None]) | (error[None] < error[:, None])
     is_dominated = (is_no_worse & is_better_in_one).any(axis=1)
@@ -226,8 +226,8 @@ def interval_coverage(estimate: Array, std: Array, truth: Array, levels: Array) 
         Fractions for x, y and F, shape (n_level, 3). They equal the levels if the standard deviations are correct.
     """
     standardised_error = np.abs(estimate - truth) / std
-    half_width = scipy.stats.norm.ppf(0.5 + 0.5 * levels)
-    is_inside = standardised_error[None] <= half_width[:, None, None]
+    half_width = scipy.stats.norm.ppf(0.5 + 0.5 * levels)  # in standard deviations, shape (n_level,)
+    is_inside = standardised_error[None] <= half_width[:, None, None]  # shape (n_level, n, 3)
     return np.asarray(np.mean(is_inside, axis=1))
 
 

@@ -149,13 +149,13 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
             scaled: Bias and weights of the three angles divided by FIRST_STEP, flattened, shape (3 (1 + n_input),).
         """
         bias, weight = np.split(FIRST_STEP * scaled.reshape(-1, 3), [1])  # shapes (1, 3) and (n_input, 3)
-        single_weight = weight.astype(np.float32)
-        angles = single_weight.T @ white_inputs.T + bias.astype(np.float32).T  # shape (3, n)
+        float32_weight = weight.astype(np.float32)
+        angles = float32_weight.T @ white_inputs.T + bias.astype(np.float32).T  # shape (3, n)
         correlation_part, angle_gradient = correlation_loss(angles, targets)
         penalty = RIDGE * float((weight**2).sum())
 
         bias_gradient = angle_gradient.sum(axis=1, dtype=float)
-        weight_gradient = white_inputs.T @ angle_gradient.T + 2.0 * RIDGE * single_weight
+        weight_gradient = white_inputs.T @ angle_gradient.T + 2.0 * RIDGE * float32_weight
         gradient = np.vstack([bias_gradient, weight_gradient])
         return correlation_part + penalty, FIRST_STEP * gradient.ravel()
 

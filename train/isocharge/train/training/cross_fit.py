@@ -94,8 +94,9 @@ def fit_presses(
 ) -> Fitted:
     """Train a network on measured presses of any sensor with three to eight channels.
 
-    The steps are cross-validation, distillation of the mean of its networks into one network, and training of the
-    misfit. A warning is logged if presses are left out, and if all presses have the same force.
+    Several networks are trained for a cross-validation. One further network then learns the mean outputs of these
+    networks (distillation), and the misfits. A warning is logged if presses are left out, and another one if all
+    presses have the same force.
 
     Args:
         presses: At least 500 presses at 50 places. Presses with an unknown place, force or charge are left out.
@@ -103,6 +104,9 @@ def fit_presses(
         config: Settings. `steps` is the largest number of steps; `noise` and `hold_out` are not used.
         probes: Notations of the probes.
         run: Run that saves the state, so that an interrupted training can be continued.
+
+    Returns:
+        The network that learned from the others, with everything that a release needs.
 
     Raises:
         PressError: If there are too few presses or places, fewer than three or more than eight channels, or if
@@ -118,6 +122,7 @@ def fit_presses(
     noise = ChannelNoise.of(labelled.charge, domain.to_unit(labelled.contact))
     with threads_and_seed(training.threads, training.seed):
         features = WhitenedFeatures.fit_signed(labelled.charge, noise.bend(labelled.charge))
+        # The last training uses the first network. The other networks are the members of the cross-validation.
         network, *members = (InverseNetwork(domain, features, settings.network) for _ in range(1 + N_FOLDS))
         fold = folds_by_place(labelled.contact, N_FOLDS)
         steps = _train_members(members, labelled, fold, noise, training, run)
@@ -127,7 +132,7 @@ def fit_presses(
         distillation = _distillation_stage(network, members, labelled, noise, training)
         train_perceptron(distillation, network.contact, settings, run)
         draw = partial(_misfit_examples, labelled, domain, noise, training)
-        examples = draw() if run is None else run.storing_executor("misfit-charges").submit(draw).result()
+        examples = _saved_or_drawn(draw, run)
         train_perceptron(misfit_stage(network, examples, training), network.misfit_vector, settings, run)
 
     cross_validated = Answers(
@@ -336,7 +341,7 @@ def _train_with_best_steps(network: TrainablePerceptron, train: Callable[[int], 
     while 2 * steps <= largest_steps:
         network.load_state_dict(initial_weights)
         longer_training = train(2 * steps)
-        is_better = longer_training.best < best_training.best
+        is_better = longer_training.best_score < best_training.best_score
         if not is_better:
             network.load_state_dict(best_training.best_weights)
             break
@@ -446,6 +451,19 @@ def _misfit_examples(
     _, charge = draw_charges(rng, presses.charge[chosen_rows], presses.charge, noise)
     residual = planes.residuals(noise.level(charge))
     return np.stack([charge, residual])
+
+
+def _saved_or_drawn(draw: Callable[[], Array], run: ResumableRun | None) -> Array:
+    """Return the examples that a run has saved. If there are none, draw the examples and save them.
+
+    Args:
+        draw: Function that draws the examples.
+        run: Run that saves the examples; None to save nothing.
+    """
+    if run is None:
+        return draw()
+    examples: Array = run.storing_executor("misfit-charges").submit(draw).result()
+    return examples
 
 
 def _cross_validated_misfit(

@@ -118,7 +118,7 @@ class Descent:
         seed: Seed of the batches and the noise.
 
     Attributes:
-        best: Lowest validation score so far.
+        best_score: Lowest validation score so far.
         best_weights: State of the network at this score.
     """
 
@@ -137,7 +137,7 @@ class Descent:
         self.optimisers = stage.optimisers(stage)
         self.random = torch.Generator().manual_seed(seed)
         self.step = 0
-        self.best = math.inf
+        self.best_score = math.inf
         self.best_step = 0
         self.best_weights = copy.deepcopy(stage.network.state_dict())
 
@@ -155,7 +155,7 @@ class Descent:
         """
         saved_at = time.monotonic()
         if run is not None:
-            state = run.load(self.stage.name, tensors)  # None if nothing was saved
+            state = run.load(self.stage.name, tensors_from_bytes)  # None if nothing was saved
             if state is not None:
                 self._restore(state)
 
@@ -213,15 +213,16 @@ class Descent:
                 "training.learning_rate"
             )
         is_after_warm_up = self.step > self.stage.warm_up_steps
-        if is_after_warm_up and score < self.best:
-            self.best = score
+        if is_after_warm_up and score < self.best_score:
+            self.best_score = score
             self.best_step = self.step
             self.best_weights = copy.deepcopy(self.stage.network.state_dict())
         report(f"training the {self.stage.name} network", self.step, self.stage.steps, f"loss {loss:.3f}, {text}")
 
     def _is_stalled(self) -> bool:
         """Return whether the score has not improved for `patience` steps after the warm-up."""
-        return self.step - max(self.best_step, self.stage.warm_up_steps) >= self.patience
+        counted_from = max(self.best_step, self.stage.warm_up_steps)
+        return self.step - counted_from >= self.patience
 
     def _state(self) -> dict[str, Any]:
         """Return everything that a checkpoint holds."""
@@ -230,7 +231,7 @@ class Descent:
             "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
             "random": self.random.get_state(),
             "step": self.step,
-            "best": (self.best, self.best_step),
+            "best": (self.best_score, self.best_step),
             "best_weights": self.best_weights,
         }
 
@@ -245,7 +246,7 @@ class Descent:
             optimiser.load_state_dict(optimiser_state)
         self.random.set_state(state["random"])
         self.step = state["step"]
-        self.best, self.best_step = state["best"]
+        self.best_score, self.best_step = state["best"]
         self.best_weights = state["best_weights"]
 
 
@@ -256,7 +257,7 @@ def tensor_bytes(state: object) -> bytes:
     return buffer.getvalue()
 
 
-def tensors(data: bytes) -> Any:
+def tensors_from_bytes(data: bytes) -> Any:
     """Return the tensors, numbers and texts that `tensor_bytes` converted into bytes.
 
     Code in the bytes is not executed.
@@ -273,4 +274,5 @@ def _relative_rate(progress: float) -> float:
     if progress < WARM_UP_FRACTION:
         rise = 0.5 * (1.0 - math.cos(math.pi * progress / WARM_UP_FRACTION))
         return INITIAL_RATE + (1.0 - INITIAL_RATE) * rise
-    return 0.5 * (1.0 + math.cos(math.pi * (progress - WARM_UP_FRACTION) / (1.0 - WARM_UP_FRACTION)))
+    angle = math.pi * (progress - WARM_UP_FRACTION) / (1.0 - WARM_UP_FRACTION)  # 0 after the warm-up, pi at the end
+    return 0.5 * (1.0 + math.cos(angle))

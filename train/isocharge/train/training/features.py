@@ -94,7 +94,7 @@ def whitening(values: Array, min_relative_std: float = 0.0) -> tuple[Array, Arra
     """Compute the whitening transform of values by a principal component analysis.
 
     Args:
-        values: Shape (n, k).
+        values: Values, shape (n, k).
         min_relative_std: Principal components with a standard deviation below this fraction of the largest one are
             scaled as if they had this fraction, so that their standard deviation stays below 1.
 

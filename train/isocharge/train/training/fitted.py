@@ -88,7 +88,7 @@ class Fitted:
         """Estimate contacts.
 
         Args:
-            charge: Shape (n, n_electrode), pC.
+            charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
             Contacts (x, y, F), shape (n, 3), mm and N. Standard deviations of the contacts, shape (n, 3). Misfits,

@@ -85,7 +85,7 @@ class FoldedNetwork:
         """Estimate contacts.
 
         Args:
-            charge: Shape (n, n_electrode), pC.
+            charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
             Contact (x, y, F), shape (n, 3), mm and N; its standard deviations, shape (n, 3); misfit, shape (n, 1).
@@ -97,7 +97,7 @@ class FoldedNetwork:
         """Compute the outputs of the exported graph.
 
         Args:
-            charge: Shape (n, n_electrode), pC.
+            charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
             Contacts and standard deviations as `predict` returns them. Correlations, shape (n, 3), if the network gives
@@ -165,5 +165,5 @@ def relative_log_std(answers: Array) -> Array:
     The standard deviation of ln F is the standard deviation of F divided by F.
     """
     log_std = answers[:, LOG_STD].copy()
-    log_std[:, 2:] -= answers[:, LOG_FORCE]
+    log_std[:, 2:] -= answers[:, LOG_FORCE]  # the last column belongs to the force
     return np.asarray(log_std)

@@ -38,7 +38,7 @@ def fold(
     Returns:
         Perceptron from the features to the answers.
     """
-    joined = _join(perceptrons)
+    joined = _join_perceptrons(perceptrons)
     first, *other_hidden = joined.hidden
     # ((features - mean) @ matrix) @ W + b  =  features @ (matrix W) + (b - mean @ (matrix W))
     first_weight = matrix @ first.weight
@@ -74,8 +74,8 @@ def transform_inputs(perceptron: Perceptron[Array], transform: Layer[Array]) -> 
 def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: int) -> Layer[Array]:
     """Return the linear map from the outputs of the contact and misfit perceptrons to the answers.
 
-    The standard deviation of the force is relative in the outputs and absolute in the answers, so ln F is added to its
-    logarithm.
+    The outputs contain the relative standard deviation of the force, and the answers contain the absolute one. To
+    convert it, ln F is added to the logarithm of the relative standard deviation.
 
     Args:
         domain: Centre and scale of the unit coordinates.
@@ -99,21 +99,28 @@ def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: in
     return Layer(weight, bias)
 
 
-def _join(perceptrons: Sequence[Perceptron[Array]]) -> Perceptron[Array]:
+def _join_perceptrons(perceptrons: Sequence[Perceptron[Array]]) -> Perceptron[Array]:
     """Return one perceptron that gives the outputs of several perceptrons with the same inputs, one after the other."""
+    # Each entry of `first` and `others` contains the layers of all perceptrons at one depth.
     first, *others = zip(*(perceptron.hidden for perceptron in perceptrons), strict=True)
-    hidden = [_beside(first, np.hstack)]
-    hidden += [_beside(layers, _block_diagonal) for layers in others]
+    hidden = [_join_layers(first, np.hstack)]  # the first layers have the same inputs
+    hidden += [_join_layers(layers, _block_diagonal) for layers in others]
     return Perceptron(
         hidden=tuple(hidden),
-        last=_beside([perceptron.last for perceptron in perceptrons], _block_diagonal),
+        last=_join_layers([perceptron.last for perceptron in perceptrons], _block_diagonal),
         skip=np.hstack([perceptron.skip for perceptron in perceptrons]),
         activation=perceptrons[0].activation,
     )
 
 
-def _beside(layers: Sequence[Layer[Array]], join_weights: Callable[[Sequence[Array]], Array]) -> Layer[Array]:
-    """Return one layer that gives the outputs of several layers, one after the other."""
+def _join_layers(layers: Sequence[Layer[Array]], join_weights: Callable[[Sequence[Array]], Array]) -> Layer[Array]:
+    """Return one layer that gives the outputs of several layers, one after the other.
+
+    Args:
+        layers: The layers.
+        join_weights: Function that joins the weights: `np.hstack` if the layers have the same inputs, `_block_diagonal`
+            if each layer has its own inputs.
+    """
     weight = join_weights([layer.weight for layer in layers])
     bias = np.concatenate([layer.bias for layer in layers])
     return Layer(weight, bias)

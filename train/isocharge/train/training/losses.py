@@ -114,7 +114,7 @@ def robust_correlation_loss(angles: Tensor, deviation: Tensor) -> Tensor:
     Args:
         angles: Angles a, b and c of `isocharge.train.training.correlation` minus a right angle, shape (n, 3), rad.
             Three zeros give no correlations.
-        deviation: Errors of the unit coordinates over their standard deviations, shape (n, 3).
+        deviation: Errors of the unit coordinates divided by their standard deviations, shape (n, 3).
     """
     # With x = a - pi / 2: sin a = cos x and cos a = -sin x.
     sin_a, sin_b, sin_c = torch.cos(angles).clamp(min=MIN_TRAINING_SINE).unbind(dim=1)

@@ -133,23 +133,25 @@ class MisfitExamples:
         return self.features.charge_features.n_electrode > FEW_ELECTRODES
 
     @property
+    def _has_positive_charges(self) -> bool:
+        """Whether all charges are positive, so that their features are logarithms."""
+        return self.features.charge_features.mean is None  # only features of charges of both signs have a mean
+
+    @property
     def _options(self) -> ExampleOptions:
         """Options of the examples. For charges of both signs, the limits are those of the input features."""
         starts = MANY_SEARCH_STARTS if self._has_many_electrodes else SEARCH_STARTS
-        charge_features = self.features.charge_features
-        is_positive = charge_features.mean is None  # only features of charges of both signs have a mean
-        if is_positive:
+        if self._has_positive_charges:
             return ExampleOptions(starts=starts)
+        charge_features = self.features.charge_features
         return ExampleOptions(starts=starts, limits=(charge_features.low_pC, charge_features.high_pC))
 
     def _noise(self) -> Noise:
         """Return the noise of good presses. For charges of both signs, return the noise of each channel."""
         noise = misfit_noise(self.config.noise_model)
-        charge_features = self.features.charge_features
-        is_positive = charge_features.mean is None  # only features of charges of both signs have a mean
-        if is_positive:
+        if self._has_positive_charges:
             return noise
-        return ChannelNoise.alike(noise, charge_features.n_electrode)
+        return ChannelNoise.alike(noise, self.features.charge_features.n_electrode)
 
     def _saved_or_drawn(self, name: str, draw: Callable[..., Array]) -> Array:
         """Return the examples that the run has saved under a name. If there are none, draw the examples and save them.

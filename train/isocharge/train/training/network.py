@@ -98,7 +98,7 @@ class TrainablePerceptron(nn.Module):
         The hidden layers then start with a small contribution to these outputs, and learn what is not linear.
 
         Args:
-            inputs: Shape (n, n_input).
+            inputs: Inputs, shape (n, n_input).
             targets: Targets of the first n_target outputs, shape (n, n_target).
         """
         n_input = inputs.shape[1]
@@ -198,7 +198,7 @@ class InverseNetwork(nn.Module):
         """Compute mean and log standard deviation of the unit coordinates.
 
         Args:
-            charge: Shape (n, n_electrode), pC.
+            charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
             Mean and logarithm of the standard deviation, shape (n, 3) each.
@@ -213,7 +213,7 @@ class InverseNetwork(nn.Module):
         correlations. The angles of a released model are fitted to the hidden layers after the training.
 
         Args:
-            charge: Shape (n, n_electrode), pC.
+            charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
             Mean and logarithm of the standard deviation of the unit coordinates, and the angles, shape (n, 3) each.
@@ -225,7 +225,7 @@ class InverseNetwork(nn.Module):
         """Estimate contacts.
 
         Args:
-            charge: Shape (n, n_electrode), pC.
+            charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
             Contact (x, y, F), shape (n, 3), mm and N; its standard deviations, shape (n, 3); misfit, shape (n, 1).

@@ -12,11 +12,13 @@ from isocharge.train.training.folded_network import LOG_STD, MEAN, FoldedNetwork
 from isocharge.train.training.folding import transform_inputs
 
 EXACT_RIDGE = 1e-5
-"""Ridge for targets without noise, relative to the mean square of a feature of unit size."""
+"""Weight of the squared changes of the weights for targets without noise. The mean squared error has the weight 1."""
 
 NOISY_RIDGE = 0.03
-"""Ridge for targets that contain the squares of single errors, relative to the mean square of a feature of unit
-size."""
+"""Weight of the squared changes of the weights for targets that contain the squares of single errors.
+
+The mean squared error has the weight 1.
+"""
 
 MAX_ERROR = 3.0
 """Largest error, in standard deviations, that the regression of the standard deviations distinguishes. The square of a
@@ -32,7 +34,7 @@ N_CORE_STEPS = 5
 """Number of scoring steps of `fit_std`. The limitation of the errors makes each step shorter."""
 
 CORE_RIDGE = 1e-3
-"""Ridge of `fit_std`, relative to the mean square of a feature of unit size."""
+"""Weight of the squared changes of the weights in `fit_std`. The mean squared error has the weight 1."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Regression:
 
     Attributes:
         target: Function from the present answers to the target answers, both of shape (n, n_answer).
-        ridge: Penalty on the change of the weights.
+        ridge: Weight of the squared changes of the weights. The mean squared error has the weight 1.
     """
 
     target: Callable[[Array], Array]
@@ -103,7 +105,7 @@ def _linear_fit(inputs: Array, outputs: Array) -> Layer[Array]:
     """Return the linear layer that computes outputs from inputs with the smallest sum of squared errors.
 
     Args:
-        inputs: Shape (n, n_input).
+        inputs: Inputs, shape (n, n_input).
         outputs: Shape (n, n_output).
     """
     design = np.column_stack([inputs, np.ones(len(inputs))])  # the column of ones is for the bias
@@ -206,12 +208,14 @@ def refit_last_layer(
     for regression in regressions:
         outputs = design @ weights
         change = regression.target(outputs) - outputs
-        moment = design.T @ change
+        right_side = design.T @ change
         changed_columns = np.flatnonzero(change.any(axis=0))
         for column in changed_columns:
+            # Solve the normal equations for the fitted weights of this output. The other weights remain zero.
             rows = np.flatnonzero(is_fitted[:, column])
-            damped_matrix = normal_matrix[np.ix_(rows, rows)] + regression.ridge * n_sample * np.eye(len(rows))
-            weights[rows, column] += np.linalg.solve(damped_matrix, moment[rows, column])
+            fitted_part = normal_matrix[np.ix_(rows, rows)]  # these rows and these columns of the matrix
+            damped_matrix = fitted_part + regression.ridge * n_sample * np.eye(len(rows))
+            weights[rows, column] += np.linalg.solve(damped_matrix, right_side[rows, column])
 
     last, skip, bias = np.split(weights, [n_hidden, n_hidden + n_input])
     return replace(perceptron, last=Layer(last, bias[0]), skip=skip)

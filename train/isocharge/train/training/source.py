@@ -36,14 +36,15 @@ class Teacher:
         """Compute the teacher's posterior in unit coordinates.
 
         Args:
-            charge: Shape (n, n_electrode), pC.
+            charge: Charges, shape (n, n_electrode), pC.
             domain: Centre and scale of the unit coordinates.
 
         Returns:
             Mean and logarithm of the standard deviation, shape (n, 3) each.
         """
         contact, std = self.answer(charge.double().numpy())
-        unit_std = np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]]) / domain.scale
+        log_force_std = std[:, 2] / contact[:, 2]  # the standard deviation of ln F
+        unit_std = np.column_stack([std[:, :2], log_force_std]) / domain.scale
         return as_tensor(domain.to_unit(contact)), as_tensor(np.log(unit_std))
 
 

@@ -39,7 +39,7 @@ def evaluate_hidden_layers(layers: Sequence[Layer[Tensor]], activation: Activati
     Args:
         layers: Weights and biases of the layers.
         activation: Activation after each layer.
-        inputs: Shape (n, n_input) or (n_batch, n, n_input).
+        inputs: Inputs, shape (n, n_input) or (n_batch, n, n_input).
 
     Returns:
         Outputs of the last layer, shape (n, width) or (n_batch, n, width).
@@ -57,10 +57,10 @@ def evaluate(perceptron: Perceptron[Tensor], inputs: Tensor) -> Tensor:
     Args:
         perceptron: A perceptron, or n_batch perceptrons with weights of shape (n_batch, n_input, n_output) and biases
             of shape (n_batch, 1, n_output).
-        inputs: Shape (n, n_input), or (n_batch, n, n_input).
+        inputs: Inputs, shape (n, n_input), or (n_batch, n, n_input).
 
     Returns:
-        Shape (n, n_output), or (n_batch, n, n_output).
+        Outputs, shape (n, n_output) or (n_batch, n, n_output).
     """
     hidden_output = evaluate_hidden_layers(perceptron.hidden, perceptron.activation, inputs)
     return _evaluate_layer(perceptron.last, hidden_output) + inputs @ perceptron.skip
