@@ -278,8 +278,8 @@ def test_noise_of_channels_that_are_mostly_zero_is_finite():
     charge = np.where(is_zero, 0.0, charges_on_l(contact, 8))
     noise = ChannelNoise.of(charge, PressedArea.of(contact).to_unit(contact))
     np.testing.assert_allclose(noise.charge(noise.level(charge)), charge, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(noise.bend(np.abs(charge)), noise.bend(-np.abs(charge)))
-    assert np.isfinite(WhitenedFeatures.fit_signed(charge, noise.bend(charge)).matrix).all()
+    np.testing.assert_allclose(noise.transition_charge(np.abs(charge)), noise.transition_charge(-np.abs(charge)))
+    assert np.isfinite(WhitenedFeatures.fit_signed(charge, noise.transition_charge(charge)).matrix).all()
 
 
 def test_presses_at_one_place_are_in_the_same_fold():

@@ -71,7 +71,7 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
             train, validation = split_by_position(presses, VALIDATION_FRACTION, self.seed)
             self.map_ = ChargeField.fit(self.domain, names, train, validation)
 
-        # The search for a contact starts at the start with the most similar charges.
+        # A search begins at the chosen press whose charges are most similar, which the tree finds.
         shuffled_rows = np.random.default_rng(self.seed).permutation(len(presses))
         start_rows = shuffled_rows[:N_STARTS]
         self.features_ = whitening().fit(charge)

@@ -20,7 +20,7 @@ from sklearn.pipeline import Pipeline
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.train.data.channel_noise import BOTH_SIGNS, LEAST_BEND, usual_size
+from isocharge.train.data.channel_noise import BOTH_SIGNS, MIN_TRANSITION_RATIO, usual_size
 from isocharge.train.data.presses import LOWEST_CHARGE
 
 BATCH = 256
@@ -72,7 +72,7 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         is_not_positive = charge <= 0.0
         not_positive_fraction = is_not_positive.mean(axis=0)  # one value for each electrode
         has_both_signs = (not_positive_fraction > BOTH_SIGNS).any()
-        self.scale_ = LEAST_BEND * usual_size(charge) if has_both_signs else None
+        self.scale_ = MIN_TRANSITION_RATIO * usual_size(charge) if has_both_signs else None
         return self
 
     def transform(self, charge: Array) -> Array:
@@ -157,9 +157,12 @@ class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         rows = np.random.default_rng(self.seed).permutation(len(values))[: self.points]
         kernel_rows = rows[: self.kernel_points]
 
-        # Each part of the kernel has an initial value and bounds: variance, length scales, and variance of the noise.
-        lengths = np.full(values.shape[1], 2.0)
-        kernel = ConstantKernel(10.0, (1e-2, 1e5)) * RBF(lengths, (0.1, 100.0)) + WhiteKernel(1e-3, (1e-8, 1.0))
+        # Each part of the kernel has an initial value and bounds, between which the value is fitted.
+        n_input = values.shape[1]
+        variance = ConstantKernel(10.0, (1e-2, 1e5))
+        correlation = RBF(np.full(n_input, 2.0), (0.1, 100.0))  # one length scale for each input
+        noise = WhiteKernel(1e-3, (1e-8, 1.0))
+        kernel = variance * correlation + noise
         with catch_warnings():
             simplefilter("ignore", ConvergenceWarning)  # a length scale at its bound is acceptable
             fitted = GaussianProcessRegressor(kernel, normalize_y=True).fit(values[kernel_rows], target[kernel_rows])

@@ -35,8 +35,8 @@ If no charge is small, the presses do not determine the white noise.
 BOTH_SIGNS = 0.01
 """Fraction of presses with the rarer sign, above which a channel is treated as having charges of both signs."""
 
-LEAST_BEND = 0.5
-"""Smallest charge above which features are logarithmic for channels with both signs, relative to the usual size.
+MIN_TRANSITION_RATIO = 0.5
+"""Smallest `ChannelNoise.transition_charge` of a channel with both signs, relative to the usual size of its charges.
 
 With a smaller value, the features of charges with little noise would have a kink where the charge changes its sign.
 """
@@ -122,18 +122,20 @@ class ChannelNoise:
         exponent = np.clip(level * self.gain, -LARGEST_EXPONENT, LARGEST_EXPONENT)
         return np.asarray(np.sinh(exponent) * self.white / self.gain)
 
-    def bend(self, charge: Array) -> Array:
-        """Return the charges above which the features are logarithmic, shape (n_electrode,), pC.
+    def transition_charge(self, charge: Array) -> Array:
+        """Return the charges at which the features change from linear to logarithmic, shape (n_electrode,), pC.
 
-        The features are asinh(Q / charge). They are linear for smaller charges.
+        The features are asinh(Q / transition charge).
 
         Args:
             charge: Charges of presses, shape (n, n_electrode), pC.
         """
-        share_of_rarer_sign = np.minimum(np.mean(charge > 0.0, axis=0), np.mean(charge < 0.0, axis=0))
-        has_both_signs = share_of_rarer_sign > BOTH_SIGNS
-        smallest_bend = np.where(has_both_signs, LEAST_BEND * usual_size(charge), 0.0)
-        return np.asarray(np.maximum(self.white / self.gain, smallest_bend))
+        positive_share = np.mean(charge > 0.0, axis=0)  # shape (n_electrode,)
+        negative_share = np.mean(charge < 0.0, axis=0)
+        has_both_signs = np.minimum(positive_share, negative_share) > BOTH_SIGNS
+        lower_limit = np.where(has_both_signs, MIN_TRANSITION_RATIO * usual_size(charge), 0.0)
+        # Above white / gain, the noise is mostly proportional to the charge.
+        return np.asarray(np.maximum(self.white / self.gain, lower_limit))
 
     def scaled(self, factor: float) -> "ChannelNoise":
         """Return the noise model with all standard deviations multiplied by a factor."""

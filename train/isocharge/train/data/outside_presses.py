@@ -53,11 +53,13 @@ class OutsidePresses:
 
     @classmethod
     def of(cls, sensor: Sensor, probes: tuple[str, ...], force_range: tuple[float, float]) -> "OutsidePresses | None":
-        """Solve a coarse forward map of the whole film for the probe with the largest reach.
+        """Solve a coarse forward map of the whole film for the largest probe.
+
+        The reach of a probe is the distance of the farthest point of its footprint from the centroid.
 
         Args:
             sensor: The sensor.
-            probes: Notations of the probes. A probe that is not round is replaced by a disk with the same reach.
+            probes: Notations of the probes. The probe with the largest reach is replaced by a disk with the same reach.
             force_range: Smallest and largest force of the model, N.
 
         Returns:

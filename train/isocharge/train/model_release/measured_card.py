@@ -8,17 +8,17 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.train.model_release.evaluate import HELD_PRESSES
 
 
-def measured_errors(errors: Mapping[str, float], which: str, how: str) -> str:
+def measured_errors(errors: Mapping[str, float], heading_end: str, explanation: str) -> str:
     """Return the section of a card with the errors on measured presses.
 
     Args:
         errors: Errors of the model by name.
-        which: Words after "measured presses" in the heading.
-        how: Paragraph about the meaning of the figures.
+        heading_end: Words after "measured presses" in the heading.
+        explanation: Paragraph about the meaning of the figures.
     """
-    return f"""## Errors on {errors[HELD_PRESSES]:.0f} measured presses {which}
+    return f"""## Errors on {errors[HELD_PRESSES]:.0f} measured presses {heading_end}
 
-{how}
+{explanation}
 | error | on measured presses |
 |---|---|
 | position, median | {errors["position_median_mm"]:g} mm |

@@ -63,9 +63,9 @@ def is_flagged(about: ModelMetadata, contact: Array, std: Array, misfit: Array) 
     Returns:
         Whether each answer carries such a flag, shape (n,).
     """
-    correlation = np.full_like(std, np.nan)
-    columns = np.concatenate([contact, std, misfit, correlation], axis=1).T
-    flags = Validity.of(about).batch_flags(Contacts(*columns))
+    correlation = np.full_like(std, np.nan)  # no flag depends on the correlations
+    fields = np.concatenate([contact, std, misfit, correlation], axis=1).T  # one row for each field of `Contacts`
+    flags = Validity.of(about).batch_flags(Contacts(*fields))
     return np.array([any(flag != STRESS for flag in answer_flags) for answer_flags in flags])
 
 

@@ -172,7 +172,7 @@ class MethodRecord:
 
 
 def with_pareto_fronts(records: Sequence[MethodRecord]) -> list[MethodRecord]:
-    """Return the records with `pareto_costs` filled in.
+    """Return the records in which `pareto_costs` states the costs for which the method is on the Pareto front.
 
     The function `pareto_front` defines when a method is on the Pareto front of a cost. Methods that are not comparable
     are on no Pareto front, and do not exclude other methods from a front.

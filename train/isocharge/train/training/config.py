@@ -91,8 +91,9 @@ class NetworkConfig(Settings, frozen=True):
                 raise WrongKey("misfit_hidden", expected, list(self.misfit_hidden))
         if self.activation not in ACTIVATIONS:
             raise WrongKey("activation", f"one of {', '.join(ACTIVATIONS)}", self.activation)
-        is_as_dataset = self.electrodes == 0
-        if not is_as_dataset and not 3 <= self.electrodes <= MAX_ELECTRODES:
+        is_any_number = self.electrodes == 0
+        is_in_range = 3 <= self.electrodes <= MAX_ELECTRODES
+        if not (is_any_number or is_in_range):
             raise WrongKey("electrodes", f"0 (as the dataset) or 3 to {MAX_ELECTRODES}", self.electrodes)
 
     def contact_widths(self, n_electrode: int) -> Widths:
@@ -115,8 +116,8 @@ class NetworkConfig(Settings, frozen=True):
         Args:
             sizes: Default sizes.
         """
-        given = self.hidden or self.misfit_hidden
-        return sizes.layers if given is None else len(given)
+        given_widths = self.hidden or self.misfit_hidden
+        return sizes.layers if given_widths is None else len(given_widths)
 
 
 class TrainingConfig(Settings, frozen=True):

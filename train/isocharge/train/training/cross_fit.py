@@ -121,7 +121,7 @@ def fit_presses(
     domain = PressedArea.of(labelled.contact)
     noise = ChannelNoise.of(labelled.charge, domain.to_unit(labelled.contact))
     with threads_and_seed(training.threads, training.seed):
-        features = WhitenedFeatures.fit_signed(labelled.charge, noise.bend(labelled.charge))
+        features = WhitenedFeatures.fit_signed(labelled.charge, noise.transition_charge(labelled.charge))
         # The last training uses the first network. The other networks are the members of the cross-validation.
         network, *members = (InverseNetwork(domain, features, settings.network) for _ in range(1 + N_FOLDS))
         fold = folds_by_place(labelled.contact, N_FOLDS)

@@ -268,10 +268,15 @@ def train_perceptron(
         return
 
     perceptron.round_hidden_matrices()
+
+    def further_loss(step: int, random: torch.Generator) -> Tensor:
+        """Return the loss of a step, with its number counted from the beginning of the first training."""
+        return stage.loss(stage.steps + step, random)
+
     rounded_stage = replace(
         stage,
         name=f"{stage.name}-rounded",
-        loss=lambda step, random: stage.loss(stage.steps + step, random),
+        loss=further_loss,
         steps=round(ROUNDED_FRACTION * stage.steps),
         warm_up_steps=0,
     )

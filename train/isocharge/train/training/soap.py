@@ -56,6 +56,7 @@ class Soap:
                 self.param_groups.append(defaults | parameter_or_group)
         if single_parameters:
             self.param_groups.append(defaults | {"params": single_parameters})
+        # One state for each parameter, in the order of the groups. A state is empty until the first step.
         self._states: list[dict[str, Any]] = [{} for group in self.param_groups for _ in group["params"]]
 
     @torch.no_grad()

@@ -65,8 +65,9 @@ class Split:
 
         train, validation, test = _split_presses(inside, training)
 
-        # The first field was fitted to presses beyond the fold, or to measured test presses. Then another field is
-        # fitted, unless the first one is more accurate within the fold.
+        # If the map folds, the first field was also fitted to presses beyond the fold. If the presses are measured, it
+        # was also fitted to test presses. In both cases, a second field is fitted to the training presses. For a map
+        # that folds, the more accurate field is used.
         field: ChargeMap = whole_field
         if is_folded or presses.measured:
             field = ChargeField.fit(domain, names, train, validation)
@@ -87,7 +88,7 @@ class Split:
             return WhitenedFeatures.fit_logarithms(charge)
         channel_noise = ChannelNoise.alike(noise, charge.shape[1])
         larger_noise = replace(channel_noise, white=SIGNED_FEATURE_SCALE * channel_noise.white)
-        return WhitenedFeatures.fit_signed(charge, larger_noise.bend(charge))
+        return WhitenedFeatures.fit_signed(charge, larger_noise.transition_charge(charge))
 
 
 def _split_presses(
