@@ -1,9 +1,9 @@
 """Maximum a posteriori estimate of a contact by the Gauss-Newton method on a charge map.
 
-The residuals are (Q - Q(c)) / sigma(Q), where Q are the measured charges and Q(c) those of a contact c. The prior is
-uniform over the disk and over the logarithm of the force, so it only constrains the contact. The search starts at the
-press with the nearest charges. If the residuals of the solution are too large, it starts again at the press with the
-next nearest charges.
+The residuals are (Q - Q(c)) / sigma(Q). Here Q are the measured charges, Q(c) are the charges of a contact c, and sigma
+is the standard deviation of the noise. The prior is uniform over the disk and over the logarithm of the force, so it
+only constrains the contact. The search starts at the press with the nearest charges. If the residuals of the solution
+are too large, it starts again at the press with the next nearest charges.
 """
 
 import numpy as np

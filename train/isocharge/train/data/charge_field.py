@@ -9,9 +9,9 @@ Here r is the radius of the working area, and l is the logarithm of the force sc
 have charges of both signs. For such charges, the quotient Q_e / S(l) is expanded instead of the logarithm. Here S(l) is
 the typical size of the charges under this force. The coefficients follow from linear least squares.
 
-The training uses the series to find the contact that is nearest to given charges, to find folds of the map, and to find
-distant contacts with the same charges. The model itself does not use the series. For a dataset of several probes, the
-series describes the mean of their charges.
+The training uses the series for three searches: for the contact that is nearest to given charges, for folds of the map,
+and for distant contacts with the same charges. The model itself does not use the series. For a dataset of several
+probes, the series describes the mean of their charges.
 """
 
 from dataclasses import dataclass, replace
@@ -287,7 +287,7 @@ MAX_ERROR_WITHOUT_NOISE = 2e-3
 """Relative error of a fit above which the charges probably have noise."""
 
 CREDIBLE_FOLD_RATIO = 0.95
-"""Largest ratio of the radius of a fold to that of the domain for which a fold of a poor fit is taken to be real.
+"""Largest ratio of the radius of a fold to the radius of the domain for which a fold of a poor fit counts as real.
 
 Spurious folds lie near the edge of the domain, where there are presses on one side only."""
 
@@ -295,7 +295,7 @@ CREDIBLE_FOLD_RATIO_WITH_NOISE = 0.8
 """The value of `CREDIBLE_FOLD_RATIO` for charges with noise, which moves spurious folds inwards."""
 
 SEARCHED_RADIUS_RATIO = 0.98
-"""Ratio of the searched radius to that of the domain. At the edge, presses do not determine the slopes."""
+"""Ratio of the searched radius to the radius of the domain. At the edge, presses do not determine the slopes."""
 
 N_PAIR_CONTACTS = 400
 """Number of contacts for which another contact with the same charges is searched. The search takes half a second."""

@@ -32,7 +32,7 @@ and two presses at the same place have p = 3/2. Presses solved with both loads a
 MIN_CHANGE = 1e-4
 """Change of |residual|^2 below which the search for the nearest contact ends, relative to 1 + |residual|^2.
 
-The misfits of 99 % of the examples then differ by less than 0.001 from those of a converged search.
+For 99 % of the examples, the misfit then differs by less than 0.001 from the misfit of a converged search.
 """
 
 MOVED_LOG_STDS = (-3.0, 0.3)

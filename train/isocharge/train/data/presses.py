@@ -24,7 +24,7 @@ HIGHEST_CHARGE = 1e6
 """Largest positive charge, pC. Larger charges are set to this value before the logarithm."""
 
 SOLVER = "solver"
-"""Name of an entry that the manifest of every simulated dataset has, and that of a measured dataset does not have."""
+"""Name of a manifest entry. Every simulated dataset has this entry, and no measured dataset has it."""
 
 FEWEST = 500
 """Smallest number of presses for a fit."""
@@ -143,7 +143,7 @@ def domain_of(dataset: Dataset) -> Domain:
 
 
 def split_by_position(presses: LabelledPresses, share: float, seed: int) -> tuple[LabelledPresses, LabelledPresses]:
-    """Split presses at random into two parts, such that all presses at one position belong to the same part.
+    """Split presses at random into two parts. All presses at one position belong to the same part.
 
     Args:
         presses: The presses.

@@ -92,8 +92,8 @@ class LayerSource:
 def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Block, ...]]:
     """Find the blocks of consecutive layers: two where two perceptrons run side by side, otherwise one.
 
-    The layers are examined from the last to the first one, because the outputs of the last layer are known to belong to
-    one or the other perceptron. The rows of a layer then tell which of its inputs belong to which perceptron.
+    The layers are examined from the last to the first one. For the last layer, it is known which outputs belong to
+    which perceptron. The rows of a layer then tell which of its inputs belong to which perceptron.
 
     Args:
         weights: Weights of each layer except the first one, whose inputs both perceptrons share.

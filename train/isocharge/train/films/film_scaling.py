@@ -1,6 +1,7 @@
 """Scaling of the charges of films, and the context: the properties of a film on which the scaled charges depend.
 
-With the stretching stiffness E h, the geometric mean d of d31 and d32, and the gain g of an electrode,
+E is Young's modulus, h is the thickness, d is the geometric mean of d31 and d32, and g is the gain of an electrode. The
+charge Q of this electrode then has the form
 
     Q / (g d E)  =  function of F / (E h), of the position in the frame of the electrodes, and of the context.
 
@@ -47,8 +48,8 @@ class FilmScaling:
     def log_charge_scale(self, parameters: Array) -> Array:
         """Compute the logarithms of those factors of the charges that follow exactly from the parameters.
 
-        A factor is the product of Young's modulus, the geometric mean of d31 and d32, and the gain of the electrode,
-        each relative to the described film.
+        The factor of an electrode is the product of three ratios between the film and the described film: Young's
+        modulus, the geometric mean of d31 and d32, and the gain of the electrode.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).

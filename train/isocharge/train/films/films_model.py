@@ -55,8 +55,8 @@ class ConditionalWeights:
     def perceptron(self, context: Array) -> Perceptron[Array]:
         """Compute the perceptron of one film.
 
-        Two context layers compute features psi of the film. The factors phi, by which the matrices of each layer are
-        mixed, and the biases are linear functions of psi.
+        Two context layers compute features psi of the film. The weights of each layer are a sum of matrices with the
+        factors phi. The factors phi and the biases are linear functions of psi.
 
         Args:
             context: Numbers that describe the film, shape (n_context,).
@@ -99,7 +99,7 @@ class ConditionalWeights:
 
 
 class AddedVariance(NamedTuple):
-    """Variances that are added to those of a network.
+    """Variances that are added to the variances of a network.
 
     Attributes:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -176,12 +176,11 @@ class FilmsModel:
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
             provenance: Additional information for the release.
-            charge_factor: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns factors, shape (n,
-                n_electrode), by which the charges of the film differ from those of the simulated film. The first and
-                the last layer of the network are then changed, and its standard deviations are fitted to the remaining
-                errors.
-            added_variance: Variances that are added to those of the network, for example because the parameters of the
-                film are uncertain.
+            charge_factor: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns the charges of the film
+                divided by the charges of the simulated film, shape (n, n_electrode). The first and the last layer of
+                the network are then changed, and its standard deviations are fitted to the remaining errors.
+            added_variance: Variances that are added to the variances of the network, for example because the parameters
+                of the film are uncertain.
             correlation: Whether to fit the correlations, which takes one or two seconds.
             n_test: Number of test presses, at most `N_TEST_PRESSES`.
 

@@ -50,9 +50,8 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
     Returns:
         Errors by name. The position errors are in mm, and the force errors are in percent of the force. The coverages
         of the 68 and 95 % intervals are fractions of the coordinates, 0 to 1. Further entries are the misfits that 1 %
-        and 0.1 % of the good presses exceed. For simulated presses, there are also the errors without noise, and the
-        fractions of faults whose misfit exceeds that of 99 % of the good presses. For measured presses, there is also
-        the number of presses.
+        and 0.1 % of the good presses exceed. For simulated presses, the result also contains the errors without noise,
+        and the fractions of faults that cause an alarm. For measured presses, there is also the number of presses.
     """
     if isinstance(presses, Dataset):
         presses = LabelledPresses.of(presses)

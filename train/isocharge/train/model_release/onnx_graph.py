@@ -254,7 +254,7 @@ def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
         where: Beginning of the error messages.
 
     Raises:
-        ModelError: If the number or the shapes of the constants are not those of a network.
+        ModelError: If the number or the shapes of the constants do not fit a network.
     """
     operators = [node.op_type for node in graph.node]
     activation = _activation_of(operators, where)

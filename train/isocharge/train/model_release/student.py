@@ -1,8 +1,8 @@
 """Training data and settings of a student: a small network that learns the answers of a model.
 
 A student has the inputs and outputs of the model and about 5,000 weights and biases, so it fits into the flash memory
-of a microcontroller. The student learns the contacts and standard deviations that the model estimates. The misfit of
-the student, like that of the model, is trained with distances that were computed exactly.
+of a microcontroller. The student learns the contacts and standard deviations that the model estimates. The misfits of
+the student and of the model are both trained with distances that were computed exactly.
 """
 
 from dataclasses import dataclass, replace

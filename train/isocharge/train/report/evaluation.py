@@ -178,8 +178,9 @@ class DatasetEvaluation:
     def _measure_on_simulated_presses(self, executor: Executor) -> Section:
         """Return the section of a simulated dataset, whose test presses are simulated.
 
-        The steps are: simulate the test presses, compute the theoretical limits of the error, fit and measure all
-        methods, and study the released model under several noise draws and under mismatches.
+        The test presses are simulated first, and the theoretical limits of the error are computed for these presses.
+        All methods are then fitted and measured. Finally, the released model is studied under several noise draws and
+        under mismatches.
 
         Args:
             executor: Executor of the solves and of the integrals of the Bayes limit.

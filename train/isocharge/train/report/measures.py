@@ -236,14 +236,15 @@ SPEED_NAMES: dict[Cost, str] = {"latency": "single predictions", "throughput": "
 
 
 def compare_with_released(records: Sequence[MethodRecord]) -> dict[str, Any]:
-    """Compare the speed and the error of all comparable methods with those of the released model.
+    """Compare the speed and the error of all comparable methods with the released model.
 
     Args:
         records: Records of all methods; the first one is the record of the released model.
 
     Returns:
-        The entry "verdict" of `report.json`. Its entry "sentences" is a list of sentences, and its entry "both"
-        contains, for "latency" and "throughput", the labels of the methods that are faster and more accurate.
+        The entry "verdict" of `report.json`. Its entry "sentences" is a list of sentences. Its entry "both" contains
+        two lists of labels, for "latency" and "throughput". Each list names the methods that are both faster and more
+        accurate than the released model.
     """
     released = records[0]
     comparable = [record for record in records[1:] if record.is_comparable]

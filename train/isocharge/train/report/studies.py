@@ -299,8 +299,8 @@ def measure_mismatch(
 
     Returns:
         One entry of "cases" in `report.json`. The entry contains the errors of each method. For the released model, the
-        entry also contains the percentage of presses with an alarm, and the fraction of true values inside plus or
-        minus one standard deviation.
+        entry also contains the percentage of presses with an alarm. A further number is the fraction of true values
+        within one standard deviation of the estimate.
     """
     estimate, std, misfit = released.answer(mismatch.charge)
     errors = {released_name: asdict(ContactErrors.of(estimate, mismatch.truth))}

@@ -111,7 +111,7 @@ class NetworkConfig(Settings, frozen=True):
         return (sizes.misfit_width,) * self._layer_count(sizes)
 
     def _layer_count(self, sizes: DefaultSizes) -> int:
-        """Return the number of hidden layers of each network: that of the given widths, or the default number.
+        """Return the number of given widths, or the default number of hidden layers if no widths are given.
 
         Args:
             sizes: Default sizes.

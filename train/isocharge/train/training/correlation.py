@@ -126,7 +126,7 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
 def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
     """Fit the linear layer that computes the angles a, b and c.
 
-    The inputs are whitened for the fit. The returned layer includes this whitening. The loss is that of
+    The inputs are whitened for the fit. The returned layer includes this whitening. The minimised function is
     `correlation_loss` plus a penalty on the squared weights.
 
     Args:

@@ -24,7 +24,7 @@ WARM_UP_FRACTION = 0.1
 """Fraction of the steps during which the learning rate rises, dimensionless."""
 
 SLOW_RATE_FACTOR = 0.1
-"""Learning rate of slow parameters, relative to that of the others."""
+"""Learning rate of slow parameters, relative to the learning rate of the other parameters."""
 
 INITIAL_RATE = 0.04
 """Learning rate of the first step, relative to the largest rate."""
@@ -88,11 +88,11 @@ class TrainingStage:
         score: Function that returns the loss on validation data and a text for the progress report.
         steps: Number of steps.
         warm_up_steps: Number of first steps with another loss. Weights of these steps are never the best ones.
-        rate_factor: Largest learning rate relative to that of the training's settings.
+        rate_factor: Factor by which the learning rate of the training's settings is multiplied.
         largest_gradient: Norm to which larger gradients are clipped after the warm-up.
         slow_parameters: Parameters of the network that have a smaller learning rate in SOAP.
         optimisers: Function from this stage to the optimisers of its network. The key `rate_factor` of each group of
-            parameters is the learning rate relative to that of the training.
+            parameters is a further factor on the learning rate.
     """
 
     name: str

@@ -9,8 +9,8 @@ from isocharge.common.charge_features import ChargeFeatures
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 
 CLIPPING_MARGIN = 1.0
-"""Distance between the extreme charges of the presses and the limits to which charges of both signs are clipped,
-relative to the range of the presses' charges. The distance is measured in asinh(Q / typical), dimensionless."""
+"""Distance of the clipping limits from the extreme charges of the presses, relative to the range of these charges.
+Charges of both signs are clipped. Distance and range are differences of asinh(Q / typical charge)."""
 
 MIN_SINGULAR_VALUE = 1e-12
 """Singular value below which the whitening does not enlarge a direction further."""
@@ -95,8 +95,9 @@ def whitening(values: Array, min_relative_std: float = 0.0) -> tuple[Array, Arra
 
     Args:
         values: Values, shape (n, k).
-        min_relative_std: Principal components with a standard deviation below this fraction of the largest one are
-            scaled as if they had this fraction, so that their standard deviation stays below 1.
+        min_relative_std: Smallest standard deviation of a principal component, relative to the largest one, for which
+            the component is scaled to unit variance. A smaller component is scaled as if it had this standard
+            deviation.
 
     Returns:
         Mean, shape (k,), and matrix M, shape (k, k): (values - mean) @ M has unit covariance.

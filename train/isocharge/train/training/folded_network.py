@@ -88,7 +88,8 @@ class FoldedNetwork:
             charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
-            Contact (x, y, F), shape (n, 3), mm and N; its standard deviations, shape (n, 3); misfit, shape (n, 1).
+            Contacts (x, y, F), shape (n, 3), mm and N. Standard deviations of the contacts, shape (n, 3). Misfits,
+            shape (n, 1).
         """
         contact, std, *_, misfit = self.outputs(charge)
         return contact, std, misfit

@@ -142,7 +142,7 @@ def _long_tailed_square(values: Tensor) -> Tensor:
 
 
 def distillation_loss(mean: Tensor, log_std: Tensor, teacher_mean: Tensor, teacher_log_std: Tensor) -> Tensor:
-    """Compute the Kullback-Leibler divergence of the network's normal distributions from those of the teacher.
+    """Compute the Kullback-Leibler divergence between the normal distributions of the network and of its teacher.
 
     Args:
         mean: Unit coordinates that the network estimates, shape (n, 3).

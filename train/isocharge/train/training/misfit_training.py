@@ -32,7 +32,8 @@ from isocharge.train.training.network import InverseNetwork, as_tensor, compress
 from isocharge.train.training.split import VALIDATION_FRACTION, Split
 
 MISFIT_RATE_FACTOR = 1.5
-"""Learning rate of the misfit network, whose targets have no noise, relative to that of the contact network."""
+"""Learning rate of the misfit network, relative to the learning rate of the contact network. The targets of the misfit
+network have no noise."""
 
 N_OUTSIDE_PRESSES = 6_000
 """Number of presses outside the working area from which charges for the misfit network are drawn."""
@@ -139,7 +140,8 @@ class MisfitExamples:
 
     @property
     def _options(self) -> ExampleOptions:
-        """Options of the examples. For charges of both signs, the limits are those of the input features."""
+        """Options of the examples. For charges of both signs, the charges are clipped to the limits of the input
+        features."""
         starts = MANY_SEARCH_STARTS if self._has_many_electrodes else SEARCH_STARTS
         if self._has_positive_charges:
             return ExampleOptions(starts=starts)

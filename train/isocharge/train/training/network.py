@@ -4,8 +4,9 @@ The inputs are whitened logarithms of the charges (`isocharge.train.training.fea
 nearly the same factor. The common factor therefore depends mostly on the force, and the ratios depend mostly on the
 position. One perceptron gives the mean and the logarithm of the standard deviation of (x, y, ln F). A second perceptron
 gives the vector (Q - Q(c)) / sigma at the contact c of the domain where this vector is shortest. The length of the
-vector is the misfit. Where the charges Q are exactly those of a contact, the vector is smooth, but its length is not.
-The length of the vector ranges from a tenth to thousands, and is compressed by asinh.
+vector is the misfit. If a contact explains the charges exactly, the vector is zero. The vector is a smooth function of
+the charges there, but its length is not. The length of the vector ranges from a tenth to thousands, and is compressed
+by asinh.
 """
 
 from collections.abc import Sequence
@@ -49,8 +50,8 @@ MIN_LENGTH = 1e-9
 class TrainablePerceptron(nn.Module):
     """A perceptron with a skip layer (`isocharge.common.perceptron`).
 
-    The logarithm of the force is nearly linear in the logarithms of the charges and is needed with a relative error of
-    a thousandth of its range. With the skip layer, the hidden layers only need to learn the nonlinear part.
+    The logarithm of the force is nearly a linear function of the logarithms of the charges. It is needed with an error
+    of about a thousandth of its range. With the skip layer, the hidden layers only need to learn the nonlinear part.
 
     Args:
         n_input: Number of inputs.
@@ -79,8 +80,8 @@ class TrainablePerceptron(nn.Module):
         """Draw the first layer again with larger weights, so that the units bend at random places among the inputs.
 
         The posterior mean of contacts at the rim of the working area bends within a small distance. Units that are
-        nearly linear over all inputs learn this slowly. Each unit gets a random direction in the space of the inputs, a
-        random slope along this direction, and a random centre at which its output is zero.
+        nearly linear over all inputs learn this slowly. Each unit gets a random direction in the space of the inputs
+        and a random slope along this direction. The output of the unit is zero at a random centre.
         """
         first, *_ = self.linear_layers()
         n_unit = first.out_features
@@ -228,7 +229,8 @@ class InverseNetwork(nn.Module):
             charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
-            Contact (x, y, F), shape (n, 3), mm and N; its standard deviations, shape (n, 3); misfit, shape (n, 1).
+            Contacts (x, y, F), shape (n, 3), mm and N. Standard deviations of the contacts, shape (n, 3). Misfits,
+            shape (n, 1).
         """
         # (x, y, ln F) and the standard deviations of these values
         unit_mean, unit_log_std = self.posterior(charge)

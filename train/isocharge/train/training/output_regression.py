@@ -51,13 +51,13 @@ class Regression:
 
 
 def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent: Array, contact: Array) -> FoldedNetwork:
-    """Adapt a network to charges that differ from those of its training.
+    """Adapt a network to charges that differ from the charges of its training.
 
-    The new network estimates from `charge` the contacts that the given network estimates from `equivalent`. A linear
-    map from the features of `charge` to those of `equivalent` is included in the first layer, and the last layer is
-    fitted to the remaining differences. The standard deviations are then fitted to the errors of the new network, so
-    that the Gaussian likelihood is largest. The method is Fisher's scoring (McCullagh and Nelder 1989, 2.5), a
-    regression on the squares of error / standard deviation.
+    The new network estimates from `charge` the contacts that the given network estimates from `equivalent`. First, a
+    linear map from the features of `charge` to the features of `equivalent` is included in the first layer. Then the
+    last layer is fitted to the remaining differences. The standard deviations are then fitted to the errors of the new
+    network, so that the Gaussian likelihood is largest. The method is Fisher's scoring (McCullagh and Nelder 1989,
+    2.5), a regression on the squares of error / standard deviation.
 
     Args:
         network: The given network.
@@ -120,8 +120,8 @@ def fit_std(network: FoldedNetwork, charge: Array, contact: Array) -> FoldedNetw
 
     Where the map from contacts to charges nearly folds, the errors have longer tails than a normal distribution. The
     intervals of a Gaussian likelihood then contain more than the stated share of the contacts. Errors are therefore
-    limited to `CORE_ERROR` standard deviations, and their mean square is compared with that of a limited normal
-    variable (Huber 1964, proposal 2).
+    limited to `CORE_ERROR` standard deviations. The mean square of these limited errors is compared with the mean
+    square of a normal variable with the same limit (Huber 1964, proposal 2).
 
     Args:
         network: The trained network.

@@ -56,8 +56,8 @@ class TrainingData:
         sensor: The pressed sensor.
         probes: Notations of the probes.
         domain: Contacts for which a network is requested. The network gets a smaller domain if the map folds.
-        presses: Presses for training. Noise is added to their charges during training, also to those of measured
-            presses, as a regularisation.
+        presses: Presses for training. Noise is added to the charges during the training. For measured presses, this is
+            a regularisation.
         sha256: Checksum of the presses.
         test: Measured presses for measuring errors; None to hold out a part of `presses`.
         teacher: Model whose answers are learned; None to learn the contacts of the presses.
