@@ -199,11 +199,19 @@ def describe_parameter(name: str, value: object) -> str:
 
 
 GAUSS_NEWTON = "Gauss-Newton"
+"""Name of the maximum a posteriori estimate by the Gauss-Newton method (`GaussNewton`)."""
+
 POLYNOMIAL = "polynomial ridge"
+"""Name of the ridge regression on monomials (`polynomial_ridge`)."""
+
 TABLE = "lookup table, interpolated"
+"""Name of the lookup table with affine maps (`AffineTable`)."""
+
 BOOSTING = "gradient boosting"
+"""Name of the gradient boosting of regression trees."""
+
 LINEAR_BAND = "linear band"
-"""Names of the methods to which a report refers by name."""
+"""Name of the method that assumes charges proportional to the force (`LinearBand`)."""
 
 POLYNOMIAL_DEGREES = (4, 6, 8, 10, 12)
 """Candidates for the degree of the polynomial."""
@@ -212,9 +220,13 @@ MAX_MONOMIALS = 500
 """Largest number of monomials of the polynomial. More monomials take longer and do not reduce the error under noise."""
 
 SKLEARN = "scikit-learn"
+"""Name in tables of the library that computes most methods."""
+
 KD_TREE = "SciPy KD-tree"
+"""Name in tables of the library part that finds nearest neighbours."""
+
 NUMPY = "NumPy"
-"""Names of the libraries that compute the methods, for tables."""
+"""Name in tables of the library that computes methods without another library."""
 
 
 def compared_methods(task: FittingTask, charge_map: ChargeMap | None = None) -> list[ComparedMethod]:

@@ -1,9 +1,7 @@
 """Training charges of the misfit network: charges of good presses, charges of faulty presses, and random charges.
 
-The misfit network has to answer any charges, so it is trained on all kinds of charges: presses with noise; charges at
-any distance from the charges that contacts can have; wrong gains; failing electrodes; forces far outside of the range;
-two presses at the same time; presses outside the working area; and charges from a box that contains all of these. The
-charges of two simultaneous presses are approximated from the charges of the single presses.
+The misfit network has to answer any charges, so it is trained on charges of many kinds (`KINDS`) and on presses outside
+the working area. The charges of two simultaneous presses are approximated from the charges of the single presses.
 """
 
 from collections.abc import Callable
@@ -20,7 +18,16 @@ from isocharge.train.data.channel_noise import ChannelNoise, Noise
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 
 KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}
-"""Share of each kind of charges in the training examples, dimensionless."""
+"""Share of each kind of charges in the training examples, dimensionless.
+
+- "noisy": charges of presses with noise.
+- "moved": charges at various distances from the charges of a press.
+- "gains": charges of electrodes with wrong gains.
+- "dying": charges of presses with one failing electrode.
+- "scaled": charges of forces far outside the range.
+- "two": charges of two simultaneous presses.
+- "any": charges from a box that contains the charges of all presses.
+"""
 
 PAIR_EXPONENTS = (1.0, 1.75)
 """Smallest and largest exponent p with which the charges of two presses are combined, (Q1^p + Q2^p)^(1/p).

@@ -66,7 +66,7 @@ class ConditionalWeights:
         """
         context_layers = [self._linear(f"context.{name}") for name in CONTEXT_LAYERS]
         psi = evaluate_hidden_layers(context_layers, self.activation, context)
-        n_layer = sum(name.startswith("constant.") for name in self.arrays)
+        n_layer = sum(name.startswith("constant.") for name in self.arrays)  # each layer has one constant matrix
         phi = self._apply_linear("phi", psi).reshape(n_layer + 1, -1)  # one row for each layer and for the skip layer
         layers = []
         for index in range(n_layer):
@@ -209,15 +209,14 @@ class FilmsModel:
         factors = np.ones(simulated_charge.shape) if charge_factor is None else charge_factor(contact)
         presses = LabelledPresses(contact, simulated_charge * factors)
         if charge_factor is not None:
-            copied_rows = train_rows[:N_REGRESSION_PRESSES].repeat(N_COPIES)  # each copy gets its own noise
-            noisy_charge = self.noise.add(presses.charge[copied_rows], rng)
-            equivalent_charge = noisy_charge / factors[copied_rows]
-            network = adapt_to_charges(network, noisy_charge, equivalent_charge, contact[copied_rows])
+            regression_rows = train_rows[:N_REGRESSION_PRESSES]
+            network = self._adapt_to_factors(network, presses[regression_rows], factors[regression_rows], rng)
         if correlation:
             network = with_correlation(network, presses[train_rows], self.noise, SEED)
         if added_variance is not None:
             noisy_charge = self.noise.add(presses.charge[uncertain_rows.repeat(N_COPIES)], rng)
-            network = add_variance(network, noisy_charge, added_variance.variance.repeat(N_COPIES, axis=0))
+            repeated_variance = added_variance.variance.repeat(N_COPIES, axis=0)
+            network = add_variance(network, noisy_charge, repeated_variance)
         test = presses[test_rows]
         return Fitted(
             network=network,
@@ -231,6 +230,22 @@ class FilmsModel:
             provenance=provenance or Provenance(),
             requested_domain=self.domain,
         )
+
+    def _adapt_to_factors(
+        self, network: FoldedNetwork, presses: LabelledPresses, factors: Array, rng: np.random.Generator
+    ) -> FoldedNetwork:
+        """Adapt the network of a simulated film to a film whose charges differ by known factors.
+
+        Args:
+            network: Network of the simulated film.
+            presses: Presses on the film, with the factors in their charges.
+            factors: Charges of the film divided by the charges of the simulated film, shape (n, n_electrode).
+            rng: Random number generator for the noise.
+        """
+        copied_rows = np.arange(len(presses)).repeat(N_COPIES)  # each copy gets its own noise
+        noisy_charge = self.noise.add(presses.charge[copied_rows], rng)
+        simulated_charge = noisy_charge / factors[copied_rows]
+        return adapt_to_charges(network, noisy_charge, simulated_charge, presses.contact[copied_rows])
 
     def fold(self, parameters: Array) -> FoldedNetwork:
         """Compute the network of one film without corrections, which takes a few milliseconds.

@@ -1,8 +1,8 @@
 """Studies of the released model beyond its mean error.
 
 The studies compute the errors over the film and the force, and the coverage of the reported standard deviations. The
-studies also compute the errors if the noise, the probe, the pretension, the gains or an electrode differ from those of
-the training.
+studies also compute the errors under conditions that differ from the training: other noise, another probe, another
+pretension, wrong gains or a dead electrode.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
