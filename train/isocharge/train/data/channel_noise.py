@@ -237,25 +237,25 @@ def usual_size(charge: Array) -> Array:
     return np.array([np.median(np.abs(column[column != 0.0])) for column in charge.T])
 
 
-def _fit_variances(value: Array, residual: Array) -> tuple[float, float]:
+def _fit_variances(charge: Array, residual: Array) -> tuple[float, float]:
     """Estimate the variances white^2 and gain^2 of one channel, for which white^2 + gain^2 Q^2 fits the residuals.
 
     The fit is a weighted least-squares problem with variances that are not negative. The weights of each round follow
     from the previous round, because the standard deviation of a squared residual is proportional to its expectation.
 
     Args:
-        value: Charges Q, shape (n,), pC.
+        charge: Charges Q without noise, shape (n,), pC.
         residual: Residuals, shape (n,), pC.
 
     Returns:
         white^2, pC^2, and gain^2, dimensionless.
     """
     # The expected squares are columns @ (white^2, gain^2).
-    columns = np.stack([np.ones_like(value), value**2], axis=1)
+    columns = np.stack([np.ones_like(charge), charge**2], axis=1)  # shape (n, 2)
     mean_square = np.mean(residual**2)
     smallest_variance = 1e-12 * mean_square + TINY  # avoids a division by zero
     # Both columns are scaled to the root mean square 1, because the squared charges may be very large or small.
-    column_scale = np.sqrt(np.maximum((columns**2).sum(axis=0), TINY)) / np.sqrt(len(value))
+    column_scale = np.sqrt(np.maximum((columns**2).sum(axis=0), TINY)) / np.sqrt(len(charge))
 
     variances = np.array([mean_square, 0.0])
     for _ in range(ROUNDS):

@@ -149,28 +149,28 @@ class ChargeField:
             charge_error = field.charges(validation.contact) - validation.charge
             return replace(field, error=rms(charge_error / error_unit))
 
-        best = fit_degrees(*first_degrees)
-        if best is None:
+        best_field = fit_degrees(*first_degrees)
+        if best_field is None:
             fewest = FEWEST_PER_TERM * series_term_count(*first_degrees)
             raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(unit)}")
 
         # If the lowest degrees for taut films have a clearly smaller error, the film is taut.
-        if not presses.signed and best.error > GOOD_ENOUGH:
+        if not presses.signed and best_field.error > GOOD_ENOUGH:
             first_taut_degrees, *further_taut_degrees = TAUT_CANDIDATE_DEGREES
             taut = fit_degrees(*first_taut_degrees)
-            if taut is not None and taut.error < TAUT_ERROR_RATIO * best.error:
-                best = taut
+            if taut is not None and taut.error < TAUT_ERROR_RATIO * best_field.error:
+                best_field = taut
                 further_degrees = further_taut_degrees
 
         for degree, force_degree in further_degrees:
-            if best.error < GOOD_ENOUGH:
+            if best_field.error < GOOD_ENOUGH:
                 break
             field = fit_degrees(degree, force_degree)
             if field is None:  # there are too few presses for this degree and all higher ones
                 break
-            if field.error < best.error:
-                best = field
-        return best
+            if field.error < best_field.error:
+                best_field = field
+        return best_field
 
     def charges(self, contact: Array) -> Array:
         """Return the charges of contacts; see `ChargeMap`."""

@@ -189,7 +189,16 @@ def _single_precision(values: Array) -> Singles:
 
 
 def _weights_on_differences(weight: Array) -> Singles:
-    """Return weights on (ln q_0, ln(q_1 / q_0), ...) from weights on the logarithms, shape (inputs, outputs)."""
-    values = np.array(weight)
-    values[0] = values.sum(axis=0)
-    return values.astype(np.float32)
+    """Return weights on (ln q_0, ln(q_1 / q_0), ...) that give the same sums as weights on (ln q_0, ln q_1, ...).
+
+    The equation in the description of this module shows that only the weights on ln q_0 change.
+
+    Args:
+        weight: Weights on the logarithms, shape (inputs, outputs).
+
+    Returns:
+        Weights on the first logarithm and on the differences from it, same shape.
+    """
+    changed = np.array(weight)
+    changed[0] = weight.sum(axis=0)
+    return changed.astype(np.float32)

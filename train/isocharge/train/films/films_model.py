@@ -78,13 +78,13 @@ class ConditionalWeights:
         return Perceptron(tuple(hidden), output_layer, skip_weight, self.activation)
 
     def _linear(self, name: str) -> Layer[Array]:
-        """Return a linear layer, whose weight has the shape (n_output, n_input) in the file."""
+        """Return the linear layer with this name. Its weight is stored with the shape (n_output, n_input)."""
         return Layer(self.arrays[f"{name}.weight"].T, self.arrays[f"{name}.bias"])
 
-    def _apply_linear(self, name: str, value: Array) -> Array:
-        """Apply a linear layer to a vector."""
+    def _apply_linear(self, name: str, vector: Array) -> Array:
+        """Apply the linear layer with this name to a vector, shape (n_input,)."""
         layer = self._linear(name)
-        return np.asarray(value @ layer.weight + layer.bias)
+        return np.asarray(vector @ layer.weight + layer.bias)
 
     def _mix_weights(self, constant: str, bases: str, phi: Array) -> Array:
         """Compute the weights of a layer: a constant matrix plus a weighted sum of basis matrices.

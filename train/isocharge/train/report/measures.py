@@ -292,13 +292,13 @@ def _comparison_sentence(cost: Cost, released: MethodRecord, group: Sequence[Met
     more_accurate_count = sum(record.error_mm < released.error_mm for record in faster)
     verb = "are" if more_accurate_count > 1 else "is"
 
-    best = min(faster, key=lambda record: record.error_mm)
-    speed_ratio = _speed_ratio(best, released, cost)
-    error_change_percent = 100.0 * (best.error_mm / released.error_mm - 1.0)
+    most_accurate = min(faster, key=lambda record: record.error_mm)
+    speed_ratio = _speed_ratio(most_accurate, released, cost)
+    error_change_percent = 100.0 * (most_accurate.error_mm / released.error_mm - 1.0)
     comparative = "less" if error_change_percent < 0.0 else "more"
     return (
         f"In {SPEED_NAMES[cost]}, {more_accurate_count or 'none'} of {len(group)} {group_name} {verb} both faster and "
-        f"more accurate than the released model. The most accurate of the faster ones is {best.label}: it is "
+        f"more accurate than the released model. The most accurate of the faster ones is {most_accurate.label}: it is "
         f"{speed_ratio:.3g} times as fast as the released model, with {abs(error_change_percent):.2g} % {comparative} "
         "error."
     )

@@ -75,15 +75,15 @@ def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
         model: Metadata of the model.
         dataset: The dataset.
     """
-    expected = sensor_to_dict(dataset.sensor)
-    given = dict(model.sensor)
-    compared_keys = (expected.keys() | given.keys()) - {"name"}
-    different_keys = sorted(key for key in compared_keys if expected.get(key) != given.get(key))
+    dataset_sensor = sensor_to_dict(dataset.sensor)
+    model_sensor = dict(model.sensor)
+    compared_keys = (dataset_sensor.keys() | model_sensor.keys()) - {"name"}
+    different_keys = sorted(key for key in compared_keys if dataset_sensor.get(key) != model_sensor.get(key))
     if different_keys:
         raise ModelError(
-            f"model {model.label}: expected a model of the dataset's sensor {expected['name']!r}, got a model of "
-            f"{given.get('name')!r} with another {', '.join(different_keys)}; choose a model of this sensor with "
-            "--model, or train one"
+            f"model {model.label}: expected a model of the dataset's sensor {dataset_sensor['name']!r}, got a model "
+            f"of {model_sensor.get('name')!r} with another {', '.join(different_keys)}; choose a model of this sensor "
+            "with --model, or train one"
         )
 
 

@@ -219,17 +219,17 @@ def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tup
     # The Cholesky factor is inverted row by row: the covariance of the whitened errors is the identity matrix. The
     # determinant of the factor is sin a sin b sin c. The square of the first error does not depend on the angles.
     x_deviation, y_deviation, force_deviation = deviation
-    first = x_deviation
-    second = (y_deviation - cos_a * first) / sin_a
-    third = (force_deviation - cos_b * first - sin_b * cos_c * second) / (sin_b * sin_c)
-    loss = np.log(np.abs(sin_a * sin_b * sin_c)) + 0.5 * (second**2 + third**2)
+    white_x = x_deviation
+    white_y = (y_deviation - cos_a * white_x) / sin_a
+    white_force = (force_deviation - cos_b * white_x - sin_b * cos_c * white_y) / (sin_b * sin_c)
+    loss = np.log(np.abs(sin_a * sin_b * sin_c)) + 0.5 * (white_y**2 + white_force**2)
 
     # Derivatives of the loss with respect to a, b and c, in which the cotangents replace quotients
     cot_a = cos_a / sin_a
     cot_b = cos_b / sin_b
     cot_c = cos_c / sin_c
-    a_derivative = cot_a + (second - third * cot_c) * (first - cot_a * second)
-    b_derivative = cot_b + third * ((first - cot_b * cos_c * second) / sin_c - cot_b * third)
-    c_derivative = cot_c + third * (second - cot_c * third)
+    a_derivative = cot_a + (white_y - white_force * cot_c) * (white_x - cot_a * white_y)
+    b_derivative = cot_b + white_force * ((white_x - cot_b * cos_c * white_y) / sin_c - cot_b * white_force)
+    c_derivative = cot_c + white_force * (white_y - cot_c * white_force)
     gradient = np.stack([a_derivative, b_derivative, c_derivative]) / np.float32(angles.shape[1])
     return float(loss.mean(dtype=float)), gradient
