@@ -27,11 +27,17 @@ def direction_arrays():
     series = np.zeros((2, 2, 2, 2, 4))
     series[0, 0, 0, 0] = 0.01
     series[1, 0, 0, 1] = [0.02, -0.02, 0.01, 0.0]
+    log_charge = np.zeros((2, 2, 2, 4))
+    log_charge[0, 0, 0] = np.log(200.0)
+    log_charge[1, 0, 0] = [0.1, 0.0, -0.1, 0.0]  # of x
+    log_charge[0, 1, 0] = [0.0, 0.1, 0.0, -0.1]  # of y
+    log_charge[0, 0, 1] = 0.7  # of the force
     return {
         "series": series,
         "radius_mm": np.array(8.0),
         "force_N": np.array([0.05, 2.0]),
         "by_pretension": np.array([0.1, -0.2]),
+        "log_charge": log_charge,
     }
 
 

@@ -360,6 +360,9 @@ def test_companion_files_with_faults(name, tmp_path, attack):
             directions = read_film_directions(tmp_path, 4)
             log_changes = directions.log_changes(np.array([[0.0, 0.0, 0.5], [30.0, -20.0, 100.0]]))
             assert np.isfinite(np.exp(log_changes)).all()
+            charge_pC = np.full((1, 4), 200.0)
+            slopes = directions.misfit_slopes(np.array([[1.0, -2.0, 0.5]]), charge_pC, np.ones((1, 4)))
+            assert slopes is None or np.isfinite(slopes).all()
         else:
             pretensions = read_pretensions(tmp_path)
             middle = np.array([sum(pretensions.range_MPa) / 2.0])

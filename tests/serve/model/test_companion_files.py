@@ -150,12 +150,35 @@ def test_pretensions_that_nothing_can_be_computed_from_are_refused(tmp_path, cha
 
 def test_film_directions_are_read_as_they_were_written(tmp_path):
     arrays = direction_arrays()
-    written = FilmDirections(arrays["series"], 8.0, (0.05, 2.0), arrays["by_pretension"])
+    written = FilmDirections(
+        arrays["series"], 8.0, (0.05, 2.0), arrays["by_pretension"], log_charge_coefficients=arrays["log_charge"]
+    )
     (tmp_path / "film_directions.npz").write_bytes(written.to_bytes())
     read = read_film_directions(tmp_path, 4)
     np.testing.assert_allclose(read.coefficients, written.coefficients, rtol=1e-6)
     np.testing.assert_array_equal(read.by_pretension, written.by_pretension)
+    np.testing.assert_allclose(read.log_charge_coefficients, written.log_charge_coefficients, rtol=1e-6)
     assert (read.radius_mm, read.force_N, read.count) == (8.0, (0.05, 2.0), 2)
+
+
+def test_charges_that_a_contact_explains_have_no_misfit(tmp_path):
+    """In the small file, x moves charge from C to A, y from D to B, and the force scales all charges equally."""
+    write_npz(tmp_path, "film_directions.npz", direction_arrays())
+    directions = read_film_directions(tmp_path, 4)
+    contact = np.array([[1.0, 2.0, 0.5]])
+    (slopes,) = directions.misfit_slopes(contact, np.full((1, 4), 200.0), np.full((1, 4), 2.0))
+    explained = np.array([[1.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, -1.0], [1.0, 1.0, 1.0, 1.0]])
+    np.testing.assert_allclose(slopes @ explained.T, 0.0, atol=1e-9)
+    unexplained = np.array([1.0, -1.0, 1.0, -1.0])
+    np.testing.assert_allclose(slopes @ unexplained, 100.0 * unexplained)
+
+
+def test_film_directions_of_an_earlier_version_have_no_misfit_slopes(tmp_path):
+    arrays = direction_arrays()
+    del arrays["log_charge"]
+    write_npz(tmp_path, "film_directions.npz", arrays)
+    directions = read_film_directions(tmp_path, 4)
+    assert directions.misfit_slopes(np.array([[1.0, 2.0, 0.5]]), np.ones((1, 4)), np.ones((1, 4))) is None
 
 
 def test_film_directions_change_the_charges_as_the_chebyshev_series_says(tmp_path):
@@ -185,6 +208,9 @@ def test_model_without_film_directions_has_none(tmp_path):
         ({"series": np.zeros((40, 40, 2, 2, 4))}, "degrees up to 30"),
         ({"series": np.full((2, 2, 2, 2, 4), 1e3)}, "changes of ln Q up to 10"),
         ({"series": np.full((2, 2, 2, 2, 4), np.nan)}, "expected finite numbers"),
+        ({"log_charge": np.zeros((2, 2, 2, 3))}, "expected an array of shape"),
+        ({"log_charge": np.zeros((2, 3, 2, 4))}, "log_charge: expected equal degrees"),
+        ({"log_charge": np.full((2, 2, 2, 4), 1e3)}, "values of ln Q up to 100"),
         ({"by_pretension": np.zeros(3)}, "expected an array of shape"),
         ({"by_pretension": np.full(2, 1e6)}, "changes up to 1000 per MPa"),
         ({"radius_mm": np.array(0.0)}, "expected a radius"),

@@ -18,7 +18,6 @@ touches, because a warm hand may come or go (an interacting multiple model, Blom
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from isocharge.common.arrays import Array
 from isocharge.serve.model.film_directions import FilmDirections
 from isocharge.serve.model.pretensions import Pretensions
 from isocharge.serve.tracking.film_unknowns import UnknownsLayout
-from isocharge.serve.tracking.film_update import kalman_update, multiply_stacks
+from isocharge.serve.tracking.film_update import TouchResiduals, kalman_update, multiply_stacks
 from isocharge.serve.tracking.pretension_grid import (
     GRID_STEP_MPa,
     evenly_spaced,
@@ -89,23 +88,6 @@ SECONDS_PER_HOUR = 3600.0
 
 PROBABILITY_COLUMN = 0
 """Index of the probability on the last axis of the weighted moments."""
-
-
-class TouchResiduals(NamedTuple):
-    """Squared misfits of a touch after the touch is corrected with the most likely offset level.
-
-    All values are relative to the mean squared misfit of good touches.
-
-    Attributes:
-        filtered: Squared misfit after the correction by all linear unknowns, at each pretension, shape (n_pretension,).
-        without_gains: Squared misfit after the correction by the offset and the directions, but not by the gains, at
-            each pretension, shape (n_pretension,).
-        offset_variance: Variance that the unknown offset of this touch adds to its misfit.
-    """
-
-    filtered: Array
-    without_gains: Array
-    offset_variance: float
 
 
 class FilmFilter:
@@ -359,7 +341,7 @@ class FilmFilter:
         self._mean = normalised[..., mean_columns]
         self._covariance = normalised[..., covariance_columns].reshape(level_count, grid_size, size, size)
 
-    def update(self, charge_pC: Array, log_changes: Array) -> TouchResiduals:
+    def update(self, charge_pC: Array, log_changes: Array, misfit_slopes: Array | None = None) -> TouchResiduals:
         """Update the distribution by a touch.
 
         The Kalman update assumes that the touch fits the model. A touch may also be an outlier with a small
@@ -369,11 +351,13 @@ class FilmFilter:
             charge_pC: Touch charges, shape (n_electrode,), pC.
             log_changes: Changes of the logarithms of the charges by one unit of each direction at the contact, shape
                 (n_direction, n_electrode).
+            misfit_slopes: Derivatives of the misfit vector with respect to the logarithms of the charges, shape
+                (n_electrode, n_electrode), in units of the noise. If None, they are finite differences of the network.
 
         Returns:
             The squared misfits that remain after the update.
         """
-        misfit, jacobian = self._linearise(charge_pC, log_changes)
+        misfit, jacobian = self._linearise(charge_pC, log_changes, misfit_slopes)
         noise_covariance = self._noise_covariance(jacobian)
         kalman = kalman_update(misfit, jacobian, noise_covariance, self._mean, self._covariance)
 
@@ -408,44 +392,69 @@ class FilmFilter:
         scatter_covariance = scatter_variance * outer_product
         return np.asarray(np.eye(self._layout.electrodes) + scatter_covariance)
 
-    def _linearise(self, charge_pC: Array, log_changes: Array) -> tuple[Array, Array]:
+    def _linearise(self, charge_pC: Array, log_changes: Array, misfit_slopes: Array | None) -> tuple[Array, Array]:
         """Compute the misfit vector of a touch at each pretension, and the Jacobian for the linear unknowns.
 
-        The derivatives are finite differences. The step of the offset is the estimated mean offset of the level, so
-        that the linearised misfit vector without this offset is exact.
+        A gain or a direction changes the misfit vector by the product of the misfit slopes and its change of ln Q. The
+        derivatives with respect to the offset are finite differences. Their step is the estimated mean offset of the
+        level, so that the linearised misfit vector without this offset is exact.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
             log_changes: Changes of the logarithms of the charges by one unit of each direction at the contact, shape
                 (n_direction, n_electrode).
+            misfit_slopes: Derivatives of the misfit vector with respect to the logarithms of the charges, as for
+                `update`.
 
         Returns:
             Misfit vectors, shape (n_pretension, n_electrode). Jacobian of the misfit vectors, shape (n_level,
             n_pretension, n_electrode, n_unknown). The unit of both is the root mean square of good touches.
         """
         layout = self._layout
+        gain_changes = GAIN_STD * np.eye(layout.electrodes)
         offset_step_pC = self._offset_steps()
 
-        # The network evaluates the charges of the touch and all changed charges at once.
-        changed_charges = [
-            charge_pC[None],  # shape (1, n_electrode)
-            charge_pC + GAIN_STD * np.diag(charge_pC),  # shape (n_electrode, n_electrode)
-            charge_pC - np.outer(offset_step_pC, self._offset_ratio),  # shape (n_level, n_electrode)
-            charge_pC * np.exp(log_changes),  # shape (n_direction, n_electrode)
-        ]
-        vectors = self._network.vectors(np.concatenate(changed_charges), self.grid_MPa) / self._pretensions.misfit_rms
+        # The network evaluates the charges of the touch, and these charges without the offset of each level.
+        charges_without_offset = charge_pC - np.outer(offset_step_pC, self._offset_ratio)
+        vectors = self._misfit_vectors(np.vstack([charge_pC, charges_without_offset]))
+        misfit = vectors[0]
+        without_offset = vectors[1:]  # shape (n_level, n_pretension, n_electrode)
 
-        # Divide the misfit vectors, shape (n_charges, n_pretension, n_electrode), into the same four groups.
-        group_ends = np.cumsum([len(group) for group in changed_charges])
-        (misfit,), with_gain, without_offset, with_direction = np.split(vectors, group_ends[:-1])
-
-        # The first axis of each difference is the unknown. It becomes the last axis of the Jacobian. Only the
-        # derivative with respect to the offset depends on the level.
         jacobian = np.empty((*self._probability.shape, layout.electrodes, layout.size))
-        jacobian[..., layout.gains] = np.moveaxis(with_gain - misfit, 0, 2)
         jacobian[..., layout.offset] = (misfit - without_offset) / offset_step_pC[:, None, None]
-        jacobian[..., layout.directions] = np.moveaxis(with_direction - misfit, 0, 2)
+        if misfit_slopes is None:
+            jacobian[..., layout.gains] = self._misfit_differences(charge_pC, misfit, gain_changes)
+            jacobian[..., layout.directions] = self._misfit_differences(charge_pC, misfit, log_changes)
+        else:
+            slopes = misfit_slopes / self._pretensions.misfit_rms
+            jacobian[..., layout.gains] = slopes @ gain_changes.T
+            jacobian[..., layout.directions] = slopes @ log_changes.T
         return misfit, jacobian
+
+    def _misfit_vectors(self, charge_pC: Array) -> Array:
+        """Evaluate the network for charges at every pretension of the grid.
+
+        Args:
+            charge_pC: Charges, shape (n, n_electrode), pC.
+
+        Returns:
+            Misfit vectors, shape (n, n_pretension, n_electrode). The unit is the root mean square of good touches.
+        """
+        return self._network.vectors(charge_pC, self.grid_MPa) / self._pretensions.misfit_rms
+
+    def _misfit_differences(self, charge_pC: Array, misfit: Array, log_changes: Array) -> Array:
+        """Compute the changes of the misfit vectors of a touch by changes of its charges as finite differences.
+
+        Args:
+            charge_pC: Touch charges, shape (n_electrode,), pC.
+            misfit: Misfit vectors of these charges, shape (n_pretension, n_electrode).
+            log_changes: Changes of the logarithms of the charges, shape (n_change, n_electrode).
+
+        Returns:
+            Changes of the misfit vectors, shape (n_pretension, n_electrode, n_change).
+        """
+        changed_misfit = self._misfit_vectors(charge_pC * np.exp(log_changes))
+        return np.moveaxis(changed_misfit - misfit, 0, 2)
 
     def _offset_steps(self) -> Array:
         """Return the step of the finite difference with respect to the offset at each level, shape (n_level,), pC.

@@ -28,7 +28,9 @@ from isocharge.serve.prediction.contact import Contact, Sensitivity, is_close
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.rule import Rule, Setting
-from isocharge.serve.tracking.film_filter import FilmFilter, TouchResiduals
+from isocharge.serve.tracking.film_filter import FilmFilter
+from isocharge.serve.tracking.film_state import FilmStateEstimate
+from isocharge.serve.tracking.film_update import TouchResiduals
 from isocharge.serve.tracking.followable_pretensions import followable_pretensions
 from isocharge.serve.tracking.pretension_grid import odds_of_no_change
 
@@ -71,6 +73,9 @@ The sum with the wrong gain is compared with the smallest sum for any pretension
 OFFSET_CORRECTION_ERROR = 0.5
 """Standard deviation of the correction of the pretension for offsets, in units of the correction."""
 
+UNCHANGED_PROBABILITY = 0.2
+"""Probability before the first touch that the pretension has not changed since the calibration."""
+
 SENSITIVITY_STEP_MPa = 0.05
 """Step of the finite differences with respect to the pretension."""
 
@@ -92,35 +97,6 @@ class FollowRule(Rule, frozen=True, kw_only=True):
 
     drift_MPa_per_root_hour: Setting = 0.35
     largest_offset_pC: Setting = 30.0
-
-
-class FilmStateEstimate(NamedTuple):
-    """Estimate of the pretension of the film and of the directions in which the film is uncertain.
-
-    Attributes:
-        pretension_MPa: Estimate of the pretension.
-        std_MPa: Standard deviation of the pretension.
-        directions: Estimate of the directions at this pretension, shape (n_direction,), in standard deviations.
-        directions_per_MPa: Change of this estimate with the pretension, shape (n_direction,), 1/MPa.
-    """
-
-    pretension_MPa: float
-    std_MPa: float
-    directions: Array
-    directions_per_MPa: Array
-
-    def charge_factor(self, log_changes: Array, step_MPa: float = 0.0) -> Array:
-        """Compute the ratio of the charges of this film to the charges of the calibrated film at the same pretension.
-
-        Args:
-            log_changes: Changes of ln Q by one unit of each direction, shape (n_direction, n_electrode).
-            step_MPa: Difference of this pretension from the estimated pretension.
-
-        Returns:
-            Ratios, shape (n_electrode,), dimensionless.
-        """
-        directions = self.directions + step_MPa * self.directions_per_MPa
-        return np.asarray(np.exp(directions @ log_changes))
 
 
 class FollowedContact(NamedTuple):
@@ -333,7 +309,7 @@ class FilmFollower:
         contacts = np.array([peak.contact[:3]])  # one contact (x, y, force), shape (1, 3)
         log_changes = self._directions.log_changes(contacts)[0]
         self._filter.predict(clock_s)
-        residuals = self._filter.update(peak.charge_pC, log_changes)
+        residuals = self._filter.update(peak.charge_pC, log_changes, self._misfit_slopes(contacts, peak.charge_pC))
         self._touch_count += 1
         self._recent_misfits.append(self._squared_misfits(peak.charge_pC, log_changes, residuals))
         if len(self._recent_misfits) < FEWEST_TOUCHES:
@@ -348,6 +324,21 @@ class FilmFollower:
         elif not was_lost:  # the film has been lost with this touch
             self._apply_estimate(self._estimate_before_recent_touches())
             self._recent_estimates.clear()
+
+    def _misfit_slopes(self, contacts: Array, charge_pC: Array) -> Array | None:
+        """Return the derivatives of the misfit vector of a touch with respect to the logarithms of its charges.
+
+        Args:
+            contacts: The contact (x, y, F), shape (1, 3), mm and N.
+            charge_pC: Touch charges, shape (n_electrode,), pC.
+
+        Returns:
+            Derivatives, shape (n_electrode, n_electrode), in units of the noise. None if the file of directions does
+            not contain the charges of the calibrated film.
+        """
+        noise_std_pC = np.sqrt(self._calibrated.metadata.noise.variance(charge_pC))
+        slopes = self._directions.misfit_slopes(contacts, charge_pC[None], noise_std_pC[None])
+        return None if slopes is None else slopes[0]
 
     def _estimate_before_recent_touches(self) -> FilmStateEstimate:
         """Return the estimate before the latest `RECENT_TOUCHES` touches."""
@@ -405,8 +396,8 @@ class FilmFollower:
         """Return the estimate of the film, averaged over two hypotheses.
 
         The first hypothesis is that the pretension has changed since the calibration. The second hypothesis is that it
-        has not changed. Before the first touch, each hypothesis has the probability one half. The variance includes the
-        difference between the two hypotheses.
+        has not changed, which has the probability `UNCHANGED_PROBABILITY` before the first touch. The variance includes
+        the difference between the two hypotheses.
         """
         calibrated_MPa = self._pretensions.calibrated_MPa
         change_MPa = self._filter.mean_MPa - calibrated_MPa
@@ -442,7 +433,10 @@ class FilmFollower:
         """Return the probability that the pretension has changed since the calibration."""
         pretensions = self._pretensions
         change_MPa = self._filter.grid_MPa - pretensions.calibrated_MPa
-        odds = odds_of_no_change(change_MPa, self._filter.probability, pretensions.std_MPa, self._additional_variance())
+        likelihood_ratio = odds_of_no_change(
+            change_MPa, self._filter.probability, pretensions.std_MPa, self._additional_variance()
+        )
+        odds = likelihood_ratio * UNCHANGED_PROBABILITY / (1.0 - UNCHANGED_PROBABILITY)
         return 1.0 / (1.0 + odds)
 
     def _apply_estimate(self, estimate: FilmStateEstimate) -> None:

@@ -23,6 +23,23 @@ class KalmanUpdate(NamedTuple):
     density: Array
 
 
+class TouchResiduals(NamedTuple):
+    """Squared misfits of a touch after the touch is corrected with the most likely offset level.
+
+    All values are relative to the mean squared misfit of good touches.
+
+    Attributes:
+        filtered: Squared misfit after the correction by all linear unknowns, at each pretension, shape (n_pretension,).
+        without_gains: Squared misfit after the correction by the offset and the directions, but not by the gains, at
+            each pretension, shape (n_pretension,).
+        offset_variance: Variance that the unknown offset of this touch adds to its misfit.
+    """
+
+    filtered: Array
+    without_gains: Array
+    offset_variance: float
+
+
 def kalman_update(
     misfit: Array, jacobian: Array, noise_covariance: Array, mean: Array, covariance: Array
 ) -> KalmanUpdate:

@@ -31,9 +31,9 @@ def normal_probabilities(deviation: Reals, std: float) -> Array:
 def odds_of_no_change(change_MPa: Array, probability: Array, prior_std_MPa: float, additional_variance: float) -> float:
     """Compute the odds that a pretension is unchanged, against a change with a normal prior distribution.
 
-    Both hypotheses have the same prior probability. The odds are then the ratio of two probability densities of the
-    change at zero, after and before the measurements. Both densities belong to the hypothesis of a change (the
-    Savage-Dickey density ratio, Dickey 1971).
+    Both hypotheses are assumed to have the same prior probability. The odds are then the ratio of two probability
+    densities of the change at zero, after and before the measurements. Both densities belong to the hypothesis of a
+    change (the Savage-Dickey density ratio, Dickey 1971).
 
     Args:
         change_MPa: Changes on an evenly spaced grid, shape (n,), MPa.

@@ -14,6 +14,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.model.film_directions import FilmDirections
 from isocharge.simulate import Domain
+from isocharge.train.calibration.contact_error import spread_contacts
 from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.data.charge_field import fit_series
 
@@ -23,11 +24,17 @@ DEGREES = ((5, 3), (3, 1), (1, 1))
 CONTACTS_PER_TERM = 2.0
 """Least number of contacts for each coefficient of a series."""
 
-LEAST_MISFIT = 0.5
+LEAST_MISFIT = 0.2
 """Effect of a direction on the misfit below which the direction is left out, in units of the noise.
 
-The effect is the root mean square of the misfit that one standard deviation of the direction causes. The misfits of a
-trained network have errors of this size, and directions with a smaller effect would explain these errors."""
+The effect is the root mean square of the misfit that one standard deviation of the direction causes. More directions
+hardly change the followed contacts."""
+
+N_CHARGE_CONTACTS = 1200
+"""Number of contacts to which the series of ln Q of the calibrated film is fitted."""
+
+CHARGE_DEGREES = (12, 3)
+"""Degrees of this series in the position and in ln F. The derivatives of the series are used as well."""
 
 MAX_DIRECTIONS = 16
 """Largest number of directions. A larger number would increase the time that a touch takes."""
@@ -47,33 +54,73 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
         result: The calibration of the film.
     """
     problem = result.problem
-    estimate = result.posterior.drifted(problem.prior)
+    sensitivity = result.sensitivity
+    estimate = result.posterior.drifted(problem.prior)  # the film changes until it is used
     pretension = problem.prior.index("pretension")
+
+    # Covariance C of the unknowns at a given pretension: that of all unknowns less the part due to the pretension. The
+    # root R, with C = R R', expresses the unknowns by independent variables with a standard deviation of 1.
     covariance = estimate.unknown_covariance
-    n_unknown = len(covariance)
-    # The covariance of the unknowns at a given pretension is that of all unknowns less the part due to the pretension.
     by_pretension = covariance[:, pretension] / covariance[pretension, pretension]  # regression on the pretension
     root = _covariance_root(covariance - np.outer(by_pretension, covariance[pretension]))
 
-    # The singular vectors are orthogonal combinations of the columns of the root, the largest misfit first.
-    sensitivity = result.sensitivity
-    unknowns = slice(0, n_unknown)
-    misfit = sensitivity.misfit_jacobian[:, :, unknowns]
-    misfit_of_root = misfit.reshape(-1, n_unknown) @ root  # M R, one row for each misfit of each contact
-    _, misfit_norms, combinations = np.linalg.svd(misfit_of_root, full_matrices=False)
-    # The norm over all contacts is the root mean square misfit of a contact times the root of their number.
-    is_visible = misfit_norms > LEAST_MISFIT * np.sqrt(len(misfit))
-    visible = combinations[is_visible][:MAX_DIRECTIONS]  # shape (n_direction, n_column of the root)
+    # Each direction is a unit vector of these variables. The unknowns change by the root times this vector.
+    unknowns = slice(0, len(covariance))
+    directions = _visible_directions(sensitivity.misfit_jacobian[:, :, unknowns], root)
+    unknown_changes = directions @ root.T  # shape (n_direction, n_unknown)
 
     # Sum over the unknowns u, for each contact n, direction k and electrode e
-    log_changes = np.einsum("neu,ku->nke", sensitivity.log_charge_jacobian[:, :, unknowns], visible @ root.T)
-    mean_by_pretension = visible @ np.linalg.pinv(root) @ by_pretension
+    log_changes = np.einsum("neu,ku->nke", sensitivity.log_charge_jacobian[:, :, unknowns], unknown_changes)
+    # Mean of each direction after a change of the pretension, with which the unknowns are correlated
+    mean_by_pretension = directions @ np.linalg.pinv(root) @ by_pretension
     return FilmDirections(
         coefficients=_fitted_series(problem.domain, sensitivity.contact, log_changes),
         radius_mm=problem.domain.radius,
         force_N=problem.domain.force_range,
         by_pretension=mean_by_pretension / problem.prior.std[pretension],
+        log_charge_coefficients=_fitted_log_charge(result),
     )
+
+
+def _fitted_log_charge(result: CalibrationResult) -> Array | None:
+    """Fit a series to ln Q of the calibrated film.
+
+    Args:
+        result: The calibration of the film.
+
+    Returns:
+        Coefficients of the series, shape (degree + 1, degree + 1, force_degree + 1, n_electrode). None if the film has
+        charges of both signs, which have no logarithm.
+    """
+    problem = result.problem
+    contact = spread_contacts(problem.domain, N_CHARGE_CONTACTS)
+    charge = problem.charges.charges(result.posterior.unknowns, contact)
+    if charge.min() <= 0.0:
+        return None
+    degree, force_degree = CHARGE_DEGREES
+    return fit_series(problem.domain.to_unit(contact), np.log(charge), degree, force_degree)
+
+
+def _visible_directions(misfit_jacobian: Array, root: Array) -> Array:
+    """Find the combinations of independent variables that change the misfits of touches most.
+
+    The combinations are the right singular vectors of M R, where M is the misfit Jacobian and R is the root. Their
+    effects on the misfits are orthogonal. Combinations with an effect below `LEAST_MISFIT` are left out.
+
+    Args:
+        misfit_jacobian: Derivatives of the misfits of each contact with respect to the unknowns, in units of the noise,
+            shape (n, n_electrode, n_unknown).
+        root: Derivatives of the unknowns with respect to the independent variables, shape (n_unknown, n_variable).
+
+    Returns:
+        Unit vectors, the largest misfit first, shape (n_direction, n_variable).
+    """
+    n_contact, _, n_unknown = misfit_jacobian.shape
+    misfit_of_root = misfit_jacobian.reshape(-1, n_unknown) @ root  # one row for each misfit of each contact
+    _, misfit_norms, combinations = np.linalg.svd(misfit_of_root, full_matrices=False)
+    # A norm over all contacts is the root mean square misfit of a contact times the root of their number.
+    is_visible = misfit_norms > LEAST_MISFIT * np.sqrt(n_contact)
+    return np.asarray(combinations[is_visible][:MAX_DIRECTIONS])
 
 
 def _covariance_root(covariance: Array) -> Array:

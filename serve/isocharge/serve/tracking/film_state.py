@@ -1,0 +1,36 @@
+"""Estimate of the state of a film, which `film_follower` computes from touches."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+
+
+class FilmStateEstimate(NamedTuple):
+    """Estimate of the pretension of the film and of the directions in which the film is uncertain.
+
+    Attributes:
+        pretension_MPa: Estimate of the pretension.
+        std_MPa: Standard deviation of the pretension.
+        directions: Estimate of the directions at this pretension, shape (n_direction,), in standard deviations.
+        directions_per_MPa: Change of this estimate with the pretension, shape (n_direction,), 1/MPa.
+    """
+
+    pretension_MPa: float
+    std_MPa: float
+    directions: Array
+    directions_per_MPa: Array
+
+    def charge_factor(self, log_changes: Array, step_MPa: float = 0.0) -> Array:
+        """Compute the ratio of the charges of this film to the charges of the calibrated film at the same pretension.
+
+        Args:
+            log_changes: Changes of ln Q by one unit of each direction, shape (n_direction, n_electrode).
+            step_MPa: Difference of this pretension from the estimated pretension.
+
+        Returns:
+            Ratios, shape (n_electrode,), dimensionless.
+        """
+        directions = self.directions + step_MPa * self.directions_per_MPa
+        return np.asarray(np.exp(directions @ log_changes))
