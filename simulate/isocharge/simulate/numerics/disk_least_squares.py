@@ -17,8 +17,9 @@ Residuals = Callable[[Integers, Array], tuple[Array, Array]]
 """Function of the indices of problems, shape (m,), and of their points u, shape (m, 3). It returns the residuals r,
 shape (m, k), and their derivatives dr/du, shape (m, 3, k)."""
 
-MAX_STEPS = 30
-"""Default of the largest number of steps. Most problems converge in five."""
+MAX_STEPS = 60
+"""Default of the largest number of steps. Most problems converge in five. Problems with large residuals may need more
+than thirty."""
 
 MIN_CHANGE = 1e-7
 """Default of the change of |r|^2 below which the iteration ends, relative to 1 + |r|^2."""
@@ -62,11 +63,13 @@ def minimise(
 ) -> tuple[Array, Array]:
     """Find a local minimum of every problem by damped Gauss-Newton steps from a starting point.
 
-    The damping of a problem is reduced after a step that is accepted, and increased after a step that is rejected
-    because it increases |r|^2. A problem is finished if |r|^2 hardly changes, or if the damping exceeds `MAX_DAMPING`.
+    Each problem minimises |r(u)|^2 over the domain D of u, which is the unit disk times the interval [-1, 1]. The
+    damping of a problem is reduced after a step that is accepted, and increased after a step that is rejected because
+    it increases |r|^2. A problem is finished if |r|^2 hardly changes, or if the damping exceeds `MAX_DAMPING`.
 
     Args:
-        residuals: Function that evaluates the residuals of some of the problems.
+        residuals: Function that evaluates the residuals and their derivatives for some of the problems. Its arguments
+            are the indices of the problems and their points.
         start: Starting points, shape (n, 3). Points outside D are replaced by the nearest point of D.
         steps: Largest number of steps.
         min_change: Change of |r|^2 below which the iteration ends, relative to 1 + |r|^2.
@@ -84,22 +87,23 @@ def minimise(
     for _ in range(steps):
         if not active.size:
             break
+
+        # A step is accepted if it does not increase |r|^2.
         trial = bounded_step(point[active], residual[active], slopes[active], damping[active])
         trial_residual, trial_slopes = residuals(active, trial)
         trial_square = (trial_residual**2).sum(axis=1)
         change = (trial_square - square[active]) / (1.0 + trial_square)
         is_accepted = change <= MAX_INCREASE
-
         accepted = active[is_accepted]
         point[accepted] = trial[is_accepted]
         residual[accepted] = trial_residual[is_accepted]
         slopes[accepted] = trial_slopes[is_accepted]
         square[accepted] = trial_square[is_accepted]
 
+        # Adapt the damping, and remove the problems that have ended.
         lower_damping = np.maximum(damping[active] * DAMPING_DECREASE, MIN_DAMPING)
         higher_damping = damping[active] * DAMPING_INCREASE
         damping[active] = np.where(is_accepted, lower_damping, higher_damping)
-
         is_changing = np.abs(change) >= min_change
         is_damping_allowed = damping[active] <= MAX_DAMPING
         active = active[is_changing & is_damping_allowed]
@@ -107,7 +111,10 @@ def minimise(
 
 
 def bounded_step(unit: Array, residual: Array, slopes: Array, damping: Array | float) -> Array:
-    """Take one damped Gauss-Newton step that stays within D.
+    """Take one damped Gauss-Newton step that stays within the domain D, the unit disk times [-1, 1].
+
+    With the Jacobian J of the residuals, the step is -(J'J + damping * mean(diag(J'J)) I)^-1 J'r. It is modified for
+    points on the edge of D.
 
     Args:
         unit: Points of D, shape (..., 3).
@@ -124,7 +131,7 @@ def bounded_step(unit: Array, residual: Array, slopes: Array, damping: Array | f
     trace = normal_matrix[..., 0, 0] + normal_matrix[..., 1, 1] + normal_matrix[..., 2, 2] + 1e-12
     normal_matrix = normal_matrix + (damping * trace)[..., None, None] * MEAN_OF_DIAGONAL
 
-    # Points on the edge of the disk or at an end of the interval
+    # At the edge of the disk or at an end of the interval, a step must not leave D.
     is_on_circle, is_at_end = _is_beyond(unit, 1.0 - EDGE_TOLERANCE)
     if np.count_nonzero(is_on_circle | is_at_end):
         normal_matrix, gradient = _restrict_to_edges(unit, normal_matrix, gradient, trace, is_on_circle, is_at_end)
@@ -159,6 +166,9 @@ def _restrict_to_edges(
 ) -> tuple[Array, Array]:
     """Modify the normal equations so that steps do not leave D across an edge, but follow the edge.
 
+    The edges of D are the unit circle for the first two coordinates, and both ends of the interval [-1, 1] for the
+    third coordinate.
+
     Args:
         unit: Points of D, shape (..., 3).
         normal_matrix: Damped matrices J'J, shape (..., 3, 3).
@@ -188,8 +198,9 @@ def _restrict_to_edges(
 
     # The curvature of the circle acts along its tangent. The stiffness keeps the point on the active edges.
     curvature = _outer_product(circle_tangent, circle_multiplier)
-    circle_stiffness = _outer_product(circle_normal, (circle_multiplier > 0.0) * EDGE_STIFFNESS * trace)
-    end_stiffness = _outer_product(end_normal, (end_multiplier > 0.0) * EDGE_STIFFNESS * trace)
+    stiffness = EDGE_STIFFNESS * trace
+    circle_stiffness = _outer_product(circle_normal, np.where(circle_multiplier > 0.0, stiffness, 0.0))
+    end_stiffness = _outer_product(end_normal, np.where(end_multiplier > 0.0, stiffness, 0.0))
     new_matrix = normal_matrix + curvature + circle_stiffness + end_stiffness
 
     # The components of the gradient that point out of D do not contribute to the step.
