@@ -98,6 +98,7 @@ def design_command(
 
     Example: isocharge simulate design four-25um-biaxial --guard --radius 8 -o guarded
     """
+    # Check the options, and describe the search.
     refuse_finished(output)
     footprint = parse_probe(probe)
     if not isinstance(footprint, Circle):
@@ -105,16 +106,17 @@ def design_command(
     described_sensor = load_sensor(sensor)
     if guard:
         refuse_search_options(electrodes=electrodes, keep=keep, goal=goal, known=known)
-        electrodes = len(described_sensor.electrodes) + 1
+        electrodes = len(described_sensor.electrodes) + 1  # the guard is added to the electrodes of the sensor
         keep = ",".join(described_sensor.electrode_names)
     if electrodes is None:
         raise InputError("--electrodes: expected the number of electrodes, got none; give it, or --guard")
+    kept_names = [name.strip() for name in (keep or "").split(",")]
     case = DesignCase(
         described_sensor,
         electrodes,
         radius,
         goal=read_goal(goal),
-        keep=tuple(name.strip() for name in (keep or "").split(",") if name.strip()),
+        keep=tuple(name for name in kept_names if name),
         probe=footprint,
         force=force,
         noise=noise_model(noise),
@@ -123,7 +125,8 @@ def design_command(
         seed=seed,
     )
     warn_of_stress(case.sensor.film, [footprint], force, stress_limit)
-    # An interrupted search is only resumed if all of these values are unchanged.
+
+    # Search, and write the files. An interrupted search is only resumed if all values of `identity` are unchanged.
     identity = {
         "made_by": code_fingerprint(),
         "sensor": sensor_to_dict(case.sensor),
@@ -143,6 +146,8 @@ def design_command(
         else:
             result = design(case, executor=executor)
             write_design(result, output)
+
+    # Print the result.
     if guard:
         show(_guard_table(guard_design))
         say(f"{guard_design.summary}; {straight_leads(guard_design.sensor).summary}; files in {output}")
@@ -164,20 +169,26 @@ def refuse_search_options(*, electrodes: int | None, keep: str | None, goal: str
     Raises:
         InputError: If one of the options was given.
     """
-    given = {"--electrodes": electrodes is not None, "--keep": keep is not None, "--goal": goal != "worst"}
-    names = [name for name, is_given in {**given, "--known": known}.items() if is_given]
-    if names:
+    is_given = {
+        "--electrodes": electrodes is not None,
+        "--keep": keep is not None,
+        "--goal": goal != "worst",
+        "--known": known,
+    }
+    given_names = [name for name in is_given if is_given[name]]
+    if given_names:
+        pronoun = "it" if len(given_names) == 1 else "them"
         raise InputError(
-            f"--guard: keeps all electrodes of the sensor and adds one, got {', '.join(names)} as well; leave "
-            f"{'it' if len(names) == 1 else 'them'} out"
+            f"--guard: keeps all electrodes of the sensor and adds one, got {', '.join(given_names)} as well; leave "
+            f"{pronoun} out"
         )
 
 
 def _guard_table(guard_design: GuardDesign) -> str:
     """Return a table with the position of the guard electrode.
 
-    The table also lists the share of presses that are not noticed and the limits of the position error, without and
-    with this electrode.
+    The table also lists the share of the presses outside the working area that are not noticed, and the limits of the
+    position error inside it, without and with this electrode.
     """
     x, y = guard_design.guard.centre
     lines = [
@@ -188,8 +199,8 @@ def _guard_table(guard_design: GuardDesign) -> str:
         ("without guard", guard_design.region_before, guard_design.limits_before),
         ("with guard", guard_design.region_after, guard_design.limits_after),
     ):
-        share = f"{100.0 * region.total_share:.1f} %"
-        lines.append(f"{title:<15} {share:>12} {limits.worst:31.3f} {limits.rms:8.3f}")
+        unnoticed_percent = f"{100.0 * region.total_share:.1f} %"
+        lines.append(f"{title:<15} {unnoticed_percent:>12} {limits.worst:31.3f} {limits.rms:8.3f}")
     return "\n".join(lines)
 
 
@@ -204,6 +215,8 @@ def _table(result: Design) -> str:
     for electrode in result.sensor.electrodes:
         x, y = electrode.centre
         lines.append(f"{electrode.name:<10} {x:9.3f} {y:9.3f} mm")
+
+    # The errors have one line for the noise alone, and one line for noise and nuisances.
     lines.append("position error limit, mm     worst      rms")
     for name, errors in (("before", result.before), ("after", result.after)):
         if errors is None:

@@ -66,13 +66,15 @@ def identify_command(
     if not 0.0 < error < inf:
         raise InputError(f"--error: expected a positive number of mm, got {error}")
     described_sensor = load_sensor(sensor)
-    footprint = parse_probe(probe)
+    footprint = parse_probe(probe)  # the shape of the contact area
     noise_level = noise_model(noise)
     with shown_progress(), executor_for(workers, None) as pool:
         identification = identify(
             described_sensor, footprint, noise_level, force_range=force, radius=radius, error=error, executor=pool
         )
     results = identification.to_dict()
+
+    # Write the pictures and the results.
     if output is not None:
         with new_folder(output) as folder:
             (folder / PICTURE).write_bytes(picture_bytes(identification_picture(identification)))
@@ -80,6 +82,8 @@ def identify_command(
                 picture = mirror_picture(described_sensor, identification.mirror)
                 (folder / MIRROR_PICTURE).write_bytes(picture_bytes(picture))
             (folder / RESULTS).write_bytes(json_module.dumps(results, indent=1).encode())
+
+    # Print the results and a summary in sentences.
     if json:
         show_json(results)
     else:

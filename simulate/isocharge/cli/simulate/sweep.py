@@ -97,6 +97,8 @@ def sweep_command(
     """
     film_sensor = load_sensor(sensor)
     probes = [parse_probe(text) for text in probe or ["circle:1.0"]]
+
+    # The output is a dataset folder, or a table beside which the dataset folder is written.
     folder = output
     table = None
     if output.suffix.lower() in TABLES:
@@ -115,9 +117,9 @@ def sweep_command(
     if table is not None:
         write_presses(table, _presses(read_dataset(folder)))
 
-    count = json_module.loads((folder / "manifest.json").read_text())["samples"]
+    manifest = json_module.loads((folder / "manifest.json").read_text())
     written = f"{folder} and {table}" if table is not None else f"{folder}"
-    say(f"{count} presses in {written}")
+    say(f"{manifest['samples']} presses in {written}")
 
 
 def _check_table(table: Path, folder: Path, samples: int, *, has_one_orientation: bool) -> None:
@@ -147,7 +149,7 @@ def _check_table(table: Path, folder: Path, samples: int, *, has_one_orientation
             f"{table}: a table has at most {MAX_ROWS:,} presses, got --samples {samples}; give a folder, -o {folder}"
         )
     if table.suffix.lower() == ".parquet":
-        with require("parquet"):
+        with require("parquet"):  # raises MissingExtra if the import fails
             import pyarrow  # noqa: F401
 
 

@@ -30,13 +30,13 @@ def write_design(design: Design, folder: Path) -> None:
         OutputError: If the files cannot be written.
     """
     case = design.case
-    errors = design.after.to_dict()["with_nuisances"]
-    comment = [
+    errors = design.after.to_dict()["with_nuisances"]  # of the new layout
+    sensor_comment = [
         f"Positions searched for {case.electrodes} electrodes over {case.radius:g} mm, goal {case.goal_name}:",
         f"lower limit of the position error {errors['worst_mm']:.3f} mm at worst, {errors['rms_mm']:.3f} mm rms.",
     ]
     pictures = {"design.png": picture_bytes(error_maps_picture(design))}
-    _write_folder(folder, design.sensor, comment, design.to_dict(), pictures)
+    _write_folder(folder, design.sensor, sensor_comment, design.to_dict(), pictures)
 
 
 def write_guard_design(design: GuardDesign, folder: Path) -> None:
@@ -53,7 +53,7 @@ def write_guard_design(design: GuardDesign, folder: Path) -> None:
         OutputExists: If the folder already exists.
         OutputError: If the files cannot be written.
     """
-    comment = [
+    sensor_comment = [
         f"Guard electrode {design.guard.name} searched for presses outside {design.case.radius:g} mm:",
         f"{100.0 * design.region_before.total_share:.1f} % of them cannot be noticed without it, "
         f"{100.0 * design.region_after.total_share:.1f} % with it.",
@@ -62,31 +62,33 @@ def write_guard_design(design: GuardDesign, folder: Path) -> None:
         "mirror_before.png": picture_bytes(mirror_picture(design.case.sensor, design.region_before)),
         "mirror.png": picture_bytes(mirror_picture(design.sensor, design.region_after)),
     }
-    _write_folder(folder, design.sensor, comment, design.to_dict(), pictures)
+    _write_folder(folder, design.sensor, sensor_comment, design.to_dict(), pictures)
 
 
 def _write_folder(
-    folder: Path, sensor: Sensor, comment: list[str], results: dict[str, Any], pictures: dict[str, bytes]
+    folder: Path, sensor: Sensor, sensor_comment: list[str], results: dict[str, Any], pictures: dict[str, bytes]
 ) -> None:
     """Write the files of a designed sensor into a new folder.
+
+    The drawings also show the leads, which are the conductors from the electrodes to the rim of the film.
 
     Args:
         folder: Folder to create.
         sensor: The designed sensor.
-        comment: Comment lines at the beginning of the sensor file.
+        sensor_comment: Comment lines at the beginning of the sensor file.
         results: Content of `design.json`, to which a sentence about the leads is added.
         pictures: PNG files, by file name.
     """
     leads = straight_leads(sensor)
     drawing = draw_layout(sensor, leads)
-    results = {**results, "leads": leads.summary}
+    all_results = {**results, "leads": leads.summary}
     files = {
-        "sensor.toml": sensor_to_toml(sensor, comment).encode(),
+        "sensor.toml": sensor_to_toml(sensor, sensor_comment).encode(),
         "layout.svg": to_svg(drawing).encode(),
         "layout.dxf": to_dxf(drawing).encode(),
-        "design.json": (json.dumps(results, indent=1, allow_nan=False) + "\n").encode(),
+        "design.json": (json.dumps(all_results, indent=1, allow_nan=False) + "\n").encode(),
         **pictures,
     }
-    with new_folder(folder) as draft:
-        for name, data in files.items():
-            write_whole(draft / name, data)
+    with new_folder(folder) as temporary_folder:  # is renamed when all files are complete
+        for name, content in files.items():
+            write_whole(temporary_folder / name, content)

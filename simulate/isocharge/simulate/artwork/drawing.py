@@ -7,7 +7,7 @@ from typing import Any
 
 from isocharge.common.extras import require
 from isocharge.simulate.artwork.leads import Leads
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.sensor.sensor import Electrode, Sensor
 
 with require("design"):
     import ezdxf
@@ -53,14 +53,16 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
         sensor: Sensor with the layout.
         leads: Leads of the electrodes.
     """
+    # Empty drawing in mm with one layer for each kind of object
     with _fixed_metadata():
         document = ezdxf.new("R2010")
     document.units = units.MM
     for name, colour in LAYERS.items():
         document.layers.add(name, color=colour)
+
+    # Film and leads
     space = document.modelspace()
     space.add_circle((0.0, 0.0), sensor.film.radius, dxfattribs={"layer": "FILM"})
-
     for path in leads.paths.values():
         space.add_lwpolyline(path.tolist(), dxfattribs={"layer": "LEADS", "const_width": leads.width})
 
@@ -74,12 +76,24 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
     for electrode in sensor.electrodes:
         for polygon in electrode.front:
             space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "ELECTRODES"})
-        name = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in electrode.name)
-        text = space.add_text(name, height=TEXT_HEIGHT, dxfattribs={"layer": "NAMES"})
-        rightmost_corner = max(electrode.corners)  # corners are compared by x first
-        text.set_placement(rightmost_corner)
-    _draw_ruler(space, -sensor.film.radius - RULER_OFFSET)
+        _draw_name(space, electrode)
+
+    ruler_y = -sensor.film.radius - RULER_OFFSET  # below the film
+    _draw_ruler(space, ruler_y)
     return document
+
+
+def _draw_name(space: Any, electrode: Electrode) -> None:
+    """Write the name of an electrode at its rightmost corner. Letters that cannot be printed are replaced.
+
+    Args:
+        space: Model space of the drawing.
+        electrode: The electrode.
+    """
+    letters = [letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in electrode.name]
+    text = space.add_text("".join(letters), height=TEXT_HEIGHT, dxfattribs={"layer": "NAMES"})
+    rightmost_corner = max(electrode.corners)  # corners are compared by x first
+    text.set_placement(rightmost_corner)
 
 
 def _draw_ruler(space: Any, y: float) -> None:
@@ -87,7 +101,7 @@ def _draw_ruler(space: Any, y: float) -> None:
 
     Args:
         space: Model space of the drawing.
-        y: Height of the ruler, mm.
+        y: Coordinate y of the ruler, mm. The ticks and the label are below the ruler.
     """
     left_end = -0.5 * RULER_LENGTH
     right_end = 0.5 * RULER_LENGTH
@@ -100,6 +114,7 @@ def _draw_ruler(space: Any, y: float) -> None:
     label = space.add_text(
         f"{RULER_LENGTH:g} mm along x, the drawn direction", height=TEXT_HEIGHT, dxfattribs=attributes
     )
+    # The label is placed by its baseline, and the space between ticks and letters is half the height of a letter.
     label_y = y - TICK_LENGTH - 1.5 * TEXT_HEIGHT
     label.set_placement((left_end, label_y))
 
@@ -116,7 +131,10 @@ def to_svg(document: Drawing) -> str:
     """Return the text of an SVG file that shows a drawing to scale. Letters are drawn as outlines."""
     backend = SVGBackend()
     configuration = Configuration(background_policy=BackgroundPolicy.WHITE)
-    Frontend(RenderContext(document), backend, config=configuration).draw_layout(document.modelspace())
+    frontend = Frontend(RenderContext(document), backend, config=configuration)
+    frontend.draw_layout(document.modelspace())
+
+    # A page without width and height gets the size of the drawing. The drawing is not scaled to fit the page.
     page = Page(0.0, 0.0, Units.mm, margins=Margins.all(MARGIN))
     text: str = backend.get_string(page, settings=Settings(fit_page=False))
     return text

@@ -56,20 +56,25 @@ def straight_leads(sensor: Sensor, width: float = 0.3, clearance: float = 0.3) -
         The leads, and the names of the electrodes that cannot have a straight lead.
     """
     paths: dict[str, Array] = {}
-    outermost_first = sorted(sensor.electrodes, key=lambda electrode: -float(np.hypot(*electrode.centre)))
+    outermost_first = sorted(sensor.electrodes, key=lambda electrode: float(np.hypot(*electrode.centre)), reverse=True)
     for electrode in outermost_first:
         other_electrodes = [other for other in sensor.electrodes if other != electrode]
+        placed_leads = list(paths.values())
         for path in _possible_paths(np.array(electrode.centre), sensor.film.radius):
-            if _clearance(path, width, other_electrodes, list(paths.values())) >= clearance:
+            if _clearance(path, width, other_electrodes, placed_leads) >= clearance:
                 paths[electrode.name] = path
                 break
+
+    # Return the leads in the order of the electrodes of the sensor.
     ordered_paths = {name: paths[name] for name in sensor.electrode_names if name in paths}
     electrodes_without_lead = tuple(name for name in sensor.electrode_names if name not in paths)
     return Leads(ordered_paths, electrodes_without_lead, width)
 
 
 def _possible_paths(centre: Array, radius: float) -> Array:
-    """Return straight paths from a position to the rim, in the order of `TRIED_ANGLES`.
+    """Return straight paths from a position to the rim.
+
+    The first path is radial. The following paths deviate more and more from the radial direction; see `TRIED_ANGLES`.
 
     Args:
         centre: Start (x, y) of the paths, shape (2,), mm.
@@ -82,7 +87,7 @@ def _possible_paths(centre: Array, radius: float) -> Array:
     angle = np.arctan2(y, x) + TRIED_ANGLES
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
-    # Distance from the start to the rim along each direction, from |centre + length * direction| = radius
+    # Length of each path: the positive solution of |centre + length * direction|^2 = radius^2, where |direction| = 1
     projection = direction @ centre
     length = np.sqrt(radius**2 - centre @ centre + projection**2) - projection
     start = np.broadcast_to(centre, direction.shape)
@@ -102,7 +107,7 @@ def _clearance(path: Array, width: float, electrodes: list[Electrode], leads: li
     Returns:
         Distance, mm; infinite if there are neither electrodes nor leads.
     """
-    # Points on the centre line of the lead
+    # Points on the centre line of the lead, at most `SAMPLE_DISTANCE` apart
     start, end = path
     x_length, y_length = end - start
     n_points = int(np.ceil(np.hypot(x_length, y_length) / SAMPLE_DISTANCE)) + 1
@@ -130,6 +135,8 @@ def _distance_from_lead(points: Array, lead: Array) -> float:
     """
     start, end = lead
     direction = end - start
+
+    # The nearest point of the lead to each point, first as a fraction from 0 (start) to 1 (end)
     fraction_of_length = np.clip((points - start) @ direction / (direction @ direction), 0.0, 1.0)
     nearest_points = start + fraction_of_length[:, None] * direction
     x_distance, y_distance = (points - nearest_points).T

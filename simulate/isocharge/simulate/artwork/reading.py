@@ -52,7 +52,8 @@ def read_artwork(path: str | Path, layer: str = "ELECTRODES", back: str = "") ->
         document: Any = ezdxf.readfile(path)
     except (OSError, ezdxf.DXFError) as error:
         raise SensorError(f"{path}: expected a DXF file: {error}") from error
-    scale = conversion_factor(InsertUnits(document.units or InsertUnits.Millimeters), InsertUnits.Millimeters)
+    unit = InsertUnits(document.units or InsertUnits.Millimeters)  # zero means that the drawing has no unit
+    scale = conversion_factor(unit, InsertUnits.Millimeters)
     groups = _touching_groups(_polygons(document, layer, scale, path))
 
     # All electrodes share the polygons of the back.
@@ -82,7 +83,10 @@ def _touching_groups(polygons: list[Electrode]) -> list[list[Electrode]]:
                 touching.append(group)
             else:
                 separate.append(group)
-        groups = [*separate, [*chain(*touching), polygon]]
+        joined_group = [*chain(*touching), polygon]
+        groups = [*separate, joined_group]
+
+    # Joined groups were appended at the end, so the original order is restored.
     return sorted(groups, key=lambda group: polygons.index(group[0]))
 
 
@@ -110,21 +114,21 @@ def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list
         where = f"{path}: layer {layer!r}: {shape.dxftype()} #{shape.dxf.handle}"
         if shape.dxftype() not in LINE_TYPES:
             raise SensorError(f"{where}: expected one of {', '.join(LINE_TYPES)}; redraw or explode it, or delete it")
-        outline = make_path(shape)
-        is_closed = shape.closed if shape.dxftype() == "LWPOLYLINE" else outline.is_closed
+        path_of_shape = make_path(shape)
+        is_closed = shape.closed if shape.dxftype() == "LWPOLYLINE" else path_of_shape.is_closed
 
-        # Corners in mm. Arcs are replaced by chords.
-        corners = tuple((scale * point.x, scale * point.y) for point in outline.flattening(ARC_TOLERANCE / scale))
+        # Points of the line in mm. Arcs are replaced by chords.
+        chord_ends = path_of_shape.flattening(ARC_TOLERANCE / scale)
+        points = tuple((scale * point.x, scale * point.y) for point in chord_ends)
         width = scale * _width(shape)
         if is_closed:
-            # The last point repeats the first one. One of them is omitted. Clockwise polygons are reversed.
-            is_anticlockwise = area_of(np.array(corners)) > 0.0
-            corners = corners[:-1] if is_anticlockwise else corners[:0:-1]
+            corners = _anticlockwise_corners(points)
             check_polygon(where, corners)
             pads.append(Electrode(where, corners))
         elif width > 0.0:
-            (corners,) = Electrode(where, ()).with_trace(corners, width).more
-            traces.append(Electrode(where, corners))
+            # `with_trace` converts the centre line into the polygon of the trace, which it appends to the empty `more`.
+            (trace_corners,) = Electrode(where, ()).with_trace(points, width).more
+            traces.append(Electrode(where, trace_corners))
         else:
             raise SensorError(f"{where} is open and has no width; close it, or give it the width of a trace")
     if not pads and not traces:
@@ -133,11 +137,24 @@ def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list
     return [*pads, *traces]
 
 
+def _anticlockwise_corners(points: Corners) -> Corners:
+    """Return the corners of a closed line in anticlockwise order, each corner once.
+
+    Args:
+        points: Points (x, y) of the line, mm. The last point repeats the first one.
+    """
+    is_anticlockwise = area_of(np.array(points)) > 0.0  # the area of a clockwise polygon is negative
+    if is_anticlockwise:
+        return points[:-1]
+    return points[:0:-1]  # from the last point back to the second point
+
+
 def _width(line: Any) -> float:
     """Return the width of a polyline in the unit of the drawing; 0 if there is none or if it varies."""
     if line.dxftype() != "LWPOLYLINE":
         return 0.0
-    start_and_end_widths = chain(*line.get_points("se"))  # of each section
+    # The code "se" selects the start width and the end width of each section. A constant width has priority over them.
+    start_and_end_widths = chain(*line.get_points("se"))
     different_widths = {line.dxf.const_width or width for width in start_and_end_widths}
     has_constant_width = len(different_widths) == 1
     return float(different_widths.pop()) if has_constant_width else 0.0
@@ -159,13 +176,15 @@ def _names(document: Any, groups: list[list[Electrode]], scale: float) -> list[s
         text.plain_text(): scale * complex(*text.dxf.insert.vec2)
         for text in document.modelspace().query(" ".join(TEXT_TYPES))
     }
-    names = []
+    nearest_texts = []
     for group in groups:
-        corners = to_complex(np.array(group[0].corners))
+        first_polygon = group[0]
+        corners = to_complex(np.array(first_polygon.corners))
         distances = {text: float(np.abs(corners - position).min()) for text, position in text_positions.items()}
-        if distances:
-            names.append(min(distances, key=lambda text: distances[text]))
-    if len(set(names)) == len(groups):
-        return names
+        if distances:  # empty if the drawing has no texts
+            nearest_texts.append(min(distances, key=lambda text: distances[text]))
+    has_different_text_for_each_group = len(set(nearest_texts)) == len(groups)
+    if has_different_text_for_each_group:
+        return nearest_texts
     numbers = [str(number) for number in range(MAX_ELECTRODES)]
     return [*ascii_uppercase, *numbers]

@@ -90,13 +90,15 @@ class Candidates:
         first_row_of_press = np.searchsorted(ordered.press, ordered.press)
         rank = np.arange(ordered.press.size) - first_row_of_press  # 0 for the best candidate of a press
         is_distinct = np.ones(rank.size, dtype=bool)
-        for candidate_rank in range(1, int(rank.max(initial=0)) + 1):
+        worst_rank = int(rank.max(initial=0))
+        for candidate_rank in range(1, worst_rank + 1):
             # Compare the candidates of this rank, of all presses together, with those of each better rank.
             rows = np.flatnonzero(rank == candidate_rank)
-            # Candidates of one press are in consecutive rows, so the better candidates are in the rows before.
-            for better_rows in rows - 1 - np.arange(candidate_rank)[:, None]:
+            for rank_difference in range(1, candidate_rank + 1):
+                better_rows = rows - rank_difference  # the candidates of a press are in consecutive rows
                 offset = (ordered.contact[rows] - ordered.contact[better_rows])[:, :2]
                 is_near = np.linalg.norm(offset, axis=1) <= tolerance
+                # A candidate remains if it is near a better candidate that is a duplicate itself.
                 is_distinct[rows] &= ~(is_near & is_distinct[better_rows])
         return ordered[np.flatnonzero(is_distinct)]
 
@@ -127,16 +129,12 @@ class SeedGrid:
 
     @classmethod
     def of(cls, charge_map: ChargeMap) -> "SeedGrid":
-        """Create the grid over the domain of a charge map, including the edge of the disk."""
-        # Select the nodes of a square grid that lie within the disk or slightly outside, and move the nodes outside
-        # onto the edge of the disk.
-        radius = charge_map.domain.radius
-        side = 2 * max(4, int(np.ceil(radius / NODE_SPACING))) + 1  # number of nodes along a side of the grid
-        line = np.linspace(-radius, radius, side)
-        square_grid = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
-        grid_x, grid_y = square_grid.T
-        index = np.flatnonzero(np.hypot(grid_x, grid_y) <= radius * (1.0 + 1.0 / side))
-        position = onto_disk(square_grid[index], INNER_RADIUS * radius)
+        """Create the grid over the domain of a charge map, including the edge of the disk.
+
+        Args:
+            charge_map: Charges as a function of the contact.
+        """
+        side, index, position = _nodes_on_disk(charge_map.domain.radius)
 
         # Charges of the nodes for each force, shape (n_force, n_node, n_electrode)
         min_force, max_force = charge_map.domain.force_range
@@ -146,7 +144,7 @@ class SeedGrid:
         contacts = [np.column_stack([position, np.full(len(position), force)]) for force in forces]
         node_charges = np.stack([charge_map.charges(contact) for contact in contacts])
 
-        # Slopes at the middle force, and the size of the charges at each force relative to that at the middle force
+        # Slopes at the middle force, with a lower bound, and root mean square of all charges at each force
         middle = forces.size // 2
         gradient = charge_map.derivatives(contacts[middle])[..., :2]  # with respect to x and y
         gradient_length = np.linalg.norm(gradient, axis=2)
@@ -182,6 +180,7 @@ class SeedGrid:
         index_above = np.minimum(index_below + 1, n_force - 1)
         node = np.arange(len(self.position))
         weight_above = (fractional_index - index_below)[..., None]
+        # The index of the node selects the second axis, so the results have the shape (n, n_node, n_electrode).
         charge_below = self.node_charges[index_below, node]
         charge_above = self.node_charges[index_above, node]
         return np.asarray((1.0 - weight_above) * charge_below + weight_above * charge_above)
@@ -195,12 +194,13 @@ class SeedGrid:
         Returns:
             Forces, shape (n, n_node), N.
         """
-        total = charge.sum(axis=1)
+        total = charge.sum(axis=1)  # shape (n,)
         node_totals = self.node_charges.sum(axis=2)  # shape (n_force, n_node)
 
         # `np.interp` needs ascending totals. With negative coefficients, the charges decrease with the force.
         sign = np.sign(node_totals.sum())
-        log_forces = [np.interp(sign * total, sign * node_total, self.log_forces) for node_total in node_totals.T]
+        ascending_totals = sign * node_totals.T  # shape (n_node, n_force)
+        log_forces = [np.interp(sign * total, node_total, self.log_forces) for node_total in ascending_totals]
         return np.asarray(np.exp(np.stack(log_forces, axis=1)))
 
     def distance(self, charge: Array, force: Array) -> Array:
@@ -231,7 +231,7 @@ class SeedGrid:
         n_press = len(distance)
         flat_grid = np.full((n_press, self.side**2), np.inf)
         flat_grid[:, self.index] = distance
-        square_grid = flat_grid.reshape(-1, self.side, self.side)
+        square_grid = flat_grid.reshape(-1, self.side, self.side)  # one grid for each press
         neighbourhood_minimum = scipy.ndimage.minimum_filter(square_grid, (1, 3, 3), mode="constant", cval=np.inf)
         is_minimum = (square_grid == neighbourhood_minimum).reshape(n_press, -1)[:, self.index]
 
@@ -260,3 +260,22 @@ class SeedGrid:
         high = node_charges.max(axis=1)
         margin = RANGE_MARGIN * (high - low)
         return np.asarray(((charge < low - margin) | (charge > high + margin)).any(axis=1))
+
+
+def _nodes_on_disk(radius: float) -> tuple[int, Integers, Array]:
+    """Select the nodes of a square grid that lie on a disk or slightly outside, and move the latter onto its edge.
+
+    Args:
+        radius: Radius of the disk, mm.
+
+    Returns:
+        Number of nodes along a side of the square grid. Index of each selected node in the flattened square grid, shape
+        (n_node,). Positions (x, y) of the selected nodes, shape (n_node, 2), mm.
+    """
+    side = 2 * max(4, int(np.ceil(radius / NODE_SPACING))) + 1  # odd, so that the centre of the disk is a node
+    line = np.linspace(-radius, radius, side)
+    square_grid = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
+    grid_x, grid_y = square_grid.T
+    index = np.flatnonzero(np.hypot(grid_x, grid_y) <= radius * (1.0 + 1.0 / side))
+    position = onto_disk(square_grid[index], INNER_RADIUS * radius)
+    return side, index, position

@@ -87,7 +87,8 @@ class Mapping:
                 f"{np.rad2deg(last_angle):g} degrees in steps of {np.rad2deg(angle_step):g}, and lines of {length:g} "
                 f"mm in steps of {step:g} mm"
             )
-        angle = np.append(np.arange(first_angle, last_angle - 1e-9, angle_step), last_angle)
+        angles_before_last = np.arange(first_angle, last_angle - 1e-9, angle_step)  # never contains the last angle
+        angle = np.append(angles_before_last, last_angle)
         presses_per_line = int(length / step * (1.0 + 1e-9))  # the factor allows for rounding of the quotient
         distance: Array = step * np.arange(1.0, presses_per_line + 1.0)
         return cls(electrode, (float(x), float(y)), angle, distance)

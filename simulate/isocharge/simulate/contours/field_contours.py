@@ -59,7 +59,7 @@ class ContourField:
         """
         if not np.isfinite(charge):
             raise SceneError(f"charge of {electrode!r}: expected a finite number, got {charge:g} pC")
-        # The charges are divided by the largest charge before the contour is traced.
+        # The contour is traced with charges of order one, so that it does not depend on the size of the charges.
         x, y = self._grid
         charges = self._charges(electrode)
         largest_charge = np.abs(charges).max()
@@ -85,8 +85,9 @@ class ContourField:
         """
         low, high = self.charge_range(electrode)
         has_one_sign = low * high > 0.0
-        charges = np.geomspace(low, high, count + 2) if has_one_sign else np.linspace(low, high, count + 2)
-        return [float(charge) for charge in charges[1 : count + 1]]
+        spacing = np.geomspace if has_one_sign else np.linspace
+        charges = spacing(low, high, count + 2)  # with both ends
+        return [float(charge) for charge in charges[1:-1]]
 
     @cached_property
     def _grid(self) -> tuple[Array, Array]:
@@ -95,7 +96,8 @@ class ContourField:
         The boundary of the mapped grid is the edge of the disk, so that contours that leave the disk end on its edge.
         """
         radius = TRACED_RADIUS * self.charge_map.domain.radius
-        line = np.linspace(-1.0, 1.0, 2 * int(np.ceil(radius / GRID_SPACING)) + 1)
+        n_spacings = 2 * int(np.ceil(radius / GRID_SPACING))  # along a diameter
+        line = np.linspace(-1.0, 1.0, n_spacings + 1)
         square_x, square_y = np.meshgrid(line, line)
         # Elliptical grid mapping of the square [-1, 1] x [-1, 1] onto the unit disk (Nowell 2005)
         disk_x = square_x * np.sqrt(1.0 - 0.5 * square_y**2)

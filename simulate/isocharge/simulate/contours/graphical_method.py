@@ -84,18 +84,32 @@ class DrawnContour:
         """
         crossings = []
         for own_chord, other_chord in _chord_crossings(self.points, other.points):
-            parameters = np.array([self._parameters[own_chord], other._parameters[other_chord]])
-            for _ in range(NEWTON_STEPS):
-                own_parameter, other_parameter = parameters
-                gap = self._spline(own_parameter) - other._spline(other_parameter)
-                own_tangent = self._spline(own_parameter, 1)  # first derivative
-                other_tangent = other._spline(other_parameter, 1)
-                jacobian = np.stack([own_tangent, -other_tangent], axis=1)
-                # Tangents may be parallel, so the step is the least-squares solution.
-                step, *_ = np.linalg.lstsq(jacobian, gap, rcond=None)
-                parameters = parameters - step
-            crossings.append(self._spline(parameters[0]))
+            start = np.array([self._parameters[own_chord], other._parameters[other_chord]])
+            crossings.append(self._crossing_near(other, start))
         return np.array(crossings).reshape(-1, 2)
+
+    def _crossing_near(self, other: "DrawnContour", start: Array) -> Array:
+        """Find the crossing with another contour by Newton's method.
+
+        Args:
+            other: The other contour.
+            start: Parameters of both splines at which the search starts, shape (2,), mm.
+
+        Returns:
+            Position (x, y), shape (2,), mm.
+        """
+        parameters = start
+        for _ in range(NEWTON_STEPS):
+            own_parameter, other_parameter = parameters
+            gap = self._spline(own_parameter) - other._spline(other_parameter)
+            own_tangent = self._spline(own_parameter, 1)  # first derivative
+            other_tangent = other._spline(other_parameter, 1)
+            jacobian = np.stack([own_tangent, -other_tangent], axis=1)
+            # Tangents may be parallel, so the step is the least-squares solution.
+            step, *_ = np.linalg.lstsq(jacobian, gap, rcond=None)
+            parameters = parameters - step
+        own_parameter, _ = parameters
+        return np.asarray(self._spline(own_parameter))
 
 
 def _chord_crossings(first: Array, second: Array) -> Integers:
@@ -111,7 +125,7 @@ def _chord_crossings(first: Array, second: Array) -> Integers:
     # Combine every chord of the first polyline with every chord of the second, shape (n_first - 1, n_second - 1, 2).
     first_chord = np.diff(first, axis=0)[:, None]
     second_chord = np.diff(second, axis=0)[None]
-    start_difference = second[None, :-1] - first[:-1, None]
+    start_difference = second[None, :-1] - first[:-1, None]  # from the start of the first chord to that of the second
 
     # The crossing lies at these fractions of the lengths of both chords (Cramer's rule).
     with np.errstate(divide="ignore", invalid="ignore"):  # parallel chords do not cross
@@ -161,15 +175,17 @@ def _root(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) 
         polynomial: Charge (pC) as a function of the distance (mm).
         charge: Charge, pC.
         distance: Distances of the presses on the line, ascending, mm. The root must lie between half of the first and
-            the last distance.
+            the last distance, because the polynomial does not describe the charge elsewhere.
 
     Returns:
         Distance, mm; NaN if there is no root.
     """
     roots = (polynomial - charge).roots()
-    real = roots.real[np.abs(roots.imag) < 1e-9 * np.abs(distance[-1])]
-    inside = real[(real >= 0.5 * distance[0]) & (real <= distance[-1])]
-    return float(inside.min()) if inside.size else np.nan
+    is_real = np.abs(roots.imag) < 1e-9 * np.abs(distance[-1])  # up to rounding errors
+    real_roots = roots.real[is_real]
+    is_on_line = (real_roots >= 0.5 * distance[0]) & (real_roots <= distance[-1])
+    roots_on_line = real_roots[is_on_line]
+    return float(roots_on_line.min()) if roots_on_line.size else np.nan
 
 
 class _Location(NamedTuple):
@@ -245,7 +261,7 @@ class DrawnTriangulation:
 
         # Three contours meet if the crossings of their three pairs are close together.
         indices = range(len(contours))
-        crossings = {(i, j): contours[i].crossings(contours[j]) for i, j in combinations(indices, 2)}
+        crossings = {(i, j): contours[i].crossings(contours[j]) for i, j in combinations(indices, 2)}  # with i < j
         meetings = []
         for triple in combinations(indices, 3):
             crossings_of_pairs = [crossings[pair] for pair in combinations(triple, 2)]

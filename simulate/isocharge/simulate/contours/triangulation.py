@@ -10,7 +10,7 @@ If the force is unknown, the contours depend on it. `Triangulation.locate_with_f
 with the smallest mean square distance from the contours.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 
@@ -117,16 +117,22 @@ class Triangulation:
             Positions of all presses in the order of the charges.
         """
         no_press = Fix(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.intp))
-        fixes = [no_press]
+        fixes = [no_press]  # without charges, there are no chunks, but arrays to concatenate are needed
         for start in range(0, len(charge), CHUNK):
             chunk = slice(start, start + CHUNK)
             chunk_force = force[chunk] if force is not None else None
             fixes.append(self._locate_chunk(charge[chunk], chunk_force))
-        columns = {column.name: np.concatenate([getattr(fix, column.name) for fix in fixes]) for column in fields(Fix)}
-        return Fix(**columns)
+        return Fix(
+            contact=np.concatenate([fix.contact for fix in fixes]),
+            spread=np.concatenate([fix.spread for fix in fixes]),
+            status=np.concatenate([fix.status for fix in fixes]),
+        )
 
     def _locate_chunk(self, charge: Array, force: Array | None) -> Fix:
         """Locate the presses of one chunk.
+
+        The search first finds the contacts at which the contours of a press meet, and then chooses one of these
+        contacts. If the force is given, the contours are known curves, and the position is the mean of their crossings.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
@@ -136,11 +142,13 @@ class Triangulation:
             Position of each press.
         """
         is_force_fixed = force is not None
-        first = self._approach(charge, self._seeds(charge, force), fixed=is_force_fixed)
+        seeds = self._seeds(charge, force)
+        first_meetings = self._approach(charge, seeds, is_force_fixed=is_force_fixed)
 
         # Near a fold, there may be a second meeting beside each meeting.
-        second = self._approach(charge, self._second_seeds(first, fixed=is_force_fixed), fixed=is_force_fixed)
-        candidates = first.joined(second).distinct(MIN_DISTANCE)
+        second_seeds = self._second_seeds(first_meetings, is_force_fixed=is_force_fixed)
+        second_meetings = self._approach(charge, second_seeds, is_force_fixed=is_force_fixed)
+        candidates = first_meetings.joined(second_meetings).distinct(MIN_DISTANCE)
         if is_force_fixed:
             candidates = self._cross(charge, candidates)
         return self._choose(charge, force, candidates)
@@ -158,10 +166,12 @@ class Triangulation:
         """
         n_press = len(charge)
         n_candidates = np.bincount(candidates.press, minlength=n_press)
-        # The candidates are ordered, so the best candidate of a press is in its first row.
+
+        # The candidates are ordered, so the best candidate of a press is in its first row. The row after the last
+        # candidate is valid, too, because presses without candidates may refer to it.
+        spread = np.append(candidates.spread, np.inf)
         first_row = np.searchsorted(candidates.press, np.arange(n_press))
         second_row = np.minimum(first_row + 1, candidates.press.size)
-        spread = np.append(candidates.spread, np.inf)  # the last value is for presses without candidates
         smallest_spread = np.where(n_candidates > 0, spread[first_row], np.nan)
         second_spread = np.where(n_candidates > 1, spread[second_row], np.inf)
 
@@ -169,9 +179,12 @@ class Triangulation:
         status = np.where(n_candidates > 0, int(Meeting.met), int(Meeting.apart))
         has_no_contour = (n_candidates == 0) & self._grid.is_out_of_range(charge, force)
         status[has_no_contour] = Meeting.no_contour
+
+        # A press is ambiguous if its second candidate is almost as good as the best one, or fits almost exactly.
         is_ambiguous = second_spread <= np.maximum(AMBIGUOUS_RATIO * smallest_spread, AMBIGUOUS_SPREAD)
         status[is_ambiguous] = Meeting.twice
 
+        # Ambiguous presses have no contact either.
         is_met = status == Meeting.met
         contact = np.full((n_press, 3), np.nan)
         contact[is_met] = candidates.contact[first_row[is_met]]
@@ -201,44 +214,45 @@ class Triangulation:
         Returns:
             Starting points, at most `MAX_SEEDS` for each press.
         """
-        # One force for each press and node, shape (n, n_node), or one for each press, shape (n, 1)
+        # One force for each press and node, shape (n, n_node), or one force for each press, shape (n, 1)
         grid = self._grid
         forces = grid.matching_force(charge) if force is None else force[:, None]
         press, node = grid.lowest(grid.distance(charge, forces), MAX_SEEDS)
         seed_force = forces[press, node] if force is None else force[press]
         return Candidates.begin(press, np.column_stack([grid.position[node], seed_force]))
 
-    def _second_seeds(self, closest: Candidates, *, fixed: bool) -> Candidates:
-        """Create starting points for a second meeting across a fold.
+    def _second_seeds(self, meetings: Candidates, *, is_force_fixed: bool) -> Candidates:
+        """Create starting points of a search for a second meeting of the contours beside each meeting.
 
-        For each meeting, two starting points are placed on opposite sides of it. The starting points lie in the
-        direction in which the distances from the contours change least.
+        Near a fold of the charge map, two contacts that are close together have the same charges. They lie in the
+        direction in which the distances from the contours change least. Two starting points are therefore placed in
+        this direction, on opposite sides of each meeting.
 
         Args:
-            closest: Meetings of the contours that have been found.
-            fixed: Whether the force keeps its value.
+            meetings: Meetings of the contours that have been found.
+            is_force_fixed: Whether the force keeps its value.
 
         Returns:
             Two starting points for each meeting.
         """
         any_charge = 0.0  # the derivatives do not depend on the charge
-        _, derivatives = self._distances(closest.contact, any_charge, fixed=fixed)
+        _, derivatives = self._distances(meetings.contact, any_charge, is_force_fixed=is_force_fixed)
         _, _, right_singular_vectors = np.linalg.svd(derivatives)
         weakest_direction = right_singular_vectors[:, -1]  # of the smallest singular value, shape (n, n_unknown)
         step = SECOND_START_DISTANCE * self.tolerance * weakest_direction
-        backward = Candidates.begin(closest.press, self._moved(closest.contact, -step))
-        forward = Candidates.begin(closest.press, self._moved(closest.contact, step))
+        backward = Candidates.begin(meetings.press, self._moved(meetings.contact, -step))
+        forward = Candidates.begin(meetings.press, self._moved(meetings.contact, step))
         return backward.joined(forward)
 
     # Search from the starting points
 
-    def _approach(self, charge: Array, seeds: Candidates, *, fixed: bool) -> Candidates:
+    def _approach(self, charge: Array, seeds: Candidates, *, is_force_fixed: bool) -> Candidates:
         """Minimise the mean square distance from the contours by the Gauss-Newton method.
 
         Args:
             charge: Charges of all presses, shape (n, n_electrode), pC.
             seeds: Starting points.
-            fixed: Whether the force keeps its value.
+            is_force_fixed: Whether the force keeps its value.
 
         Returns:
             The best contact of each starting point whose distance from the contours is within the tolerance, without
@@ -247,7 +261,7 @@ class Triangulation:
         contact = seeds.contact
         best = seeds
         for _ in range(STEPS):
-            distance, derivatives = self._distances(contact, charge[seeds.press], fixed=fixed)
+            distance, derivatives = self._distances(contact, charge[seeds.press], is_force_fixed=is_force_fixed)
             rms_distance = np.sqrt(np.mean(distance**2, axis=1))
             best = best.improved(contact, rms_distance)
             contact = self._moved(contact, gauss_newton_step(derivatives, distance))
@@ -286,48 +300,55 @@ class Triangulation:
         contact = np.column_stack([position, candidates.contact[:, 2]])
         return Candidates(candidates.press, contact, spread)[n_meeting > 0].distinct(MIN_DISTANCE)
 
-    def _crossing(self, charge: Array, near: Candidates, pair: tuple[int, int]) -> Array:
-        """Find the crossing of two contours by Newton's method from each candidate.
+    def _crossing(self, charge: Array, candidates: Candidates, pair: tuple[int, int]) -> Array:
+        """Find the crossing of two contours by Newton's method from each candidate. The force keeps its value.
 
         Args:
             charge: Charges of all presses, shape (n, n_electrode), pC.
-            near: Candidates from which the search starts.
+            candidates: Candidates from which the search starts.
             pair: Indices of the two electrodes.
 
         Returns:
             Positions, shape (n_candidate, 2), mm; NaN if the contours do not cross.
         """
-        contact = near.contact.copy()
-        crossing = np.full((len(near.press), 2), np.nan)
-        active = np.arange(len(contact))
+        contact = candidates.contact.copy()
+        crossing = np.full((len(candidates.press), 2), np.nan)
+        active = np.arange(len(contact))  # indices of the candidates that have not converged
         for _ in range(STEPS):
-            distances, derivatives = self._distances(contact[active], charge[near.press[active]], fixed=True)
+            active_charge = charge[candidates.press[active]]
+            distances, derivatives = self._distances(contact[active], active_charge, is_force_fixed=True)
             pair_distances = distances[:, pair]
             pair_derivatives = derivatives[:, pair]  # shape (n_active, 2, 2)
+
+            # Store the contacts that lie on both contours, and continue with the others.
             is_moving = np.abs(pair_distances).max(axis=1) >= CONVERGED_DISTANCE
             converged = active[~is_moving]
             crossing[converged] = contact[converged, :2]
             active = active[is_moving]
             if active.size == 0:
                 break
+
             # For two equations with two unknowns, the Gauss-Newton step is the Newton step.
             step = gauss_newton_step(pair_derivatives[is_moving], pair_distances[is_moving])
             contact[active] = self._moved(contact[active], step)
         return crossing
 
-    def _distances(self, contact: Array, charge: Array | float, *, fixed: bool) -> tuple[Array, Array]:
+    def _distances(self, contact: Array, charge: Array | float, *, is_force_fixed: bool) -> tuple[Array, Array]:
         """Estimate the signed distances from contacts to the contours of given charges, and their derivatives.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             charge: Charges of the contours, shape (n, n_electrode), pC.
-            fixed: Whether the derivative with respect to the force is omitted.
+            is_force_fixed: Whether the derivative with respect to the force is omitted.
 
         Returns:
             Distances, shape (n, n_electrode), mm. Dimensionless derivatives of the distances, shape (n, n_electrode, 2
             or 3): with respect to x and y, and with respect to ln F times the radius unless the force is fixed.
         """
         predicted, charge_derivatives = linearised(self._charges, contact)
+
+        # The slope is the length of the gradient. Its lower bound keeps the distance finite where the charge has an
+        # extremum. The typical slope increases with the force like the charges.
         typical_slope = np.median(self._grid.slope, axis=0) * self._grid.growth(contact[:, 2])[:, None]
         gradient_length = np.linalg.norm(charge_derivatives[..., :2], axis=2)
         slope = np.maximum(gradient_length, MIN_SLOPE * typical_slope)  # pC/mm
@@ -336,7 +357,7 @@ class Triangulation:
         distance = (predicted - charge) / slope
         unknown_scales = np.array([1.0, 1.0, self.charge_map.domain.radius])  # the third unknown is ln F times radius
         distance_derivatives = charge_derivatives / (slope[..., None] * unknown_scales)
-        if fixed:
+        if is_force_fixed:
             distance_derivatives = distance_derivatives[..., :2]
         return distance, distance_derivatives
 
@@ -374,6 +395,8 @@ def gauss_newton_step(slopes: Array, distance: Array) -> Array:
     gradient = np.einsum("nij,ni->nj", slopes, distance)
     step: Array = -np.linalg.solve(normal_matrix, gradient[..., None])[..., 0]
 
+    # Shorten steps that are longer than `MAX_STEP`.
     length = np.linalg.norm(step, axis=1)
-    step *= np.minimum(1.0, MAX_STEP / np.maximum(length, 1e-300))[:, None]
+    factor = np.minimum(1.0, MAX_STEP / np.maximum(length, 1e-300))  # a step of length zero remains zero
+    step *= factor[:, None]
     return step

@@ -128,7 +128,7 @@ class Sweep:
             rotation=np.concatenate([presses.rotation for presses in presses_by_probe]),
         )
 
-        # Take the first press of each probe, then the second press of each probe, and so on.
+        # Interleave the probes: take the first press of each probe, then the second press of each probe, and so on.
         index_within_probe = np.concatenate([np.arange(len(presses)) for presses in presses_by_probe])
         order = np.argsort(index_within_probe, kind="stable")
         return all_presses[order]
@@ -141,19 +141,30 @@ class Sweep:
             n_probe: Number of probes in the sweep.
             period: Smallest rotation that maps the probe onto itself, rad.
         """
-        position: Complexes  # x + iy, mm
         if self.sampling == "grid":
             position, force, rotation = self._grid(self.samples // n_probe, period)
         else:
             count = len(range(probe_index, self.samples, n_probe))  # every n_probe-th press of the sweep
-            fractions = self._unit_cube(count, probe_index)  # uniform in [0, 1), with one column for each quantity
-            distance_fraction, angle_fraction, force_fraction, rotation_fraction = fractions.T
-            distance = self.radius * np.sqrt(distance_fraction)  # uniform over the area of the disk
-            position = distance * np.exp(1j * FULL_TURN * angle_fraction)
-            force = self._force(force_fraction)
-            rotation = FULL_TURN * rotation_fraction if self.orientation == "random" else np.zeros(count)
+            position, force, rotation = self._drawn(count, probe_index)
         contact = np.stack([position.real, position.imag, force], axis=1)
         return SweepPresses(np.full(position.size, probe_index), contact, rotation)
+
+    def _drawn(self, count: int, probe_index: int) -> tuple[Complexes, Array, Array]:
+        """Draw the presses of one probe, uniformly over the area of the disk and in the logarithm of the force.
+
+        Args:
+            count: Number of presses.
+            probe_index: Index of the probe.
+
+        Returns:
+            Positions x + iy (mm), forces (N) and rotations (rad), each of shape (count,).
+        """
+        fractions = self._unit_cube(count, probe_index)  # uniform in [0, 1), with one column for each quantity
+        distance_fraction, angle_fraction, force_fraction, rotation_fraction = fractions.T
+        distance = self.radius * np.sqrt(distance_fraction)  # the area within a distance grows with its square
+        position = distance * np.exp(1j * FULL_TURN * angle_fraction)
+        rotation = FULL_TURN * rotation_fraction if self.orientation == "random" else np.zeros(count)
+        return position, self._force(force_fraction), rotation
 
     def _unit_cube(self, count: int, probe_index: int) -> Array:
         """Draw points of the unit cube for the presses of one probe.
@@ -204,9 +215,11 @@ class Sweep:
         initial_n_force = steps_per_dimension if has_forces else 1
 
         # The lattice may have fewer positions than requested, so the number of forces is computed from it.
-        positions: Complexes = self.radius * lattice(max_count // (n_rotation * initial_n_force))
+        max_positions = max_count // (n_rotation * initial_n_force)
+        positions: Complexes = self.radius * lattice(max_positions)
         n_force = max_count // (positions.size * n_rotation) if has_forces else 1
-        force_fractions = np.linspace(0.0, 1.0, n_force) if n_force > 1 else np.array([0.5])
+        middle = np.array([0.5])  # a single force is the geometric mean of the range
+        force_fractions = np.linspace(0.0, 1.0, n_force) if n_force > 1 else middle
         forces = self._force(force_fractions)
         rotations: Array = period * np.arange(n_rotation) / n_rotation
 

@@ -98,7 +98,8 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
     Args:
         folder: Folder to create. It must not exist yet.
         sensor: Sensor to which the charges belong.
-        shards: Samples of each shard. The iterable is consumed while the shards are written.
+        shards: Samples of each shard, which is one file of the dataset. The iterable is consumed while the shards are
+            written.
         about: Entries of the manifest about the origin of the samples, such as probes, ranges, seed and solver.
 
     Returns:
@@ -108,13 +109,13 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
         OutputExists: If the folder already exists.
         DatasetError: If the columns of a shard have different lengths or contain numbers that are not finite.
     """
-    with new_folder(folder) as partial:
+    with new_folder(folder) as temporary_folder:  # is renamed when the dataset is complete
         entries = []
         for index, samples in enumerate(shards):
             name, data = pack_shard(index, samples, sensor)
-            write_whole(partial / name, data)
+            write_whole(temporary_folder / name, data)
             entries.append(shard_entry(name, len(samples), data))
-        write_manifest(partial, folder.name, sensor, entries, about)
+        write_manifest(temporary_folder, folder.name, sensor, entries, about)
     return folder
 
 
@@ -239,7 +240,8 @@ def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
         DatasetError: If a column has a wrong shape or type, or contains a number that is not finite.
     """
     shapes = {name: column.shape for name, column in samples.columns().items()}
-    count = len(samples) if samples.x_mm.ndim else 0
+    has_rows = samples.x_mm.ndim > 0  # a single number instead of an array has no length
+    count = len(samples) if has_rows else 0
     expected = dict.fromkeys(COLUMNS, (count,)) | {"charge_pC": (count, n_electrode)}
     if shapes != expected or count == 0:
         raise DatasetError(f"{where}: expected columns of shapes {expected}, at least one sample, got {shapes}")
@@ -251,7 +253,8 @@ def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
                 f"{where}: column {name}: expected {'text' if is_text else 'numbers'}, got {column.dtype}"
             )
         if not is_text and not np.isfinite(column).all():
-            row = int(np.argwhere(~np.isfinite(column))[0][0])
+            first_bad_index = np.argwhere(~np.isfinite(column))[0]
+            row = int(first_bad_index[0])
             raise DatasetError(f"{where}: column {name} holds {column[row]} in row {row}; every number must be finite")
 
 
@@ -266,6 +269,7 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
         DatasetError: If the folder is not a dataset, has a different format version or sensor, or is damaged or
             incomplete. The message names the file and a remedy.
     """
+    # Read the manifest, which describes the sensor and lists the shards.
     folder = Path(folder)
     manifest_path = f"{folder}/manifest.json"
     manifest, checksum = _read_manifest(folder)
@@ -285,6 +289,7 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
             f"{list(dataset_sensor.electrode_names)}, got {shown(checked_manifest.electrodes)}"
         )
 
+    # Read the shards, and join each of their columns.
     shards = [_read_shard(folder, entry, dataset_sensor) for entry in checked_manifest.shards]
     if not shards:
         raise DatasetError(f"{manifest_path}: lists no shards")
@@ -339,7 +344,7 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
         )
     data = read_needed(path, DatasetError, "make the dataset again", MAX_JSON_BYTES)
     with error_prefix(f"{path}: not a manifest of a dataset: ", DatasetError):
-        manifest = parse_json(data, "", DatasetError, dict[str, Any])
+        manifest = parse_json(data, "", DatasetError, dict[str, Any])  # the messages begin with the prefix above
         if "format_version" not in manifest:
             raise DatasetError("key 'format_version' is missing")
     version = manifest["format_version"]
@@ -381,7 +386,7 @@ def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
 
 
 def _unpack(data: bytes, where: str) -> Samples:
-    """Convert the bytes of a shard into samples without executing any code in them.
+    """Convert the bytes of a shard, an NPZ file, into samples without executing any code in them.
 
     Args:
         data: Contents of the file.

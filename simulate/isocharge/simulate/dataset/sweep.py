@@ -87,6 +87,8 @@ def run_sweep(
     refuse_finished(folder)
     # The presses are computed before files are written, because SciPy ignores an interrupt in this step.
     presses = sweep.over(probes)
+
+    # An interrupted run is resumed only if all these values are the same.
     identity = {
         "made_by": code_fingerprint(),
         "sensor": sensor_to_dict(sensor),
@@ -95,6 +97,8 @@ def run_sweep(
         "solver": asdict(settings),
         "shard": shard,
     }
+
+    # The matrices are small, so BLAS is faster with one thread. At the end of the block, the run becomes the dataset.
     with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh) as run:
         maps = [
             ForwardMap.build(
@@ -169,10 +173,10 @@ def _manifest_entries(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any
 def _finish_shards(
     run: ResumableRun, maps: Sequence[ForwardMap], presses: SweepPresses, executor: Executor | None, shard: int
 ) -> list[dict[str, Any]]:
-    """Compute and write the shards that an earlier run has not saved.
+    """Compute and write the shards that an earlier run has not saved. A shard is one file of the dataset.
 
     Args:
-        run: Run whose folder contains the shards.
+        run: Run whose folder contains the shards. The option `final` means that a shard is a file of the dataset.
         maps: Forward map of each probe.
         presses: All presses of the sweep.
         executor: Executor that computes the charges; this process if None.
@@ -193,7 +197,8 @@ def _finish_shards(
     report("pressing", finished_presses, len(presses))
 
     # Compute and save the missing shards.
-    missing_samples = _samples(maps, (presses_of_shards[index] for index in missing_shards), executor)
+    missing_presses = [presses_of_shards[index] for index in missing_shards]
+    missing_samples = _samples(maps, missing_presses, executor)
     for index, samples in zip(missing_shards, missing_samples, strict=True):
         name, data = pack_shard(index, samples, maps[0].sensor)
         run.save(name, data, final=True)
@@ -212,7 +217,10 @@ def _split(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
 def _samples(
     maps: Sequence[ForwardMap], shards: Iterable[SweepPresses], executor: Executor | None
 ) -> Iterator[Samples]:
-    """Yield the samples of each shard in order. The workers compute later shards in advance.
+    """Yield the samples of each shard in order.
+
+    A shard is divided into tasks, each of which computes the charges of some rows of the shard. The workers compute the
+    tasks of later shards in advance.
 
     Args:
         maps: Forward map of each probe.
@@ -221,27 +229,46 @@ def _samples(
     """
     # The tasks of later shards are submitted before the samples of earlier shards are yielded. The two loops over the
     # shards are therefore at different positions, and each has its own iterator.
-    shards, shards_for_tasks = tee(shards)
+    shards_for_samples, shards_for_tasks = tee(shards)
     tasks = (
         (maps[probe], presses.contact[rows], presses.rotation[rows])
         for presses in shards_for_tasks
         for probe, rows in _tasks(presses, len(maps))
     )
     charges_of_tasks = in_order(executor, _charges, tasks)
-    probe_notations = np.array([forward_map.probe.notation for forward_map in maps])
-    probe_angles = np.array([forward_map.probe.angle for forward_map in maps])
-    for presses in shards:
+    for presses in shards_for_samples:
         charge = np.empty((len(presses), len(maps[0].electrodes)))
         for _, rows in _tasks(presses, len(maps)):  # the same tasks in the same order as above
             charge[rows] = next(charges_of_tasks)
-        x, y, force = (np.ascontiguousarray(column) for column in presses.contact.T)
-        rotation_deg = np.rad2deg(probe_angles[presses.probe] + presses.rotation)
-        rotation_deg = np.mod(np.round(rotation_deg, 9), 360.0)
-        yield Samples(x, y, force, probe_notations[presses.probe], rotation_deg, charge)
+        yield _samples_of_shard(maps, presses, charge)
+
+
+def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses, charge: Array) -> Samples:
+    """Return the presses of a shard and their charges as samples of a dataset.
+
+    Args:
+        maps: Forward map of each probe.
+        presses: Presses of the shard.
+        charge: Touch charges, shape (n, n_electrode), pC.
+    """
+    probe_notations = np.array([forward_map.probe.notation for forward_map in maps])
+    probe_angles = np.array([forward_map.probe.angle for forward_map in maps])
+    x, y, force = (np.ascontiguousarray(column) for column in presses.contact.T)
+    rotation_deg = np.rad2deg(probe_angles[presses.probe] + presses.rotation)
+    return Samples(
+        x_mm=x,
+        y_mm=y,
+        force_N=force,
+        probe=probe_notations[presses.probe],
+        orientation_deg=np.mod(np.round(rotation_deg, 9), 360.0),  # without rounding errors just below 360 degrees
+        charge_pC=charge,
+    )
 
 
 def _tasks(presses: SweepPresses, n_probes: int) -> Iterator[tuple[int, Integers]]:
-    """Divide the presses of a shard into tasks of at most `TASK_SIZE` presses with the same probe.
+    """Divide the presses of a shard, a file of the dataset, into tasks of presses with the same probe.
+
+    A task has at most `TASK_SIZE` presses.
 
     Args:
         presses: Presses of the shard.

@@ -21,10 +21,12 @@ def code_fingerprint() -> str:
     """
     source = hashlib.sha256()
     for path in sources():
-        source.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
+        relative_path = path.relative_to(PACKAGE).as_posix()
+        source.update(relative_path.encode() + b"\0" + path.read_bytes())
+    short_checksum = source.hexdigest()[:12]
     isocharge_version = importlib.metadata.version("isocharge")
     libraries = [f"{name} {importlib.metadata.version(name)}" for name in LIBRARIES]
-    return ", ".join([f"isocharge {isocharge_version} ({source.hexdigest()[:12]})", *libraries])
+    return ", ".join([f"isocharge {isocharge_version} ({short_checksum})", *libraries])
 
 
 def sources() -> list[Path]:

@@ -68,11 +68,12 @@ def in_order(
         for job in jobs:
             with _executor_errors():
                 pending.append(executor.submit(task, job))
+            # Yield results if too many jobs are pending. Results are also yielded if no job is running any more.
             while pending and (len(pending) >= max_pending or all(future.done() for future in pending)):
                 yield _result(pending.popleft())
         while pending:
             yield _result(pending.popleft())
-    finally:
+    finally:  # after an error, or if the caller needs no further results
         for future in pending:
             future.cancel()
 
@@ -135,11 +136,11 @@ def local_workers(count: int) -> Iterator[Executor | None]:
         yield None
         return
     context = multiprocessing.get_context("spawn")  # a fork would copy locks that other threads hold
-    worker_end, parent_end = context.Pipe(duplex=False)
+    worker_end, parent_end = context.Pipe(duplex=False)  # a worker ends when the parent's end is closed
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_initialise_worker, initargs=(worker_end,))
     try:
         yield pool
-    except BaseException:
+    except BaseException:  # also an interrupt; the running jobs are not completed
         _abandon(pool, parent_end)
         raise
     finally:
@@ -170,12 +171,15 @@ def _abandon(pool: ProcessPoolExecutor, parent_end: Connection) -> None:
     if manager is None:
         return  # no job was submitted, so there are no workers
 
+    # Wait until the manager has discarded the cancelled futures, which resets the flag. Then end the workers.
     _wait_until(lambda: not internals._cancel_pending_futures or not manager.is_alive())
     parent_end.close()
     _wait_until(lambda: not manager.is_alive())
+
+    # If a job is still being sent, close the reading end of the pipe in this process, so that the sending fails.
     sender: threading.Thread | None = job_queue._thread
     if sender is not None and sender.is_alive():
-        job_queue._reader.close()  # the sending fails
+        job_queue._reader.close()
     manager.join()
 
 
@@ -227,6 +231,7 @@ def dask_workers(address: str) -> Iterator[Executor]:
                 f"no Dask scheduler answers at {address}: {error}; is 'dask scheduler' running?"
             ) from error
         with client:
+            # With `pure=False`, Dask does not compute the keys of the tasks from their large arguments.
             executor: Executor = client.get_executor(pure=False)
             try:
                 yield executor

@@ -116,7 +116,7 @@ class Domain:
         contact = as_contacts(contact, source)
         inside = self.contains(contact)
         if not inside.all():
-            first_outside = int(np.argmin(inside))
+            first_outside = int(np.argmin(inside))  # the first False
             x, y, force = contact[first_outside]
             low, high = self.force_range
             raise SceneError(
@@ -248,29 +248,45 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
 
     Args:
         function: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns values, shape (n, k). It is
-            called once for all steps.
+            called only once, with the contacts of all steps.
         contact: Contacts at which the derivatives are computed, shape (n, 3), mm and N.
         steps: Steps in x and y, mm, and in ln F.
 
     Returns:
         Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values per mm, per mm and per 1.
     """
-    # For each of the three variables, one copy of the contacts after a step up, and one after a step down
-    contacts_up = np.tile(np.asarray(contact, dtype=float), (3, 1, 1))  # shape (3, n, 3)
-    contacts_down = contacts_up.copy()
-    x_step, y_step, log_force_step = steps
-    for stepped, sign in ((contacts_up, 1.0), (contacts_down, -1.0)):
-        x_stepped, y_stepped, force_stepped = stepped
-        x_stepped[:, 0] += sign * x_step
-        y_stepped[:, 1] += sign * y_step
-        force_stepped[:, 2] *= np.exp(sign * log_force_step)
+    contact = np.asarray(contact, dtype=float)
+    variable_steps = np.array(steps)
+    contacts_up = _step_each_variable(contact, variable_steps)  # shape (3, n, 3), the first axis is the variable
+    contacts_down = _step_each_variable(contact, -variable_steps)
 
-    # Evaluate the function once, for the stepped contacts in the order (variable, direction, contact).
+    # Evaluate the function once, for the stepped contacts in the order (variable, up or down, contact).
     stepped_contacts = np.stack([contacts_up, contacts_down], axis=1)
     values = np.asarray(function(stepped_contacts.reshape(-1, 3))).reshape(3, 2, len(contact), -1)
-    value_differences = values[:, 0] - values[:, 1]
-    derivatives = value_differences / (2.0 * np.array(steps))[:, None, None]  # shape (3, n, k)
+    values_up = values[:, 0]
+    values_down = values[:, 1]
+    derivatives = (values_up - values_down) / (2.0 * variable_steps)[:, None, None]  # shape (3, n, k)
     return np.moveaxis(derivatives, 0, 2)
+
+
+def _step_each_variable(contact: Array, steps: Array) -> Array:
+    """Return three copies of contacts: one after a step in x, one after a step in y, and one after a step in ln F.
+
+    Args:
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        steps: Steps in x and y, mm, and in ln F, shape (3,).
+
+    Returns:
+        Contacts (x, y, F), shape (3, n, 3), mm and N.
+    """
+    x_step, y_step, log_force_step = steps
+    x_stepped = contact.copy()
+    x_stepped[:, 0] += x_step
+    y_stepped = contact.copy()
+    y_stepped[:, 1] += y_step
+    force_stepped = contact.copy()
+    force_stepped[:, 2] *= np.exp(log_force_step)
+    return np.stack([x_stepped, y_stepped, force_stepped])
 
 
 def check_forces(force: Array | float, force_range: tuple[float, float], source: str) -> None:
@@ -288,7 +304,7 @@ def check_forces(force: Array | float, force_range: tuple[float, float], source:
     inside = _are_within(forces, force_range)
     if not inside.all():
         low, high = force_range
-        first_outside = int(np.argmin(inside))
+        first_outside = int(np.argmin(inside))  # the first False
         name = f"force of press {first_outside}" if forces.size > 1 else "force"
         raise SceneError(
             f"{name}: expected {low:g} to {high:g} N, which the {source} covers, got {forces[first_outside]:g} N"
@@ -349,7 +365,7 @@ def as_charges(charge: Array, electrode_names: tuple[str, ...]) -> Array:
             f"expected charges of shape (n, {n_electrode}) for {electrode_names}, got shape {charge.shape}"
         )
     if not np.isfinite(charge).all():
-        row, column = np.argwhere(~np.isfinite(charge))[0]
+        row, column = np.argwhere(~np.isfinite(charge))[0]  # the first such charge
         raise ChargeError(
             f"charge of {electrode_names[column]!r} in press {row}: expected a finite number, got {charge[row, column]}"
         )

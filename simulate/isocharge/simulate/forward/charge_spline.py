@@ -143,7 +143,9 @@ class ChargeSpline:
         patches: list[Patch] = []
         if spacing < COARSE_SPACING:
             for electrode in range(len(sensor.electrodes)):
-                patches += _fit_patch(samples, electrode, domain.radius, spacing, coarse)
+                patch = _fit_patch(samples, electrode, domain.radius, spacing, coarse)
+                if patch is not None:
+                    patches.append(patch)
 
         # The error is measured with the finished splines, and is unknown (NaN) until then.
         spline = cls(
@@ -208,26 +210,30 @@ class ChargeSpline:
             Charges, shape (n, n_electrode), pC. Derivatives with respect to (x, y), shape (n, n_electrode, 2), pC/mm.
             Derivatives with respect to ln F, shape (n, n_electrode), pC.
         """
-        # Each charge is a weighted sum over the forces of the splines. Derivatives of the weights with respect to ln F
-        # are computed by central differences.
+        # Each charge is a weighted sum of the scaled charges at the forces of the splines. Only the weights depend on
+        # the force. Their derivatives with respect to ln F are computed by central differences.
         position = onto_disk(position, self.domain.radius)
         log_force = np.log(np.broadcast_to(force, len(position)))
         weights = self.force_weights(log_force)
         weights_above = self.force_weights(log_force + LOG_FORCE_STEP)
         weights_below = self.force_weights(log_force - LOG_FORCE_STEP)
         weight_slopes = (weights_above - weights_below) / (2.0 * LOG_FORCE_STEP)
+
+        # Only the scaled charges depend on the position.
         scaled_charge = self.scaled_charges(position)
         scaled_gradient = self.scaled_gradients(position)
-        # weighted sums over k, the forces of the splines, for each press n and electrode e (i is x or y)
+
+        # Sum over k, the forces of the splines, for each press n and electrode e (i is x or y).
         charge = np.einsum("nk,nke->ne", weights, scaled_charge)
         position_derivative = np.einsum("nk,nkei->nei", weights, scaled_gradient)
         log_force_derivative = np.einsum("nk,nke->ne", weight_slopes, scaled_charge)
         return charge, position_derivative, log_force_derivative
 
     def force_weights(self, log_force: Array) -> Array:
-        """Compute the weights of the scaled charges at the forces of the splines.
+        """Compute the weights with which the scaled charges at the forces of the splines are summed.
 
-        The weighted sum of these scaled charges is the charge.
+        The weighted sum is the charge. Each weight is a Lagrange weight in ln F, multiplied by the squared amplitude at
+        the force, because the scaled charges are divided by the squared amplitude.
 
         Args:
             log_force: Logarithms of the forces (N), shape (...).
@@ -236,15 +242,17 @@ class ChargeSpline:
             Weights, shape (..., n_force).
         """
         nodes = np.log(self.force)
-        weights = lagrange_values(nodes, barycentric_weights(nodes), log_force.ravel())
-        weights *= amplitude_squared(self.film, np.exp(log_force.ravel()))[:, None]
+        flat_log_force = log_force.ravel()
+        weights = lagrange_values(nodes, barycentric_weights(nodes), flat_log_force)
+        weights *= amplitude_squared(self.film, np.exp(flat_log_force))[:, None]
         return weights.reshape(*log_force.shape, nodes.size)
 
     def scaled_charges(self, position: Array) -> Array:
         """Compute the scaled charges at the forces of the splines.
 
-        The splines over the disk give all charges. The patches correct the charges near the electrodes. Crosstalk is
-        added last.
+        A scaled charge is a charge divided by the squared amplitude at its force. The splines over the disk give all
+        charges. Each patch corrects the charge of one electrode in a rectangle around it. The calibration adds the
+        crosstalk last.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
@@ -267,16 +275,17 @@ class ChargeSpline:
         Returns:
             Derivatives, shape (n, n_force, n_electrode, 2), pC/mm.
         """
-        x_order = (1, 0)  # first derivative with respect to x, none with respect to y
-        y_order = (0, 1)
-        gradients = []
-        for order in (x_order, y_order):
-            slope = np.asarray(self.table(position, nu=order))
+        # A spline takes the orders of the derivative with respect to x and y.
+        x_derivative_orders = (1, 0)
+        y_derivative_orders = (0, 1)
+        derivatives = []
+        for orders in (x_derivative_orders, y_derivative_orders):
+            derivative = np.asarray(self.table(position, nu=orders))
             for patch in self.patches:
                 is_inside = patch.contains(position)
-                slope[is_inside, :, patch.electrode] += patch.table(position[is_inside], nu=order)
-            gradients.append(self.calibration.read(slope))
-        return np.stack(gradients, axis=-1)
+                derivative[is_inside, :, patch.electrode] += patch.table(position[is_inside], nu=orders)
+            derivatives.append(self.calibration.read(derivative))
+        return np.stack(derivatives, axis=-1)
 
 
 def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
@@ -289,12 +298,15 @@ def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
 def _force_nodes(forward_map: ForwardMap) -> Array:
     """Return the forces of the splines, shape (n_force,), N.
 
-    If d33 is zero, these are the forces of the forward map. Otherwise there are more forces; see `EXTRA_FORCE_NODES`.
+    If d33 is zero, these are the forces of the forward map. The charges of d33 depend on the force in another way than
+    the charges of the stress, so that a sensor with d33 needs a few forces more. A single force is never extended.
     """
-    low, high = np.log(forward_map.domain.force_range)
-    if forward_map.sensor.piezo.d33 == 0.0 or low == high:
-        return forward_map.family.force
-    return np.asarray(np.exp(chebyshev_nodes(forward_map.family.force.size + EXTRA_FORCE_NODES, low, high)))
+    solved_force = forward_map.family.force
+    min_log_force, max_log_force = np.log(forward_map.domain.force_range)
+    if forward_map.sensor.piezo.d33 == 0.0 or min_log_force == max_log_force:
+        return solved_force
+    log_force = chebyshev_nodes(solved_force.size + EXTRA_FORCE_NODES, min_log_force, max_log_force)
+    return np.asarray(np.exp(log_force))
 
 
 def _fit_positions(cells: int) -> Array:
@@ -316,8 +328,8 @@ def _fit_positions(cells: int) -> Array:
     # Positions are complex numbers x + iy. Those on the edge are moved inwards by more than the rounding error.
     inner_positions = lattice(inner_count)
     edge_positions = np.exp(2j * np.pi * np.arange(edge_count) / edge_count) * EDGE_RADIUS
-    position = np.concatenate([inner_positions, edge_positions])
-    return np.stack([position.real, position.imag], axis=1)
+    complex_positions = np.concatenate([inner_positions, edge_positions])
+    return np.stack([complex_positions.real, complex_positions.imag], axis=1)
 
 
 @dataclass(frozen=True)
@@ -334,6 +346,8 @@ class _ScaledCharges:
 
     def at(self, position: Array, is_needed: Booleans) -> Array:
         """Compute the scaled charges of presses: the charges divided by the squared amplitude at their force.
+
+        At each position, the press is computed with every force of the splines.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
@@ -353,7 +367,7 @@ class _ScaledCharges:
         # Interpolate from the solved forces to the forces of the splines.
         nodes = np.log(solved_force)
         force_weights = lagrange_values(nodes, barycentric_weights(nodes), np.log(self.force))
-        scaled_charge = force_weights @ scaled_stress_charge
+        scaled_charge = force_weights @ scaled_stress_charge  # shape (n, n_force, n_electrode)
 
         # Add the charge of the contact pressure, which is proportional to the force.
         pressure_charge_per_force = forward_map.pressure_charges(position)  # shape (n, n_electrode)
@@ -369,6 +383,9 @@ def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.
         samples: Scaled charges to which the splines are fitted.
         radius: Radius of the disk, mm.
         spacing: Largest distance between the knots, mm.
+
+    Returns:
+        Splines in (x, y), whose values have the shape (n_force, n_electrode), pC.
     """
     cells = int(np.clip(np.ceil(2.0 * radius / spacing), MIN_CELLS, MAX_CELLS))
     knots = spline_knots(-radius, radius, cells)
@@ -381,8 +398,10 @@ def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.
 
 def _fit_patch(
     samples: _ScaledCharges, electrode: int, radius: float, spacing: float, coarse: "scipy.interpolate.NdBSpline"
-) -> list[Patch]:
-    """Fit the difference between the charge of one electrode and the coarse splines, in a rectangle around it.
+) -> Patch | None:
+    """Fit a correction of the coarse splines for the charge of one electrode, in a rectangle around this electrode.
+
+    The correction is the difference between the charge and the coarse spline.
 
     Args:
         samples: Scaled charges.
@@ -392,31 +411,34 @@ def _fit_patch(
         coarse: Splines of all charges over the disk.
 
     Returns:
-        One correction, or none if the rectangle lies outside the disk.
+        The correction; None if the rectangle lies outside the disk.
     """
-    # Rectangle around the electrode, outside of which its charge is smooth
+    # Choose a rectangle around the electrode, outside of which its charge is smooth.
     sensor = samples.forward_map.sensor
     corners = np.concatenate([sensor.calibration.place(part) for part in sensor.electrodes[electrode].parts])
     margin = samples.forward_map.probe.reach + PATCH_MARGIN
     lower_left = corners.min(axis=0) - margin
     upper_right = corners.max(axis=0) + margin
 
-    # Knots and fitted presses
+    # Choose the knots along x and y.
     cells = np.clip(np.ceil((upper_right - lower_left) / spacing), MIN_CELLS, MAX_CELLS).astype(int)
     x_cells, y_cells = cells
     x_knots = spline_knots(lower_left[0], upper_right[0], x_cells)
     y_knots = spline_knots(lower_left[1], upper_right[1], y_cells)
 
-    edge_count = int(PRESSES_PER_EDGE_CELL * 2.0 * np.pi * radius / spacing)
+    # Choose the fitted presses in the part of the rectangle that lies in the disk.
+    cells_along_edge = 2.0 * np.pi * radius / spacing  # along the whole edge of the disk
+    edge_count = int(PRESSES_PER_EDGE_CELL * cells_along_edge)
     position = _patch_positions(lower_left, upper_right, cells, radius, edge_count)
     if not len(position):
-        return []
+        return None
 
-    # The patch approximates the error of the coarse splines for this electrode.
+    # Fit the error of the coarse splines for this electrode. Two fixed coefficients at each end of an axis make the
+    # correction and its slopes zero on the edges of the rectangle.
     is_needed = np.arange(len(sensor.electrodes)) == electrode
     residual = (samples.at(position, is_needed) - coarse(position))[:, :, electrode]
     table = fit_spline(position, residual, (x_knots, y_knots), fixed=2)
-    return [Patch(electrode, lower_left, upper_right, table)]
+    return Patch(electrode, lower_left, upper_right, table)
 
 
 def _patch_positions(lower_left: Array, upper_right: Array, cells: Integers, radius: float, edge_count: int) -> Array:
@@ -432,6 +454,7 @@ def _patch_positions(lower_left: Array, upper_right: Array, cells: Integers, rad
     Returns:
         Positions (x, y), shape (n, 2), mm.
     """
+    # The grid has PRESSES_PER_CELL points per cell, so the square root of this number along each side of a cell.
     x_count, y_count = np.ceil(np.sqrt(PRESSES_PER_CELL) * cells).astype(int)
     x_line = np.linspace(lower_left[0], upper_right[0], x_count)
     y_line = np.linspace(lower_left[1], upper_right[1], y_count)
@@ -439,6 +462,7 @@ def _patch_positions(lower_left: Array, upper_right: Array, cells: Integers, rad
     grid = np.stack([x_grid.ravel(), y_grid.ravel()], axis=1)
     is_in_disk = np.hypot(grid[:, 0], grid[:, 1]) < radius
 
+    # Of the points on the edge of the disk, only those in the rectangle are used.
     edge_angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
     edge = radius * EDGE_RADIUS * np.stack([np.cos(edge_angle), np.sin(edge_angle)], axis=1)
     is_in_rectangle = ((edge > lower_left) & (edge < upper_right)).all(axis=1)

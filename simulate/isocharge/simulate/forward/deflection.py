@@ -76,8 +76,8 @@ def _deflection_on_rings(equilibrium: Equilibrium, distance: float, rings: Array
     Args:
         equilibrium: The solved press.
         distance: Distance of the press from the centre, mm.
-        rings: Radii of the rings before the automorphism, from 0 for the centre of the probe to 1 for the rim of the
-            film, shape (n_ring,), in film radii.
+        rings: Radii of concentric rings of the unit disk, shape (n_ring,). `points_mm` maps this disk onto the film
+            so that 0 becomes a point under the probe, and 1 remains the rim of the film.
 
     Returns:
         Deflection, shape (n_ring, n_angle), mm. It is zero at the rim.

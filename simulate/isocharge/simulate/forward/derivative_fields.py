@@ -22,7 +22,7 @@ def solve_derivatives(forward_map: ForwardMap, read: Reading, executor: Executor
 
     Args:
         forward_map: Forward map of the film, whose probe is a circle. Its mesh and its readout are used.
-        read: Function that computes the derivatives of the stress at the nodes from a solved press.
+        read: Function that computes the derivatives of the stress at the nodes of the mesh from a solved press.
         executor: Executor that runs the solves; None for this process.
 
     Returns:
@@ -38,7 +38,7 @@ def solve_derivatives(forward_map: ForwardMap, read: Reading, executor: Executor
     theory = replace(forward_map.theory, stretching=True)  # the tangent of the equilibrium requires it
     settings = SolveSettings(theory=theory, resolution=forward_map.resolution, layer=forward_map.layer)
 
-    # At each distance, the presses with all forces are solved one after the other.
+    # A chain contains the presses with all forces at one distance, which are solved one after the other.
     chains = [
         Chain(film, forward_map.probe, distance, family.force, sensor.surface, settings, read)
         for distance in family.distance.tolist()

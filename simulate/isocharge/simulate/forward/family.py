@@ -220,6 +220,7 @@ class Family:
             angle = 2.0 * np.pi * period_index / self.symmetry_order
             rotated_elements = mesh.rotated(period_index, self.symmetry_order)
             reordered_stress = solved_period[..., rotated_elements, :, :]
+            # The components refer to a frame that rotates with the probe, so they rotate in the opposite direction.
             stress_of_periods.append(rotate_stress(reordered_stress, -angle))
         all_rotations = np.concatenate(stress_of_periods, axis=2)
         return np.asarray(all_rotations.reshape(-1, n_value))
@@ -256,17 +257,22 @@ def check_presses(domain: Domain, count: int) -> list[CheckPress]:
         count: Number of presses.
     """
     relative_distances = np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0))
-    min_log, max_log = np.log(domain.force_range)
+    min_force, max_force = domain.force_range
+    min_log_force, max_log_force = np.log(domain.force_range)
     presses = []
     for index, relative_distance in enumerate([*relative_distances, 1.0]):
-        # Multiples of the golden ratio, modulo 1, distribute the logarithms of the forces evenly.
-        log_force_fraction = (0.5 + 0.618 * index) % 1.0
-        force = np.clip(np.exp(min_log + (max_log - min_log) * log_force_fraction), *domain.force_range)
         distance = float(domain.radius * relative_distance)
+
+        # Multiples of the golden ratio, modulo 1, distribute the logarithms of the forces evenly. Rounding must not
+        # move a force out of the range.
+        log_force_fraction = (0.5 + 0.618 * index) % 1.0
+        force = np.exp(min_log_force + (max_log_force - min_log_force) * log_force_fraction)
+        force_in_range = float(np.clip(force, min_force, max_force))
+
         # The golden angle (2.4 rad) distributes the directions evenly. The rotation changes by another angle.
         angle = 2.4 * index
         rotation = 0.7 * index
-        presses.append(CheckPress(distance, angle=angle, force=float(force), rotation=rotation))
+        presses.append(CheckPress(distance, angle, force_in_range, rotation))
     return presses
 
 
@@ -285,9 +291,9 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
             outermost press with the largest force cannot exist.
     """
     radius = domain.radius
-    low, high = domain.force_range
-    if not (0.0 < low <= high and np.isfinite(high)):
-        raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {low} to {high}")
+    min_force, max_force = domain.force_range
+    if not (0.0 < min_force <= max_force and np.isfinite(max_force)):
+        raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {min_force} to {max_force}")
     if not (np.isfinite(radius) and radius > 0.0):
         raise SceneError(f"radius: expected a positive number, got {radius} mm")
     if not film.is_axisymmetric:
@@ -300,7 +306,7 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
             f"radius: presses up to {radius:.4g} mm from the centre with {probe.notation}, which reaches "
             f"{probe.reach:.4g} mm, leave the film of radius {film.radius:.4g} mm"
         )
-    check_press(film, probe, (radius, 0.0), high)
+    check_press(film, probe, (radius, 0.0), max_force)
 
 
 Reading = Callable[[Equilibrium, Surface], Array]
@@ -377,7 +383,8 @@ def solve_films(
     Returns:
         Values that `read` computes, shape (*grid.shape, n_value).
     """
-    # The values of the grid are dimensionless; see `FilmGrid`. Each chain begins with the largest force.
+    # The values of the grid are dimensionless: lengths are divided by the radius of the film, tensions by Young's
+    # modulus, and forces by Young's modulus, the thickness and the radius. Each chain begins with the largest force.
     radius = film.radius
     chains = []
     for distance, tension, thickness, reach in product(grid.distance, grid.tension, grid.thickness, grid.reach):

@@ -128,7 +128,7 @@ class FilmFamily:
         _check_back(film)
         check_family(prior.sensor.coated_film, largest_probe, domain)
 
-        # All solves have the mesh that the smallest probe needs.
+        # All solves have the mesh that the smallest probe needs, because this probe needs the finest mesh.
         min_force, max_force = force_range
         middle_force = float(np.sqrt(min_force * max_force))
         layer = layer_for(film, middle_force)
@@ -220,7 +220,7 @@ class FilmFamily:
             The values by their names. The coefficients and modes are rounded to integers. The value of "mode_scale" is
             the product of the scales of both, shape (n_mode, 1).
         """
-        # All coefficients of a mode have one scale, and all values of a mode have one scale.
+        # The coefficients of a mode have one scale over all axes of the grid. Its values have another scale.
         bits = bits_of(self.coefficients, self.modes, MAX_BITS, EXTRA_BITS)  # shape (n_mode,)
         axes_of_grid = tuple(range(len(AXES)))
         coefficients, coefficient_scale = quantised(self.coefficients, axes_of_grid, bits)
@@ -259,19 +259,24 @@ class FilmFamily:
             surface = str(arrays["surface"])
             if surface not in get_args(Surface):
                 raise ValueError(f"surface {surface}")
-            limits = {
-                axis: (float(smallest), float(largest))
-                for axis, (smallest, largest) in zip(AXES, arrays["limits"], strict=True)
-            }
+            limits = {}
+            for axis, (smallest, largest) in zip(AXES, arrays["limits"], strict=True):
+                limits[axis] = (float(smallest), float(largest))
+
             # The nodes of all axes are stored in one array, one axis after the other.
             axis_starts = np.cumsum(arrays["grid_shape"])[:-1]  # without the first axis, which starts at 0
             axis_nodes = np.split(np.asarray(arrays["grid"], dtype=float), axis_starts)
             modes = arrays["modes"] * np.asarray(arrays["mode_scale"], dtype=float)
-            imperfections = {
+
+            # A family without imperfections has no arrays with this prefix.
+            imperfections = None
+            imperfection_arrays = {
                 name.removeprefix(IMPERFECTION_PREFIX): array
                 for name, array in arrays.items()
                 if name.startswith(IMPERFECTION_PREFIX)
             }
+            if imperfection_arrays:
+                imperfections = FilmModes.from_arrays(imperfection_arrays, field_size=modes.shape[1])
             return cls(
                 poisson=float(arrays["poisson"]),
                 surface=cast(Surface, surface),
@@ -282,7 +287,7 @@ class FilmFamily:
                 coefficients=arrays["coefficients"].astype(float),
                 modes=modes,
                 error=float(arrays["error"]),
-                imperfections=FilmModes.from_arrays(imperfections, modes.shape[1]) if imperfections else None,
+                imperfections=imperfections,
             )
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise InputError(f"film family: expected the arrays that to_arrays gives ({error})") from error
@@ -376,14 +381,16 @@ def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) 
     min_force, max_force = domain.force_range
     errors = []
     for index, parameters in enumerate(prior.draw(rng, CHECK_COUNT)):
-        forward_map = family.forward_map(*prior.film(parameters))
+        sensor, probe = prior.film(parameters)
+        forward_map = family.forward_map(sensor, probe)
+
         # The square root and the golden angle (2.4 rad) distribute the positions evenly over the disk. The forces are
         # uniform in the logarithm.
         distance = domain.radius * np.sqrt((index + 1.0) / CHECK_COUNT)
         angle = 2.4 * index
         force = float(min_force * (max_force / min_force) ** rng.random())
         check = CheckPress(float(distance), angle, force, rotation=0.0)
-        direct = direct_charges(forward_map.sensor, forward_map.probe, forward_map.settings, check)
+        direct = direct_charges(sensor, probe, forward_map.settings, check)
         errors.append(forward_map.relative_error(check, direct))
     return max(errors)
 
@@ -403,8 +410,8 @@ def _limits_of(prior: FilmPrior, domain: Domain) -> FilmLimits:
     largest = dict(zip(prior.names, upper_bounds.tolist(), strict=True))
     film = prior.sensor.film
 
-    # In the prior, the parameters "young" and "thickness" are logarithms of factors, and "probe_radius" is a difference
-    # in mm. Young's modulus appears in two axes.
+    # In the prior, the parameters "young" and "thickness" are logarithms of factors, "probe_radius" is a difference in
+    # mm, and "pretension" is the pretension itself, whose smallest value is zero.
     min_thickness = film.thickness * np.exp(smallest["thickness"])
     max_thickness = film.thickness * np.exp(largest["thickness"])
     min_young = film.young * np.exp(smallest["young"])

@@ -123,7 +123,8 @@ def _axis_value(axis: str, coordinate: Array) -> Array:
 def bits_of(coefficients: Array, modes: Array, max_bits: int, extra_bits: float) -> Array:
     """Compute the number of bits with which each mode of a decomposition is stored.
 
-    Modes with small contributions need fewer bits for the same absolute error.
+    The decomposition is coefficients @ modes. A mode whose contribution to it is smaller by a factor of 2 needs one bit
+    less for the same absolute error. Every mode has at least 2 bits.
 
     Args:
         coefficients: Coefficients of the modes, shape (..., n_mode).
@@ -159,43 +160,57 @@ def decompose(stress: Array, max_error: float) -> tuple[Array, Array]:
     """Compute a low-rank decomposition of stresses (proper orthogonal decomposition, Sirovich 1987).
 
     Each stress becomes a weighted sum of a few modes: stress = coefficients @ modes. The stress at each node is first
-    divided by its root mean square. Otherwise the large stress under the probe would dominate the stress at the
-    electrodes.
+    divided by its root mean square over the presses. Otherwise the large stress under the probe would dominate the
+    stress at the electrodes.
 
     Args:
-        stress: Scaled stresses of all presses, shape (..., n).
+        stress: Scaled stresses (s11, s22, s12) at the nodes for all presses, shape (..., n_node * 3).
         max_error: Largest relative error of the decomposition (root mean square).
 
     Returns:
-        Coefficients, shape (..., n_mode), and modes, shape (n_mode, n), with the smallest number of modes.
+        Coefficients, shape (..., n_mode), and modes, shape (n_mode, n_node * 3), with the smallest number of modes.
     """
     stress_of_presses = stress.reshape(-1, stress.shape[-1])
-    n_press, n_value = stress_of_presses.shape
-    squared_magnitude = (stress_of_presses.reshape(n_press, -1, 3) ** 2).sum(axis=2)
+    node_stress = stress_of_presses.reshape(len(stress_of_presses), -1, 3)
+    squared_magnitude = (node_stress**2).sum(axis=2)  # shape (n_press, n_node)
     rms_of_nodes = np.sqrt(squared_magnitude.mean(axis=0))
     rms_of_values = np.repeat(rms_of_nodes, 3)  # a node has three components of the stress
-    relative_stress = stress_of_presses / rms_of_values
 
-    # Singular value decomposition of the relative stress by the eigenvectors of a Gram matrix. Of the two Gram
-    # matrices, of shape (n_press, n_press) and (n_value, n_value), the smaller one is used.
-    has_fewer_presses = n_press < n_value
-    vectors = relative_stress if has_fewer_presses else relative_stress.T
-    gram_matrix = vectors @ vectors.T
+    relative_stress = stress_of_presses / rms_of_values
+    relative_modes = _right_singular_vectors(relative_stress, max_error)
+    coefficients = relative_stress @ relative_modes.T
+    return coefficients.reshape(*stress.shape[:-1], -1), relative_modes * rms_of_values
+
+
+def _right_singular_vectors(matrix: Array, max_error: float) -> Array:
+    """Compute the right singular vectors of a matrix M with the largest singular values.
+
+    The singular value decomposition is M = U S V^T. The squares of the singular values are the eigenvalues of M M^T and
+    of M^T M. The smaller one of these Gram matrices is decomposed. The columns of V are the eigenvectors of M^T M. If
+    M M^T is decomposed, its eigenvectors are the columns of U, and V^T = S^-1 U^T M.
+
+    Args:
+        matrix: The matrix M, shape (n_row, n_column).
+        max_error: Largest relative error (root mean square) of M if the other singular values are omitted.
+
+    Returns:
+        Rows of V^T, shape (n_vector, n_column), by descending singular value. The number of rows is the smallest one
+        with a sufficiently small error.
+    """
+    n_row, n_column = matrix.shape
+    has_fewer_rows = n_row < n_column
+    gram_matrix = matrix @ matrix.T if has_fewer_rows else matrix.T @ matrix
     ascending_eigenvalues, ascending_eigenvectors = np.linalg.eigh(gram_matrix)
     eigenvalues = np.maximum(ascending_eigenvalues[::-1], 0.0)
     eigenvectors = ascending_eigenvectors[:, ::-1].T  # one eigenvector in each row
 
-    # The error of a truncation follows from the sum of the omitted eigenvalues. Take the first number of modes with a
-    # sufficiently small error.
-    relative_error = np.sqrt(np.maximum(1.0 - np.cumsum(eigenvalues) / eigenvalues.sum(), 0.0))
-    n_mode = int(np.argmax(relative_error <= max_error)) + 1
+    # The squared relative error is the sum of the omitted eigenvalues over the sum of all eigenvalues.
+    kept_fraction = np.cumsum(eigenvalues) / eigenvalues.sum()  # if the first 1, 2, ... eigenvalues are kept
+    relative_error = np.sqrt(np.maximum(1.0 - kept_fraction, 0.0))
+    n_vector = int(np.argmax(relative_error <= max_error)) + 1  # the first sufficiently small error
+    kept_eigenvectors = eigenvectors[:n_vector]
 
-    # The modes are the right singular vectors.
-    if has_fewer_presses:
-        left_vectors = eigenvectors[:n_mode]
-        singular_values = np.sqrt(eigenvalues[:n_mode, None])
-        modes = left_vectors @ relative_stress / singular_values
-    else:
-        modes = eigenvectors[:n_mode]
-    coefficients = relative_stress @ modes.T
-    return coefficients.reshape(*stress.shape[:-1], n_mode), modes * rms_of_values
+    if has_fewer_rows:
+        singular_values = np.sqrt(eigenvalues[:n_vector, None])
+        return np.asarray(kept_eigenvectors @ matrix / singular_values)
+    return kept_eigenvectors

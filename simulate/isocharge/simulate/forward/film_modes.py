@@ -71,13 +71,17 @@ class PressedFilm:
             Two arrays of shape (n, n_electrode), pC per unit of the mode.
         """
         even, odd = self.fields[kind]
-        if kind == "tension":
+        if kind == "tension":  # the fields belong to a tension of `tension_scale`, and the mode to 1 MPa
             return even / self.tension_scale, odd / self.tension_scale
         return even, odd
 
 
 def _component_along_axes(kind: str) -> Callable[[PressedFilm], Array]:
     """Return a function that computes the charges of the component of an imperfection along x and y.
+
+    The axes of the even field are along and across the direction of the press, and those of the odd field are the
+    diagonals between them. An imperfection with two axes rotates with twice the angle t of the press. The charges of a
+    component along x and y are therefore cos(2 t) * even - sin(2 t) * odd.
 
     Args:
         kind: Name of an imperfection with two axes, from `FIELDS`.
@@ -91,7 +95,11 @@ def _component_along_axes(kind: str) -> Callable[[PressedFilm], Array]:
 
 
 def _component_along_diagonals(kind: str) -> Callable[[PressedFilm], Array]:
-    """Return a function that computes the charges of the component of an imperfection along the diagonals.
+    """Return a function that computes the charges of the component of an imperfection along the diagonals of x and y.
+
+    The axes of the even field are along and across the direction of the press, and those of the odd field are the
+    diagonals between them. An imperfection with two axes rotates with twice the angle t of the press. The charges of a
+    component along the diagonals are therefore sin(2 t) * even + cos(2 t) * odd.
 
     Args:
         kind: Name of an imperfection with two axes, from `FIELDS`.
@@ -245,12 +253,11 @@ class ModeMap:
             return {}
         is_odd = IS_ODD[list(self.field_numbers)]
         charges = self.fields.field_charges(contact, is_odd)  # shape (n, n_electrode, n_field)
-        charges_of_kind: dict[str, tuple[Array, ...]] = {}
+        charges_of_kind: dict[str, list[Array]] = {}
         for field_index, field_number in enumerate(self.field_numbers):
             kind = KINDS[field_number]
-            previous_charges = charges_of_kind.get(kind, ())
-            charges_of_kind[kind] = (*previous_charges, charges[..., field_index])
-        return charges_of_kind
+            charges_of_kind.setdefault(kind, []).append(charges[..., field_index])
+        return {kind: tuple(field_charges) for kind, field_charges in charges_of_kind.items()}
 
 
 KINDS = [kind for kind, fields in FIELDS.items() for _ in fields]
@@ -300,13 +307,14 @@ class FilmModes:
 
         Args:
             family: The family of films.
-            film: A film of the family. The grid takes its radius.
+            film: A film of the family. All films of the grid have its radius.
             executor: Executor that runs the solves; None for this process.
         """
         grid = FilmGrid.spread(family.limits, NODE_COUNTS)
         settings = SolveSettings(theory=THEORY, resolution=family.resolution, layer=family.layer)
         changes = solve_films(film, family.surface, grid, settings, executor, stress_changes)
-        return cls(grid, *decompose(changes, MAX_TRUNCATION_ERROR))
+        coefficients, components = decompose(changes, MAX_TRUNCATION_ERROR)
+        return cls(grid, coefficients, components)
 
     def mode_map(self, film: ForwardMap, names: Sequence[str] = tuple(MODES)) -> ModeMap:
         """Return the map of the modes of one film. Only the fields that these modes need are computed.
@@ -375,11 +383,12 @@ class FilmModes:
         coefficients, coefficient_scale = quantised(self.coefficients, axes_of_grid, SCALE_BITS)
 
         # The components are divided by the size of the stress at each node. This size is rounded to a power of two,
-        # which compresses well. The smallest positive number is added, because the size may be zero.
+        # which compresses well. A tiny number is added to the size, because the logarithm of zero does not exist.
         n_component = len(self.parts)
         node_stress = self.parts.reshape(n_component, -1, 3)
-        exact_node_size = np.sqrt((node_stress**2).sum(axis=(0, 2), keepdims=True)) + np.finfo(np.float32).tiny
-        node_size = np.float32(np.exp2(np.round(np.log2(exact_node_size))))  # shape (1, n_node, 1)
+        node_norm = np.sqrt((node_stress**2).sum(axis=(0, 2), keepdims=True))  # shape (1, n_node, 1)
+        node_exponent = np.round(np.log2(node_norm + np.finfo(np.float32).tiny))
+        node_size = np.float32(np.exp2(node_exponent))
         relative_parts = (node_stress / node_size).reshape(n_component, -1)
         bits = bits_of(self.coefficients, relative_parts, MAX_BITS, EXTRA_BITS)
         parts, part_scale = quantised(relative_parts, 1, bits[:, None])
@@ -404,24 +413,46 @@ class FilmModes:
             InputError: If an array is missing, the shapes are inconsistent, or the file contains other fields.
         """
         try:
-            shape = tuple(arrays["grid_shape"])
-            coefficients = arrays["coefficients"]
-            parts = arrays["parts"]
-            scale = arrays["part_scale"]
-            if coefficients.shape != (*shape, len(parts)) or scale.shape != (len(parts), 1):
-                raise ValueError(f"coefficients {coefficients.shape} and parts {parts.shape} do not match")
-            if parts.shape[1] != IS_ODD.size * field_size:
-                raise ValueError(
-                    f"a part has {parts.shape[1]} values, expected those of the {IS_ODD.size} fields of "
-                    f"{', '.join(FIELDS)}; train the network for all films again"
-                )
-            node_size = np.asarray(arrays["node_size"], dtype=float)
-            if 3 * node_size.size != parts.shape[1]:
-                raise ValueError(f"{node_size.size} node sizes do not match {parts.shape[1]} values of a part")
+            _check_shapes(arrays, field_size)
             # The nodes of all axes are stored in one array, one axis after the other.
-            axis_starts = np.cumsum(shape)[:-1]  # without the first axis, which starts at 0
+            axis_starts = np.cumsum(tuple(arrays["grid_shape"]))[:-1]  # without the first axis, which starts at 0
             grid = FilmGrid(*np.split(np.asarray(arrays["grid"], dtype=float), axis_starts))
+
+            # The file contains the components as integers, divided by the size of the stress at each node.
+            part_scale = np.asarray(arrays["part_scale"], dtype=float)
+            node_size = np.asarray(arrays["node_size"], dtype=float)
             value_size = np.repeat(node_size, 3)  # each node has three components of the stress
-            return cls(grid, coefficients.astype(float), parts * np.asarray(scale, dtype=float) * value_size)
+            parts = arrays["parts"] * part_scale * value_size
+            return cls(grid, arrays["coefficients"].astype(float), parts)
         except (KeyError, ValueError, TypeError, AttributeError, IndexError) as error:
             raise InputError(f"film modes: expected the arrays that to_arrays gives ({error})") from error
+
+
+def _check_shapes(arrays: Mapping[str, Any], field_size: int) -> None:
+    """Raise an error if the arrays of a file have inconsistent shapes.
+
+    Args:
+        arrays: Arrays of `FilmModes.to_arrays`.
+        field_size: Number of values of one field.
+
+    Raises:
+        ValueError: If the numbers of components or nodes differ, or a component does not contain all fields.
+    """
+    grid_shape = tuple(arrays["grid_shape"])
+    coefficients = arrays["coefficients"]
+    parts = arrays["parts"]
+    n_component = len(parts)
+    coefficients_fit = coefficients.shape == (*grid_shape, n_component)
+    scales_fit = arrays["part_scale"].shape == (n_component, 1)
+    if not (coefficients_fit and scales_fit):
+        raise ValueError(f"coefficients {coefficients.shape} and parts {parts.shape} do not match")
+
+    part_size = parts.shape[1]
+    if part_size != IS_ODD.size * field_size:
+        raise ValueError(
+            f"a part has {part_size} values, expected those of the {IS_ODD.size} fields of {', '.join(FIELDS)}; train "
+            "the network for all films again"
+        )
+    n_node = np.asarray(arrays["node_size"], dtype=float).size
+    if 3 * n_node != part_size:
+        raise ValueError(f"{n_node} node sizes do not match {part_size} values of a part")

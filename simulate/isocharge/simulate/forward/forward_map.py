@@ -125,7 +125,8 @@ class ForwardMap:
         settings = replace(settings, resolution=resolution, layer=layer)
 
         # Increase the number of nodes until the charges of the check presses are sufficiently accurate. The check
-        # presses are solved once, when the first map exists.
+        # presses are solved directly only once, when the first map exists. If the error is very large, the next number
+        # of nodes would not suffice either and is skipped.
         checks = check_presses(domain, CHECK_COUNT)
         check_charges: list[Array] = []
         error = np.inf
@@ -134,7 +135,8 @@ class ForwardMap:
             count = remaining_counts.pop(0)
             node_count = (count.distances, count.forces)
             family = Family.spread(domain, film.radius, node_count, probe.period, count.min_orientations)
-            table = family.unfold(family.solve(sensor, probe, settings, executor), template)
+            solved_stress = family.solve(sensor, probe, settings, executor)
+            table = family.unfold(solved_stress, template)
             forward_map = cls(sensor, probe, family, theory, resolution, layer, table, error)
             if not check_charges:
                 solve_directly = partial(direct_charges, sensor, probe, forward_map.settings)
@@ -215,13 +217,7 @@ class ForwardMap:
             SceneError: If a press lies outside the domain.
         """
         contact = self.domain.check(contact, "forward map")
-
-        def charges_without_rotation(moved_contact: Array) -> Array:
-            """Compute the charges of presses whose probe has no further rotation."""
-            no_rotation = np.zeros(len(moved_contact))
-            return self._unchecked_charges(moved_contact, no_rotation)
-
-        return differences(charges_without_rotation, contact)
+        return differences(self._unrotated_charges, contact)
 
     def relative_error(self, check: CheckPress, direct: Array) -> float:
         """Compute the largest relative difference between the charges of one press and those of a direct solve.
@@ -270,7 +266,9 @@ class ForwardMap:
     def stress_charges_by_force(self, position: Array, is_needed: Booleans) -> Array:
         """Compute the charges that the stress causes, for all forces of the family at once.
 
-        The pressure on the electrodes and the crosstalk are omitted. The probe keeps its orientation.
+        The pressure on the electrodes and the crosstalk are omitted. The probe keeps its orientation. The stress under
+        each force is treated as one of several fields of a map with a single force, so that all forces share the
+        interpolation between distances and the search of the points in the mesh.
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
@@ -279,7 +277,7 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_force, n_electrode), pC. Charges that are not needed are zero.
         """
-        # The stacked map has a single force and one even field for each force of the family.
+        # The stacked map has one field for each force of the family. All these fields are even.
         complex_position = position[:, 0] + 1j * position[:, 1]
         stacked_map = self._stacked_forces
         first_force = stacked_map.family.force[0]
@@ -287,7 +285,7 @@ class ForwardMap:
         orientation = np.zeros(1)  # the probe keeps its orientation for all presses
         chunk_size = max(1, CHUNK_SIZE // self.family.force.size)
         charges = []
-        with single_threaded_blas():
+        with single_threaded_blas():  # faster for the many small matrices of a chunk
             for start in range(0, complex_position.size, chunk_size):
                 chunk = complex_position[start : start + chunk_size]
                 rules = tuple((readout, pairs & is_needed) for readout, pairs in self._readout_rules.select(chunk))
@@ -325,6 +323,10 @@ class ForwardMap:
         table = force_as_field.reshape(n_distance * n_rotation, -1)
         family = replace(self.family, force=self.family.force[:1])
         return replace(self, family=family, table=table.astype(np.float32))
+
+    def _unrotated_charges(self, contact: Array) -> Array:
+        """Return `_unchecked_charges` of presses whose probe has no further rotation, shape (n, n_electrode), pC."""
+        return self._unchecked_charges(contact, np.zeros(len(contact)))
 
     def _unchecked_charges(self, contact: Array, orientation: Array) -> Array:
         """Compute the charges of presses in the domain or slightly outside, in chunks that limit the memory.
@@ -403,27 +405,40 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_electrode, n_field), pC.
         """
-        # Interpolate the values of the fields at the nodes of the mesh for each press.
         film = self.sensor.film
+        presses = self._interpolated_presses(position, force, orientation)
+        _, pairs_of_first_rule = rules[0]
+        pairs_shape = pairs_of_first_rule.shape  # (n, n_electrode), the same for all rules
+        scaled_charge = np.zeros((*pairs_shape, is_odd.size))
+        for readout, uses_rule in rules:
+            # Electrodes with different numbers of points are integrated separately.
+            for n_point in np.unique(readout.count):
+                press_index, electrode = np.nonzero(uses_rule & (readout.count == n_point))
+                points_mm = readout.points[electrode, :n_point] @ np.array([1.0, 1j])  # (x, y) becomes x + iy
+                points = points_mm / film.radius
+                weights = readout.weights[electrode, :n_point]
+                scaled_charge[press_index, electrode] = presses.scaled_charges(press_index, points, weights, is_odd)
+
+        # The stress in the table is divided by this unit.
+        stress_unit = film.young * amplitude_squared(film, force)
+        return np.asarray(scaled_charge * stress_unit[:, None, None])
+
+    def _interpolated_presses(self, position: Complexes, force: Array, orientation: Array) -> PressChunk:
+        """Interpolate the stress fields at the nodes of the mesh for one chunk of presses.
+
+        Args:
+            position: Positions x + iy, shape (n,), mm.
+            force: Forces, shape (n,), N.
+            orientation: Further rotation of the probe, shape (n,) or (1,), rad.
+        """
         distance = np.abs(position)
         direction = np.angle(position)  # from the centre of the film to the press, rad
         rotation = orientation - direction  # of the probe relative to the direction of the press
-        field = self.family.weights(distance, force, rotation).astype(self.table.dtype) @ self.table
+        weights = self.family.weights(distance, force, rotation).astype(self.table.dtype)
+        nodal_fields = weights @ self.table
         mesh = template_for(self.probe, self.resolution)
-        placement = Placement.of(mesh, self.probe, distance, film.radius, self.layer, rotation)
-        presses = PressChunk(mesh, placement, field, direction, rotation + self.probe.angle)
-
-        # Each rule has electrodes with different numbers of points, which are integrated separately.
-        _, first_pairs = rules[0]
-        charge = np.zeros((*first_pairs.shape, is_odd.size))
-        for readout, uses_rule in rules:
-            for n_point in np.unique(readout.count):
-                press_index, electrode = np.nonzero(uses_rule & (readout.count == n_point))
-                points = readout.points[electrode, :n_point] @ np.array([1.0, 1j]) / film.radius  # (x, y) to x + iy
-                weights = readout.weights[electrode, :n_point]
-                charge[press_index, electrode] = presses.scaled_charges(press_index, points, weights, is_odd)
-        stress_unit = film.young * amplitude_squared(film, force)
-        return np.asarray(charge * stress_unit[:, None, None])
+        placement = Placement.of(mesh, self.probe, distance, self.sensor.film.radius, self.layer, rotation)
+        return PressChunk(mesh, placement, nodal_fields, direction, rotation + self.probe.angle)
 
     @cached_property
     def _readout_rules(self) -> ReadoutRules:

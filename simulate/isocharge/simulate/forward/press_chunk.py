@@ -38,14 +38,20 @@ class PressChunk:
             press_index: Index of the press of each pair, shape (n_pair,).
             points: Integration points on the electrode of each pair, shape (n_pair, n_point), in film radii.
             weights: Charge per stress (s11, s22, s12), shape (n_pair, n_point, 3), pC/MPa.
-            is_odd: Whether each field is odd about the direction of the press, shape (n_field,).
+            is_odd: Whether each field is odd, shape (n_field,). A reflection in the direction of the press leaves an
+                even field unchanged, and changes the sign of an odd field.
 
         Returns:
             Charges over the unit of stress, shape (n_pair, n_field), pC/MPa.
         """
         stress, is_mirrored = self._interpolated_stress(press_index, points, is_odd.size)
-        direction = self.direction[press_index]
-        frame_angle = direction if self.mesh.half else direction + self.probe_angle[press_index]
+
+        # The frame of the stress is rotated to the direction of the press. If the whole film is meshed, the frame also
+        # rotates with the probe.
+        frame_angle = self.direction[press_index]
+        if not self.mesh.half:
+            frame_angle = frame_angle + self.probe_angle[press_index]
+
         charge = np.empty((len(stress), is_odd.size))
         for field_index, odd in enumerate(is_odd):
             field_stress = stress[:, :, field_index]

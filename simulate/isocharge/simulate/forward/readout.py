@@ -77,6 +77,7 @@ class ReadoutPoints:
             per_side: Number of Gauss points per side of an electrode.
         """
         layout_points = _layout_points(sensor.electrodes, sensor.readout, per_side)
+        # The factor 2 is there because s12 and s21 contribute equally.
         charge_per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
         weights = sensor.gains[:, None, None] * layout_points.weights * charge_per_stress
         return cls(sensor.calibration.place(layout_points.points), weights, layout_points.count)
@@ -100,7 +101,8 @@ class ReadoutPoints:
         points = start + relative_position[:, None] * start_to_end  # shape (n_electrode, n_line, LINE_POINTS, 2)
         placed_points = sensor.calibration.place(points.reshape(-1, LINE_POINTS, 2))
 
-        # Weight of a point: gain * length that the point represents * charge per area and stress (s11, s22, s12)
+        # Weight of a point: gain * length that the point represents * charge per area and stress (s11, s22, s12). The
+        # factor 2 is there because s12 and s21 contribute equally.
         length = np.linalg.norm(start_to_end, axis=3)  # shape (n_electrode, n_line, 1)
         point_length = length * line_weights  # shape (n_electrode, n_line, LINE_POINTS)
         amplified_length = sensor.gains[:, None, None] * point_length
@@ -144,6 +146,7 @@ def _layout_points(electrodes: tuple[Electrode, ...], readout: Readout, per_side
         electrode_points, shares = rules[index]
         n_point = counts[index]
         points[index, :n_point] = electrode_points
+        # The shares are weights of a mean over the electrode, which sum to 1 for each component of the stress.
         areas[index, :n_point] = electrode.area * shares
     return ReadoutPoints(points, areas, counts)
 
@@ -171,9 +174,13 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
             f"surface {sensor.surface!r} needs bending, but the film was solved as a {equilibrium.theory.name}; solve "
             "it with SolveSettings(theory=theory_for(sensor, probe, (force, force)))"
         )
+    # Integrate the stress at the points of all electrodes, which `touch_stress` expects in one list.
     readout = ReadoutPoints.of(sensor, DIRECT)
-    stress = touch_stress(equilibrium, readout.points.reshape(-1, 2), sensor.surface)
-    charge = readout.charge(stress.reshape(*readout.points.shape[:2], 3))
+    n_electrode, n_point, _ = readout.points.shape
+    flat_stress = touch_stress(equilibrium, readout.points.reshape(-1, 2), sensor.surface)
+    charge = readout.charge(flat_stress.reshape(n_electrode, n_point, 3))
+
+    # Add the charge of the contact pressure and the crosstalk.
     charge += contact_charge(sensor, equilibrium.probe, equilibrium.at, equilibrium.force)
     return sensor.calibration.read(charge)
 
@@ -288,13 +295,13 @@ def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
         Points (x, y), shape (n, 2), mm. Weights of each point in the means of s11, s22 and s12, shape (n, 3). The three
         weights of a point are equal.
     """
-    if electrode.square:
+    if electrode.square:  # a product of one-dimensional Gauss rules
         unit_points, shares = gauss_square(per_side)
         lower_left, _, upper_right, _ = np.array(electrode.corners)
         points = lower_left + unit_points * (upper_right - lower_left)
     elif len(electrode.parts) == 1:
         points, shares = gauss_polygon(electrode.parts[0], per_side)
-    else:
+    else:  # an electrode of several quadrilaterals
         rules = [gauss_quadrilateral(part, per_side, MAX_PART_SIDE) for part in electrode.parts]
         points = np.concatenate([part_points for part_points, _ in rules])
         weights = np.concatenate([part_weights for _, part_weights in rules])

@@ -67,6 +67,9 @@ class ReadoutRules:
     def select(self, position: Complexes) -> tuple[tuple[ReadoutPoints, Booleans], ...]:
         """Select the integration rule for each pair of a press and an electrode.
 
+        The fine rule is for electrodes near the probe. The rule for far electrodes also requires that the press is far
+        from the clamp, and that the mesh is fine there. The coarse rule is for all other pairs.
+
         Args:
             position: Positions x + iy of the presses, shape (n,), mm.
 

@@ -62,12 +62,14 @@ def stress_series(forward_map: ForwardMap) -> StressSeries:
     inner = np.empty((N_DISTANCES, N_FORCES, N_INNER_RINGS, N_ANGLES))
     outer = np.empty((N_DISTANCES, N_FORCES, N_OUTER_RINGS, N_ANGLES))
 
-    # The Chebyshev nodes are mapped from [-1, 1] to fractions from 0 to 1 of the ranges of distance, force and ring.
+    # Map the Chebyshev nodes from [-1, 1] to fractions from 0 to 1 of the ranges of distance, force and ring.
     distances_mm = max_distance_mm * 0.5 * (_nodes(N_DISTANCES) + 1.0)
     forces_N = min_force_N * (max_force_N / min_force_N) ** (0.5 * (_nodes(N_FORCES) + 1.0))
     inner_fraction = 0.5 * (_nodes(N_INNER_RINGS) + 1.0)
     outer_fraction = 0.5 * (_nodes(N_OUTER_RINGS) + 1.0)
     direction: Complexes = np.exp(1j * np.arccos(_nodes(N_ANGLES)))  # unit vectors x + iy
+
+    # Under the automorphism, rings about the centre become rings about the probe. One of them is the edge of the probe.
     for distance_index, distance_mm in enumerate(distances_mm):
         shift, probe_ring = _automorphism(distance_mm / film.radius, forward_map.probe.reach / film.radius)
         inner_rings = probe_ring * np.sqrt(inner_fraction)

@@ -159,15 +159,16 @@ def _candidates(
         Indices of first contacts, shape (m,). A candidate (x, y, F) for each first contact, shape (m, 3), mm and N. A
         first contact with two candidates occurs twice.
     """
-    profile, terms = _tabulate(charge_map, position)
-    _, neighbours = cKDTree(position).query(position, min(NEIGHBOURS, len(position)))
+    # The charges at each position of the lattice are weights(ln F) @ ratios, with the weights of the profile.
+    profile, ratios = _tabulate(charge_map, position)
+    _, neighbours = cKDTree(position).query(position, min(NEIGHBOURS, len(position)))  # indices, including itself
     first_indices = []
     second_contacts = []
     for first_index, first_charge in enumerate(charge):
         # At every position of the lattice, find the force that explains the charges of the first contact best.
         observed = np.broadcast_to(first_charge, charge.shape)
-        log_force = profile.best(terms, observed, noise)
-        predicted = profile.charge(log_force, terms)
+        log_force = profile.best(ratios, observed, noise)
+        predicted = profile.charge(log_force, ratios)
         chi2 = ((observed - predicted) ** 2 / noise.variance(predicted)).sum(axis=1)  # shape (n,)
 
         is_local_minimum = chi2 <= chi2[neighbours].min(axis=1)
@@ -200,6 +201,8 @@ def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Arr
     else:
         log_nodes = np.array([min_log_force])
     force_nodes = np.clip(np.exp(log_nodes), *force_range)  # rounding may lead out of the range
+
+    # Ratios at the nodes of the interpolation, one array of shape (n, n_electrode) for each force
     nodal_ratios = []
     for force in force_nodes:
         contact = np.column_stack([position, np.full(len(position), force)])

@@ -140,6 +140,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
         noise: Noise of the readings.
     """
     search = _FoldSearch(charge_map, noise, force)
+    # J / sigma, the derivatives of the charges divided by the noise, at all positions
     scaled = rings.per_ring(search.scaled(rings.position.reshape(-1, 2)))  # shape (n_ring, n_angle, n_electrode, 3)
     weakest = search.weakest_positions(rings, scaled)
     points = np.concatenate([search.folds_between(rings, scaled), search.folds_about(weakest)])
@@ -196,22 +197,25 @@ class _FoldSearch:
         `SEGMENT_LENGTH`.
 
         Args:
-            first: First ends of the segments.
-            second: Second ends of the segments.
+            first: First ends of the segments, shape (n, 2), mm.
+            second: Second ends of the segments, shape (n, 2), mm.
 
         Returns:
-            Centres of the final segments.
+            Centres of the final segments, shape (m, 2), mm.
         """
-        points = [np.empty((0, 2))]
-        if len(first):
-            first_scaled = self.scaled(first)
-            second_scaled = self.scaled(second)
+        if not len(first):
+            return np.empty((0, 2))
+        points = []
+        first_scaled = self.scaled(first)
+        second_scaled = self.scaled(second)
         while len(first):
+            # Store the centres of short segments.
             middle = 0.5 * (first + second)
             x_length, y_length = (second - first).T
             is_short = np.hypot(x_length, y_length) <= SEGMENT_LENGTH
             points.append(middle[is_short])
 
+            # Find the half of each other segment in which the orientation is reversed.
             middle_scaled = self.scaled(middle)
             # The orientation may be reversed in neither half, because of rounding errors. Such a segment is dropped.
             in_first_half = has_reversed_orientation(first_scaled, middle_scaled)
@@ -247,7 +251,7 @@ class _FoldSearch:
 
         # The neighbours are the 3 x 3 positions on the same ring and on the rings beside it. The angles are periodic.
         smallest_of_neighbours = scipy.ndimage.minimum_filter(smallest, 3, mode=("nearest", "wrap"))
-        is_minimum = smallest == smallest_of_neighbours  # at least at the global minimum
+        is_minimum = smallest == smallest_of_neighbours  # includes the position itself, so equality means a minimum
 
         # The first step of a search is the distance between neighbouring positions.
         spacing_on_ring = rings.distance * 2.0 * np.pi / n_angle
@@ -301,6 +305,7 @@ class _FoldSearch:
             best_neighbour = neighbours.reshape(-1, len(COMPASS), 2)[active_rows, best_direction]
             best_value = neighbour_values[active_rows, best_direction]
 
+            # Move to this neighbour if its value is smaller, and halve the step otherwise.
             is_lower = best_value < value[active]
             moving = active[is_lower]
             position[moving] = best_neighbour[is_lower]

@@ -101,7 +101,10 @@ class ForceProfile:
             weighted = predicted / noise.variance(predicted)
             # The best factor is sum(w Q_predicted Q) / sum(w Q_predicted^2), with sums over the electrodes e.
             factor = np.einsum("ne,ne->n", weighted, charge) / np.einsum("ne,ne->n", weighted, predicted)
-            log_factor = np.clip(np.log(np.maximum(factor, 1e-300)), -MAX_LOG_CHANGE, MAX_LOG_CHANGE)
+            positive_factor = np.maximum(factor, 1e-300)  # charges with opposite signs lead to the smallest force
+            log_factor = np.clip(np.log(positive_factor), -MAX_LOG_CHANGE, MAX_LOG_CHANGE)
+
+            # Near a force F, the charges are proportional to F^exponent.
             exponent = np.interp(log_force, self.log_forces, self.exponent)
             log_force = np.clip(log_force + log_factor / exponent, *self.log_range)
         return np.asarray(log_force)

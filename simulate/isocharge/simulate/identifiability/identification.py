@@ -89,6 +89,8 @@ class LimitMap:
         """
         contact = rings.contacts(force)
         limits = limits_at(charge_map, contact, noise)
+
+        # The singular values are the inverse standard deviations in the best and in the worst direction.
         largest, smallest = singular_values(scaled_derivatives(charge_map, contact, noise)).T
         condition = largest / np.maximum(smallest, 1e-12 * largest)  # at most 1e12, at a fold
         return cls(
@@ -101,7 +103,9 @@ class LimitMap:
 
     def statistics(self) -> dict[str, float]:
         """Compute statistics of the errors. The weight of a position is the area that it represents."""
-        area = np.repeat(self.rings.distance, self.position.shape[1])
+        # A position represents a part of its ring, whose area is proportional to the distance from the centre.
+        n_angle = self.position.shape[1]
+        area = np.repeat(self.rings.distance, n_angle)
         position = self.position.ravel()
         force = 100.0 * self.relative_force.ravel()
         return {
@@ -354,6 +358,7 @@ def map_to_search(
             return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
         except SolveError:
             radius *= RADIUS_REDUCTION
+    # The last radius is outside the loop, because its error is not caught.
     return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
 
 

@@ -91,6 +91,8 @@ class MirrorRegion:
         grids = np.meshgrid(ring_distance, sector_angle, forces, indexing="ij")
         distance, angle, force = (grid.ravel() for grid in grids)
         contact = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), force])
+
+        # Whether a press in the working area has the same charges, and the share of the forces for which this is true
         is_mirrored = has_mirror(within(charges, radius), whole_film.charges(contact), noise)
         share_of_forces = is_mirrored.reshape(N_RINGS, N_SECTORS, FORCE_COUNT).mean(axis=2)
         return cls(radius, outer_radius, forces, share_of_forces)

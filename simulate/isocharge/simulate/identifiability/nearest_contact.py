@@ -90,7 +90,9 @@ def _descend(
     max_steps: int,
     min_change: float = MIN_CHANGE,
 ) -> tuple[Array, Array]:
-    """Run a least-squares descent from a start to the nearest local minimum.
+    """Minimise the distance |(Q - Q(c)) / sigma| of the charges of contacts c from given charges Q.
+
+    For each row of charges, a least-squares descent leads from the start to a local minimum.
 
     The unknowns are x, y and ln F in unit coordinates, in which the domain is the unit disk times [-1, 1].
 
@@ -131,7 +133,7 @@ def _descend(
         """
         predicted, slopes = linearised(charge_map, to_contact(unit_coordinates))
         sigma = sigma_of(rows, predicted)
-        derivatives = -slopes * half_width / sigma[..., None]
+        derivatives = -slopes * half_width / sigma[..., None]  # sigma counts as constant
         return (charge[rows] - predicted) / sigma, derivatives.swapaxes(1, 2)
 
     log_start = np.column_stack([start[:, :2], np.log(start[:, 2])])  # (x, y, ln F)

@@ -65,8 +65,11 @@ class SideForceLimits:
         # Derivatives of the charges with respect to x, y, ln F, Fx / F and Fy / F
         contact = Rings.spread(radius, RING_COUNT, ANGLE_COUNT).contacts(force)
         charge, contact_jacobian = linearised(charge_map, contact)
+        # d(Q) / d(Fx / F) = F d(Q) / d(Fx)
         relative_side_force_jacobian = force * side_force_map.jacobian(contact)
         jacobian = np.concatenate([contact_jacobian, relative_side_force_jacobian], axis=2)
+
+        # The last two parameters are those of the side force.
         limits = cramer_rao(charge, jacobian, noise)
         variance = np.diagonal(limits.covariance, axis1=1, axis2=2)  # shape (n, 5)
         *_, side_x_variance, side_y_variance = variance.T

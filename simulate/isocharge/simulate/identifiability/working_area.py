@@ -72,7 +72,8 @@ class WorkingArea:
         """Description of the working area and of what limits it, in a few sentences."""
         min_force, max_force = self.force_range
         sentences = [f"Working area: up to {self.radius:.3g} mm from the centre, {min_force:g} to {max_force:g} N."]
-        if self.error_radius < min(self.searched, self.fold_radius, self.pairs.radius):
+        is_limited_by_error = self.error_radius < min(self.searched, self.fold_radius, self.pairs.radius)
+        if is_limited_by_error:
             if self.unambiguous_radius > self.radius:
                 sentences.append(f"Up to {self.unambiguous_radius:.3g} mm, the charges determine the contact uniquely.")
             sentences.append(
@@ -157,7 +158,7 @@ def working_area(
 
 
 def _confirmed(charge_map: ChargeMap, radius: float, forces: list[float], noise: NoiseModel, error: float) -> float:
-    """Evaluate the position error again on finer rings within a radius, and reduce the radius if it exceeds its limit.
+    """Evaluate the position error on finer rings within a radius, and reduce the radius if the error exceeds its limit.
 
     Args:
         charge_map: Charges as a function of the contact.
@@ -177,7 +178,7 @@ def _confirmed(charge_map: ChargeMap, radius: float, forces: list[float], noise:
             break
         rings = Rings.spread(rounded_radius)
         confirmed_radius = min(_error_radius(charge_map, rings, force, noise, error) for force in forces)
-        is_confirmed = confirmed_radius >= rounded_radius * (1.0 - 1e-9)
+        is_confirmed = confirmed_radius >= rounded_radius * (1.0 - 1e-9)  # allows for rounding errors
         if is_confirmed:
             break
         radius = confirmed_radius
@@ -201,7 +202,8 @@ def _error_radius(charge_map: ChargeMap, rings: Rings, force: float, noise: Nois
     largest_error = position_error.max(axis=1)  # of each ring
     exceeding = np.flatnonzero(~(largest_error <= error))  # including NaN
     if not exceeding.size:
-        return float(rings.distance[-1])
+        outermost_distance = rings.distance[-1]
+        return float(outermost_distance)
     first_exceeding = int(exceeding[0])
     if first_exceeding == 0:
         return 0.0

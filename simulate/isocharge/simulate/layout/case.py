@@ -302,6 +302,7 @@ class DesignCase:
             lower_left_corners, upper_right_corners = electrode.boxes
             for low, high in zip(lower_left_corners, upper_right_corners, strict=True):
                 # Gaps along x and y, shape (n, 2). A gap is negative if square and box overlap along this axis.
+                # One of the gaps must be large enough, so the larger gap counts.
                 axis_gaps = np.maximum(low - positions, positions - high) - half_side
                 clearances.append(axis_gaps.max(axis=1) - self.gap)
         return np.asarray(np.min(clearances, axis=0))
@@ -316,6 +317,8 @@ class DesignCase:
         Returns:
             Excess distance, shape (n, m), mm; negative if the rule is violated.
         """
+        # The gap between two squares along an axis is the distance of their centres along this axis minus one side.
+        # The rule must be satisfied along x or along y, so the larger distance counts.
         distance = np.abs(positions[:, None] - others).max(axis=2)
         return np.asarray(distance - self.square_side - self.gap)
 

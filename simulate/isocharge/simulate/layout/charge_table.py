@@ -128,8 +128,10 @@ class ChargeTable:
         """
         # All presses have the mesh that the outermost press needs.
         film = sensor.film
-        settings = SolveSettings(theory=theory_for(sensor, probe, (force, force)), layer=layer_for(film, force))
-        settings = replace(settings, resolution=needed_resolution(film, probe, (radius, 0.0), force, settings))
+        basic_settings = SolveSettings(theory=theory_for(sensor, probe, (force, force)), layer=layer_for(film, force))
+        outermost_press = (radius, 0.0)
+        resolution = needed_resolution(film, probe, outermost_press, force, basic_settings)
+        settings = replace(basic_settings, resolution=resolution)
 
         # The distances are Chebyshev nodes in `distance_coordinate`, whose inverse is `tanh`.
         is_wide = radius > WIDE_RADIUS * film.radius
@@ -285,7 +287,7 @@ class _PressedFilm:
         points_in_press_frame = complex_points / direction[:, None]
         nodes, node_weights = self._nodes_around(press_index, points_in_press_frame, weights)
 
-        # Sum over the nodes around all points of each mean
+        # Each mean is a weighted sum over the nodes of the grid around all its points.
         flat_weights = node_weights.reshape(n_mean, 1, -1).astype(np.float32)
         node_density = self.density[nodes.reshape(n_mean, -1)]  # shape (k, n_point * n_row * n_column, 6)
         mean: Array = np.matmul(flat_weights, node_density)[:, 0].astype(float)
@@ -309,12 +311,16 @@ class _PressedFilm:
         Returns:
             Indices into `density`, and weights, each of shape (k, n_point, n_row, n_column).
         """
+        # Nearest rows of each point, shape (k, n_point, n_row), and columns, shape (k, n_point, n_column), with weights
         row, column = self._grid_coordinates(press_index, points)
         rows, row_weights = _row_weights(row)
         columns, column_weights = cubic_weights(column, ANGLES, periodic=True)
-        first_row = press_index[:, None, None, None] * (INNER_ROWS + OUTER_ROWS)  # of the grid of each press
-        nodes = (first_row + rows[..., None]) * ANGLES + columns[..., None, :]
-        node_weights = point_weights[:, None, None] * row_weights[..., None] * column_weights[..., None, :]
+
+        # Combine each row with each column. The grids of all presses follow each other in `density`, row by row.
+        rows_per_press = INNER_ROWS + OUTER_ROWS
+        first_row_of_press = press_index[:, None, None, None] * rows_per_press
+        nodes = (first_row_of_press + rows[..., :, None]) * ANGLES + columns[..., None, :]
+        node_weights = point_weights[:, None, None] * row_weights[..., :, None] * column_weights[..., None, :]
         return nodes, node_weights
 
     def _grid_coordinates(self, press_index: Integers, points: Complexes) -> tuple[Array, Array]:
@@ -329,11 +335,12 @@ class _PressedFilm:
         Returns:
             Fractional rows and columns, each of shape (k, n_point).
         """
+        # Coordinate z of the conformal map of the press, which maps the probe onto the disk |z| <= rho
         pole = self.pole[press_index, None]
         rho = self.rho[press_index, None]
-        unit_points = points / self.table.film_radius
-        unit_points = unit_points / np.maximum(np.abs(unit_points), 1.0)
-        z = (unit_points - pole) / (1.0 - pole * unit_points)  # conformal map of the press
+        relative_points = points / self.table.film_radius
+        unit_points = relative_points / np.maximum(np.abs(relative_points), 1.0)  # within the rim
+        z = (unit_points - pole) / (1.0 - pole * unit_points)
         radius = np.abs(z)
 
         # Rows are equally spaced in |z| within the circle, and in ln|z| outside; see `_grid_points`.
@@ -341,7 +348,8 @@ class _PressedFilm:
         outer_fraction = 1.0 - np.log(np.maximum(radius, rho)) / np.log(rho * (1.0 + MARGIN))
         outer_row = INNER_ROWS + outer_fraction * (OUTER_ROWS - 1)
         row = np.where(radius <= rho, inner_row, outer_row)
-        return row, np.angle(z) * ANGLES / (2.0 * np.pi)
+        column = np.angle(z) * ANGLES / (2.0 * np.pi)  # columns have equal angles
+        return row, column
 
 
 def _piezo_in_press_frame(piezo: tuple[float, float], direction: Complexes) -> Array:
@@ -423,9 +431,8 @@ def _stress_at(
         changed_press = press(changed_film, changed_probe, position, changed_force, settings, start=unchanged_press)
         return touch_stress(changed_press, points, surface)
 
-    def central_difference(quantity: str, step: float) -> Array:
-        """Return the derivative of the stress with respect to "x", "y", "log_force" or "radius"."""
-        change = f"{quantity}_change"
+    def central_difference(change: str, step: float) -> Array:
+        """Return the derivative of the stress with respect to a change, which is an argument of `changed_stress`."""
         return (changed_stress(**{change: step}) - changed_stress(**{change: -step})) / (2.0 * step)
 
     stress = touch_stress(unchanged_press, points, surface)
@@ -435,10 +442,10 @@ def _stress_at(
     return np.stack(
         [
             stress,
-            central_difference("x", length_step),
-            central_difference("y", length_step),
-            central_difference("log_force", LOG_FORCE_STEP),
-            central_difference("radius", length_step),
+            central_difference("x_change", length_step),
+            central_difference("y_change", length_step),
+            central_difference("log_force_change", LOG_FORCE_STEP),
+            central_difference("radius_change", length_step),
             pretension_derivative,
         ]
     )

@@ -124,10 +124,12 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
         InputError: If the electrodes do not fit.
         SolveError: If an equilibrium is not reached.
     """
+    # Improve random layouts, and refine the best ones.
     grid, initial_layouts = random_layouts(case)
     table = ChargeTable.solve(case.sensor, case.probe, case.force, case.radius, executor)
     search = Search(case, table)
     optima = search.optima(grid, initial_layouts)
+    # A refined layout is an array of its error, followed by the coordinates of its squares.
     refined_layouts = list(track(in_order(executor, search.refine, optima), "refining", len(optima)))
     refined_layouts.sort(key=lambda layout: layout[0])
 
@@ -144,9 +146,16 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
         if summary == UNAMBIGUOUS:
             break
 
-    # If the last candidate is unambiguous, it is chosen, and the others are refused. Otherwise the first one is chosen.
-    n_refused = len(candidates) - 1 if summary == UNAMBIGUOUS else 0
-    sensor, error, summary = candidates[n_refused]
+    # If the last candidate is unambiguous, it is chosen, and the candidates before it are refused. Otherwise all
+    # candidates are ambiguous, and the candidate with the smallest error is chosen, which is the first one.
+    has_unambiguous_candidate = summary == UNAMBIGUOUS
+    if has_unambiguous_candidate:
+        n_refused = len(candidates) - 1
+        chosen = candidates[-1]
+    else:
+        n_refused = 0
+        chosen = candidates[0]
+    sensor, error, summary = chosen
     errors_before = error_map(case, table, case.sensor) if len(case.sensor.electrodes) >= 3 else None
     errors_after = error_map(case, table, sensor)
     return Design(case, sensor, error, summary, n_refused, errors_before, errors_after)
@@ -210,6 +219,7 @@ def error_map(case: DesignCase, table: ChargeTable, sensor: Sensor) -> ErrorMap:
     Returns:
         Position errors for the noise alone, and for the noise and the nuisances, mm.
     """
+    # All electrodes are given by their shapes, so the table is evaluated without squares.
     no_squares = np.empty((0, 2))
     unused_side = 1.0
     charge_rows = table.rows(case.fine_grid, no_squares, unused_side, sensor.electrodes)

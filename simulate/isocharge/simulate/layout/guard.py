@@ -73,7 +73,9 @@ class PositionLimits:
         """
         rings = Rings.spread(case.radius, LIMIT_RINGS, LIMIT_ANGLES)
         limits = limits_at(charges, rings.contacts(case.force), case.noise).position
-        mean_square = np.average((rings.per_ring(limits) ** 2).mean(axis=1), weights=rings.distance)
+        # A ring represents an area that is proportional to its distance from the centre.
+        mean_square_of_rings = (rings.per_ring(limits) ** 2).mean(axis=1)
+        mean_square = np.average(mean_square_of_rings, weights=rings.distance)
         return cls(float(np.sqrt(mean_square)), float(limits.max()))
 
     def to_dict(self) -> dict[str, float]:
@@ -159,6 +161,8 @@ def design_guard(case: DesignCase, *, executor: Executor | None = None) -> Guard
         SceneError: If the working area reaches the clamp.
         SolveError: If an equilibrium is not reached.
     """
+    # Estimate the share of unnoticed presses for each position. All sensors have the same film, and therefore the same
+    # solutions of the film.
     sensors = [_with_guard(case, position) for position in _free_positions(case)]
     inner_map = ForwardMap.build(case.sensor, case.probe, case.radius, DEFAULT_FORCE_RANGE, executor=executor)
     outer_map = whole_film_map(case.sensor, case.probe, DEFAULT_FORCE_RANGE, executor=executor)
@@ -249,6 +253,7 @@ def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: Forwar
     if not is_mirrored.any():
         return np.zeros(len(sensors))
 
+    # Add the charge of each guard electrode, and search again for contacts that explain the charges of these presses.
     mirrored_presses = presses[is_mirrored]
     shares = []
     for sensor in track(sensors, "comparing positions"):

@@ -56,10 +56,13 @@ class ErrorModel:
         return cls(replace(noise, gain=gain), np.array(prior_std))
 
     def sensitivity(self, rows: Array) -> Array:
-        """Compute sqrt(W) A with the parameters in units of their prior standard deviations.
+        """Compute the derivatives of the charges in units in which the noise and the priors have the variance 1.
+
+        This is sqrt(information of a reading) * d(charge) / d(parameter) * prior standard deviation of the parameter.
+        The parameters are x, y, ln F, the probe radius and the pretension.
 
         Args:
-            rows: Rows of a charge table, shape (..., 6).
+            rows: Rows of a charge table: the charge and its derivatives, shape (..., 6).
 
         Returns:
             Sensitivities, dimensionless, shape (..., 5).
@@ -98,8 +101,10 @@ def position_variance(inverse: Array) -> Array:
 def with_one_more(sensitivity: Array, candidates: Array) -> Array:
     """Compute the squared position errors of a layout with one further electrode, for many candidates.
 
-    Each candidate changes the inverse information matrix by the formula of Sherman and Morrison; see the docstring of
-    this module.
+    Let B be the information matrix of the layout, and a the sensitivities of a candidate. According to Sherman and
+    Morrison (1950), the candidate changes the sum of the variances of x and y to
+
+        tr_xy (B + a a')^-1 = tr_xy B^-1 - |(B^-1 a)_xy|^2 / (1 + a' B^-1 a).
 
     Args:
         sensitivity: Sensitivities of the electrodes of the layout, shape (n_press, n_electrode, 5).
@@ -108,10 +113,10 @@ def with_one_more(sensitivity: Array, candidates: Array) -> Array:
     Returns:
         Squared position errors, shape (n_press, n_candidate), mm^2.
     """
-    # With the notation of the docstring of this module: `inverse` is B^-1, and each candidate is a vector a.
-    inverse = inverse_information(sensitivity)  # shape (n_press, 5, 5), in the order (x, y, ...)
-    inverse_times_candidate = inverse @ candidates  # shape (n_press, 5, n_candidate)
+    inverse = inverse_information(sensitivity)  # B^-1, shape (n_press, 5, 5), in the order (x, y, ...)
+    inverse_times_candidate = inverse @ candidates  # B^-1 a, shape (n_press, 5, n_candidate)
     squared_position_part = (inverse_times_candidate[:, :2] ** 2).sum(axis=1)  # |(B^-1 a)_xy|^2
     quadratic_form = (inverse_times_candidate * candidates).sum(axis=1)  # a' B^-1 a
     reduction = squared_position_part / (1.0 + quadratic_form)
+    # The matrices are in units of the prior standard deviations.
     return np.asarray(position_variance(inverse)[:, None] - POSITION_PRIOR_STD**2 * reduction)

@@ -11,14 +11,13 @@ the largest errors on a fine grid. The method is sequential quadratic programmin
 positions. The presses are selected again in each round.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import scipy  # loads each of its subpackages on first use
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import InputError
 from isocharge.common.progress import track
 from isocharge.simulate.layout.case import DesignCase
@@ -211,7 +210,7 @@ class Search:
         results = [exchange.improve(layout) for layout in track(layouts, "exchanging")]
         results.sort(key=lambda result: result[0])  # by the error
 
-        # Two layouts count as different if their errors differ.
+        # Two layouts count as different if their errors differ. Equal errors mostly belong to rotated layouts.
         finalists: list[Array] = []
         last_error = 0.0
         for error, indices in results:
@@ -295,10 +294,10 @@ class Search:
         Returns:
             Derivatives, shape (n_rule, 2 n_new), dimensionless.
         """
-        base = self.case.all_clearances(positions)
-        steps = DIFFERENCE_STEP * np.eye(positions.size).reshape(-1, *positions.shape)
-        moved = [self.case.all_clearances(positions + step) for step in steps]
-        return (np.stack(moved, axis=1) - base[:, None]) / DIFFERENCE_STEP
+        clearances = self.case.all_clearances(positions)
+        steps = DIFFERENCE_STEP * np.eye(positions.size).reshape(-1, *positions.shape)  # of one coordinate each
+        moved_clearances = [self.case.all_clearances(positions + step) for step in steps]
+        return (np.stack(moved_clearances, axis=1) - clearances[:, None]) / DIFFERENCE_STEP
 
     def refine(self, positions: Array) -> Array:
         """Improve a layout by small steps that satisfy the distance rules.
@@ -378,10 +377,11 @@ class Search:
             bound_column[: len(log_error_jacobian)] = 1.0
             return np.concatenate([coordinate_columns, bound_column], axis=1)
 
+        # The search starts with the largest error as the bound, so that all constraints of the errors are satisfied.
         start = np.append(positions, self._log_errors(positions, active).max())
         gradient = np.append(np.zeros(positions.size), 1.0)  # of the minimised quantity, which is the last variable
         coordinate_bounds = [(value - max_step, value + max_step) for value in positions.ravel().tolist()]
-        bounds = [*coordinate_bounds, (None, None)]
+        bounds = [*coordinate_bounds, (None, None)]  # the last variable is not limited
         solution = scipy.optimize.minimize(
             lambda variables: variables[-1],
             start,
@@ -399,13 +399,17 @@ class _Exchange:
     """Exchange of single squares on a grid of positions.
 
     Attributes:
-        mean_error: Function of the other squares of a layout, which are given as indices of positions. It returns the
-            mean of the errors to the given power, for a further square at each position of the grid, shape (n,). The
-            mean is infinite if the further square violates a distance rule.
+        kept_sensitivity: Sensitivities of the kept electrodes (`ErrorModel.sensitivity`), shape (n_press, n_kept, 5).
+        candidates: Sensitivities of a square at each position of the grid, shape (n_press, 5, n).
+        is_allowed_pair: Whether two squares at a pair of positions satisfy the distance rules, shape (n, n).
+        weights: Weight of each press in the mean of the errors, shape (n_press,), dimensionless.
         power: Power of the errors in the mean, dimensionless.
     """
 
-    mean_error: Callable[[Integers], Array]
+    kept_sensitivity: Array
+    candidates: Array
+    is_allowed_pair: Booleans
+    weights: Array
     power: float
 
     @classmethod
@@ -420,29 +424,33 @@ class _Exchange:
         presses = case.search_presses
         no_squares = grid[:0]
         kept_rows = search.table.rows(presses, no_squares, case.square_side, case.kept_electrodes)
-        kept_sensitivity = search.model.sensitivity(kept_rows)  # shape (n_press, n_kept, 5)
-        square_sensitivity = search.model.sensitivity(search.table.rows(presses, grid, case.square_side))
-        candidates = np.ascontiguousarray(square_sensitivity.swapaxes(1, 2))  # shape (n_press, 5, n)
-        is_allowed_pair = case.pair_clearance(grid, grid) >= 0.0  # shape (n, n)
-        weights = case.weights(presses)
-        power = WORST_POWER if case.goal == "worst" else RMS_POWER
+        square_rows = search.table.rows(presses, grid, case.square_side)
+        square_sensitivity = search.model.sensitivity(square_rows)  # shape (n_press, n, 5)
+        return cls(
+            kept_sensitivity=search.model.sensitivity(kept_rows),
+            candidates=np.ascontiguousarray(square_sensitivity.swapaxes(1, 2)),
+            is_allowed_pair=case.pair_clearance(grid, grid) >= 0.0,
+            weights=case.weights(presses),
+            power=WORST_POWER if case.goal == "worst" else RMS_POWER,
+        )
 
-        def mean_error(other_squares: Integers) -> Array:
-            """Return the mean of the errors to the given power for each position of a further square; see `_Exchange`.
+    def mean_error(self, other_squares: Integers) -> Array:
+        """Compute the mean of the errors to the given power for a further square at each position of the grid.
 
-            Args:
-                other_squares: Indices of the positions of the other new squares of the layout.
-            """
-            others_sensitivity = candidates[:, :, other_squares].swapaxes(1, 2)
-            layout_sensitivity = np.concatenate([kept_sensitivity, others_sensitivity], axis=1)
-            # Rounding can make the small difference in `with_one_more` negative.
-            squared_error = np.maximum(with_one_more(layout_sensitivity, candidates), 1e-12)  # shape (n_press, n)
-            mean = np.average(squared_error ** (0.5 * power), axis=0, weights=weights)
-            is_allowed = is_allowed_pair[other_squares].all(axis=0)
-            mean[~is_allowed] = np.inf
-            return np.asarray(mean)
+        Args:
+            other_squares: Indices of the positions of the other new squares of the layout.
 
-        return cls(mean_error, power)
+        Returns:
+            Means, shape (n,). A mean is infinite if the further square violates a distance rule.
+        """
+        others_sensitivity = self.candidates[:, :, other_squares].swapaxes(1, 2)
+        layout_sensitivity = np.concatenate([self.kept_sensitivity, others_sensitivity], axis=1)
+        # Rounding can make the small difference in `with_one_more` negative.
+        squared_error = np.maximum(with_one_more(layout_sensitivity, self.candidates), 1e-12)  # shape (n_press, n)
+        mean = np.average(squared_error ** (0.5 * self.power), axis=0, weights=self.weights)
+        is_allowed = self.is_allowed_pair[other_squares].all(axis=0)
+        mean[~is_allowed] = np.inf
+        return np.asarray(mean)
 
     def improve(self, layout: Integers) -> tuple[float, Integers]:
         """Exchange squares until no exchange of a single square improves the layout.

@@ -132,7 +132,7 @@ class Amplifier:
         offset = self.offset * rng.standard_normal(electrodes)
         phase = rng.uniform(0.0, 2.0 * np.pi, electrodes)
         pyro = np.full(electrodes, self.pyro)
-        if self.pyro_mismatch:
+        if self.pyro_mismatch:  # without this mismatch, no random numbers are drawn
             pyro = self.pyro * (1.0 + self.pyro_mismatch * rng.standard_normal(electrodes))
         return Measurement(self, rate, rng, tau, gain, bias, offset, phase, pyro)
 
@@ -183,6 +183,7 @@ class Measurement:
         self._air_temperature = common / correlation
         self._film_temperature = correlation * common + math.sqrt(1.0 - variance_ratio) * independent
 
+        # There is no touch before the measurement, so the film has only its pyroelectric charge.
         self._film_charge = self.pyro * self._film_temperature
         self._touch_charge = np.zeros_like(self.gain)
         self._relaxation = np.zeros((CREEP_TIMES.size + 1, 1, self.gain.size))
@@ -190,7 +191,7 @@ class Measurement:
         has_leak = math.isfinite(amplifier.tau)
         if has_leak:
             # In the stationary state, output = decay * output + bias / rate for each channel.
-            decay = np.exp(-1.0 / (self.rate * self.tau))
+            decay = np.exp(-1.0 / (self.rate * self.tau))  # of the output between two readings
             self._output = self.bias / (1.0 - decay) / self.rate
 
     def __call__(self, charge: Array, charge_per_K: Array | None = None) -> Array:
@@ -209,6 +210,8 @@ class Measurement:
         """
         time = (self._readings + np.arange(len(charge))) / self.rate
         self._readings += len(charge)
+
+        # Charge of the film, output of the amplifiers, and disturbances of the output
         temperature = self._temperature(time)[:, np.newaxis]  # relative to the mean, shape (n, 1), K
         if charge_per_K is not None:
             charge = charge + charge_per_K * temperature
@@ -241,7 +244,7 @@ class Measurement:
         time_constants = np.append(CREEP_TIMES, amplifier.film_time)
         creep_amplitudes = np.full(CREEP_TIMES.size, 0.5 * amplifier.creep)  # two terms per decade
         amplitudes = np.append(creep_amplitudes, amplifier.thermoelastic)
-        # With this factor, the charge with creep is equal to the touch charge one second after the touch.
+        # With this factor, the creep changes nothing one second after a touch.
         factor = 1.0 - 0.5 * amplifier.creep * np.exp(-1.0 / CREEP_TIMES).sum()
         relaxed: Array = factor * charge
         for index, (time_constant, amplitude) in enumerate(zip(time_constants, amplitudes, strict=True)):

@@ -106,11 +106,14 @@ def load_amplifier(level: str) -> Amplifier:
         raise InputError(f"noise level: expected one of {', '.join(AMPLIFIER_LEVELS)}, or a TOML file, got {level!r}")
     file = read_toml(Path(level), "the description of noise", InputError, AmplifierFile)
     changes: dict[str, Any] = {name: value for name, value in structs.asdict(file).items() if value is not None}
-    base = AMPLIFIER_LEVELS[changes.pop("like")]
-    white = changes.pop("white_pC", base.noise.white)
-    gain = changes.pop("proportional", base.noise.gain)
+
+    # The keys of the noise are removed from the changes, so that the remaining keys are attributes of the amplifier.
+    similar_amplifier = AMPLIFIER_LEVELS[changes.pop("like")]
+    white = changes.pop("white_pC", similar_amplifier.noise.white)
+    gain = changes.pop("proportional", similar_amplifier.noise.gain)
+    name = Path(level).stem
     with error_prefix(f"{level}: ", InputError):
-        return replace(base, noise=NoiseModel(Path(level).stem, white, gain), **changes)
+        return replace(similar_amplifier, noise=NoiseModel(name, white, gain), **changes)
 
 
 def noise_model(level: str) -> NoiseModel:

@@ -41,13 +41,15 @@ class BackPressure:
     def energy(self, deflection: Array) -> float:
         """Compute the energy of the pressures on the meshed part of the film for a deflection W, shape (n_node,).
 
-        The result is the energy of the trapped air minus the work of the static pressure. The energy is infinite if the
-        film displaces the whole volume of the air.
+        The result is the energy of the trapped air minus the work of the static pressure, divided by the number of
+        copies of the mesh that cover the film. The energy is infinite if the film displaces the whole volume of the
+        air.
         """
         volume = self._volume(deflection)
         static_work = self.groups.static_pressure * volume
         if self.groups.compression == 0.0:
             return -static_work / self._copies
+        # `_air_energy` is relative to p0 V0. In scaled units, V0 is 1 / compression.
         air_energy = self.groups.ambient_pressure / self.groups.compression * self._air_energy(deflection)
         return (air_energy - static_work) / self._copies
 
@@ -59,7 +61,8 @@ class BackPressure:
         Args:
             deflection: W at the nodes, shape (n_node,).
         """
-        # At constant temperature, the pressure of the air increases by p0 x / (1 - x) with x = V / V0.
+        # At constant temperature, the pressure p0 of the air increases by p0 x / (1 - x), where x = V / V0 is the
+        # displaced share of its volume.
         compression = self.groups.compression * self._volume(deflection)
         if compression >= 1.0:
             return np.full_like(deflection, np.inf)

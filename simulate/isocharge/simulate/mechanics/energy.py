@@ -100,7 +100,8 @@ class ElasticFilm:
             element_forces[..., 2] += self.bending.forces(deflection)
         residual = np.stack([self.geometry.gather(element_forces[..., i]) for i in range(3)], axis=1)
 
-        # Forces of the probe along W, of the pressure on the whole film, and of the probe in the plane
+        # Subtract the external forces: of the probe along W, of the pressure on the whole film, and of the probe in the
+        # plane. `back.forces` is a derivative of the energy, so it already has the opposite sign.
         residual[:, 2] -= self.groups.load * self.geometry.load
         if self.back is not None:
             residual[:, 2] += self.back.forces(deflection)
@@ -170,9 +171,8 @@ class Membrane:
         """
         self.geometry = geometry
         self.groups = groups
-        self._scale = np.array(
-            [groups.squared_amplitude, groups.squared_amplitude, 1.0]
-        )  # weights of the squares of U1, U2 and W
+        # Weights of the squares of the slopes of U1, U2 and W in the strain
+        self._scale = np.array([groups.squared_amplitude, groups.squared_amplitude, 1.0])
 
     @property
     def _deviator(self) -> Array | None:
@@ -221,7 +221,9 @@ class Membrane:
         return stretch
 
     def energy(self, field: Array) -> float:
-        """Compute the stretching energy of a field; see the docstring of this class.
+        """Compute the stretching energy of a field: integral( E' : C : E' / 2 + tau (tr E' - div U) ).
+
+        Here E' is the scaled strain, C the elasticity matrix, and tau the scaled pretension.
 
         Args:
             field: Scaled displacements (U1, U2, W), shape (n_node, 3).
@@ -233,10 +235,12 @@ class Membrane:
         elastic_strain = strain(slope, self.groups.squared_amplitude)
         energy_density = 0.5 * np.sum(elastic_strain * self._stress(elastic_strain), axis=-1)
 
-        # Without div U, the term of the pretension is quadratic in the slopes.
+        # tr E' - div U is half of the weighted sum of the squared slopes. If the pretension is not uniform in all
+        # directions, its deviator adds a similar term.
         energy_density += 0.5 * self.groups.tension * np.sum(slope**2 @ self._scale, axis=-1)
         if self._deviator is not None:
-            energy_density += 0.5 * np.sum(slope * (self._deviator @ slope) @ self._scale, axis=-1)
+            deviator_products = slope * (self._deviator @ slope)
+            energy_density += 0.5 * np.sum(deviator_products @ self._scale, axis=-1)
         return float(np.sum(energy_density * self.geometry.weights))
 
     def forces(self, field: Array) -> Array:
@@ -278,7 +282,8 @@ class Membrane:
         slope = self._slope(field)
         stretch = self._stretch(slope)
 
-        # Total stress (S11, S22, S12) with the pretension, times the integration weights
+        # Total stress (S11, S22, S12): the elastic stress, the mean pretension, and the deviator of the pretension.
+        # It is multiplied by the integration weights.
         total_stress = self._stress(strain(slope, self.groups.squared_amplitude))
         total_stress[..., :2] += self.groups.tension
         if self.groups.anisotropy is not None:
@@ -297,7 +302,7 @@ class Membrane:
             matrix[:, i, :, j] = transposed_gradient @ (block @ gradient).reshape(n_element, -1, n_local)
             if i != j:
                 matrix[:, j, :, i] = matrix[:, i, :, j].transpose(0, 2, 1)
-        return matrix.transpose(0, 2, 1, 4, 3)
+        return matrix.transpose(0, 2, 1, 4, 3)  # the node before the component
 
     def _moduli(self, stretch: Array, i: int, j: int) -> Array:
         """Compute the material part of d(traction_ia)/d(slope_jb) for a pair of displacement components.
@@ -382,7 +387,9 @@ class Bending:
         self._factor: SuperLU | None = None
 
     def laplacian(self, deflection: Array) -> Array:
-        """Compute the Laplacian -M^-1 L W of the deflection W; see the docstring of this class.
+        """Compute the Laplacian -M^-1 L W of the deflection W, where L W is the integral( dot(grad W, grad phi) ).
+
+        The mass matrix M contains the integrals of products of basis functions phi, lumped on the nodes.
 
         Args:
             deflection: W at the nodes, shape (n_node,).
@@ -421,7 +428,13 @@ class Bending:
         return np.asarray(-self.stiffness * (self._laplace @ laplacian[..., None])[..., 0])
 
     def extend(self, tangent: Array) -> Array:
-        """Add bending to the element matrices of the membrane; see the matrix in the docstring of this class.
+        """Add bending to the element matrices K of the membrane.
+
+        With the bending stiffness beta, the matrix L of the weak Laplacian, the diagonal mass matrix M and the shift s,
+        the equations for W and for the auxiliary unknown mu are
+
+            [ K + beta (2 s L - s^2 M)    sqrt(beta) (L - s M)^T ] [W ]   [r]
+            [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0].
 
         Args:
             tangent: Matrices for (U1, U2, W), shape (n_element, n_local, 3, n_local, 3).

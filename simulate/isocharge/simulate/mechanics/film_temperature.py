@@ -60,7 +60,7 @@ def warmed(sensor: Sensor, film_K: float, ring_K: float = 0.0) -> Sensor:
         return sensor
     change_11, change_22, change_12 = tension_change(film, film_K, ring_K).tolist()
     pretension = film.pretension + 0.5 * (change_11 + change_22)  # mean along x and y
-    if film.expands_evenly:
+    if film.expands_evenly:  # only the mean of the tension changes
         return replace(sensor, film=replace(film, pretension=pretension))
 
     # The deviator of the tension consists of half of its difference along x and y, and of its shear.

@@ -168,7 +168,8 @@ class DimensionlessGroups:
         H^3 = (0.662)^3 p for a membrane without pretension (Hencky 1915), H = p / (4 tension) for a large pretension,
         and H = p / (64 bending) for a plate.
         """
-        # Coefficients of the equation cubic H^3 + linear H = p. The trapped air also resists the deflection.
+        # Coefficients of the equation cubic H^3 + linear H = p. The trapped air also resists the deflection. The volume
+        # under a paraboloid of the height H and the radius 1 is pi H / 2.
         air_stiffness = 0.5 * np.pi * self.ambient_pressure * self.compression
         linear = 4.0 * max(self.tension, 0.0) + 64.0 * self.bending + air_stiffness
         cubic = 1.0 / 0.662**3
@@ -239,8 +240,10 @@ def orthotropic_moduli(film: Film) -> Array:
     difference_22 = plane_modulus * (1.0 / r - 1.0)
 
     # Without a given shear modulus, the shear modulus is that of an isotropic film.
-    isotropic_shear = 0.5 / (1.0 + film.poisson)
-    difference_12 = 0.0 if film.shear is None else film.shear / film.young - isotropic_shear
+    difference_12 = 0.0
+    if film.shear is not None:
+        isotropic_shear = 0.5 / (1.0 + film.poisson)
+        difference_12 = film.shear / film.young - isotropic_shear
     return np.diag([difference_11, difference_22, difference_12])
 
 

@@ -111,7 +111,7 @@ def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
     slope = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young))
     pretension_strain = film.pretension / film.young
     total_strain = pretension_strain + 0.5 * slope**2
-    # Squared ratio of the bending length sqrt(D / (h S)) to the reach of the footprint
+    # Squared ratio of the bending length sqrt(D / (h S)) to the reach of the footprint; D is the bending stiffness.
     squared_length_ratio = slenderness(film) / total_strain * (film.radius / probe.reach) ** 2
     pretension_share = pretension_strain / total_strain
     return PROBE_WEIGHT * float(squared_length_ratio * pretension_share)
@@ -182,7 +182,7 @@ def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Th
     full = Theory(stretching=True, bending=True, pretensioned=is_tense)
     if film.pretension < 0.0 or not film.is_axisymmetric:  # the error estimates hold for axisymmetric films only
         return full
-    cheapest_first = (
+    cheapest_first = (  # a linear theory costs less than a nonlinear theory without bending
         Theory(stretching=False, bending=False, pretensioned=is_tense),
         Theory(stretching=False, bending=True, pretensioned=is_tense),
         Theory(stretching=True, bending=False, pretensioned=is_tense),
@@ -191,7 +191,7 @@ def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Th
         omits_back_pressure = film.has_back_pressure and not theory.stretching  # as do all linear theories
         if omits_back_pressure:
             continue
-        if modelling_error(film, probe, force, theory) <= 0.5 * accuracy:
+        if modelling_error(film, probe, force, theory) <= 0.5 * accuracy:  # the other half is for the mesh
             return theory
     return full
 
@@ -232,7 +232,7 @@ def theory_by_name(name: str, film: Film) -> Theory:
         short_name = theory.name.removeprefix("pre-tensioned ")
         if name not in (theory.name, short_name):
             continue
-        if theory.name == "linear membrane":
+        if theory.name == "linear membrane":  # without the prefix, so the film has no pretension
             raise SceneError(
                 "theory 'linear membrane': a film without pretension has no stiffness in it; set a pretension"
             )

@@ -175,6 +175,9 @@ class Blocks:
             for t_index in range(self.split)
         ]
         zero = np.zeros(self.n_corner + 1)
+
+        # The first layer has a straight inner side on the core polygon. Its outer side may be curved. A second layer
+        # has two curved sides.
         first_layer = [[first, second, zero, zero] for first, second in pairwise(self.boundary)]
         n_second_layer = self.n_sector * (self.n_layer - 1)
         second_layer = [[zero, zero, zero, zero] for _ in range(n_second_layer)]
@@ -225,6 +228,7 @@ class Blocks:
         sector_shift = 2 * self.split * corner_shift
         quads = np.arange(self.n_quad).reshape(self.n_meshed, -1)
         sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)
+        # Element i is replaced by the element that follows it by the shift, anticlockwise.
         rotated_quads = np.roll(quads, -corner_shift, axis=0)
         rotated_sectors = np.roll(sectors, -sector_shift, axis=1)
         return np.concatenate([rotated_quads.ravel(), rotated_sectors.ravel()])

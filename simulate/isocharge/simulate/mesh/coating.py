@@ -138,7 +138,15 @@ class Coating:
         return normal_x, normal_y
 
     def _laminate(self, points: Complexes) -> "_Laminate":
-        """Compute the laminate of bare and coated film at each point, with the formulas of the module's docstring.
+        """Compute the laminate of bare and coated film at each point.
+
+        Phase i is the film with i layers of the coat. It has the volume share f_i and the elasticity matrix C_i. The
+        strain of a phase is E + N a_i, where E is the mean strain and N a_i is a jump across the edge with the matrix N
+        of `_normal_matrix`. The traction T E across the edge is the same in all phases:
+
+            N^T C_i (E + N a_i) = T E,   M_i = N^T C_i N,   sum f_i a_i = 0,
+
+        so that a_i = M_i^-1 (T - N^T C_i) E and T = (sum f_i M_i^-1)^-1 sum f_i M_i^-1 N^T C_i.
 
         Args:
             points: Film points x + iy, any shape, in film radii.

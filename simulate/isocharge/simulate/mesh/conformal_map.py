@@ -223,8 +223,6 @@ def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
 def stretch_angles(angle: Array, factor: Array) -> Array:
     """Multiply the tangent of half of each angle by a factor.
 
-    The conformal map changes the angles on a circle in this way.
-
     The conformal map changes the angles on the circle |z| = rho with the factor (1 - c rho) / (1 + c rho). For the rim,
     rho is 1.
 
@@ -242,8 +240,8 @@ def stretch_angles(angle: Array, factor: Array) -> Array:
 def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
     """Compute the depths of the edges of the rings: 0 on the innermost circle, 1 on the rim.
 
-    The rings have equal depths, except for the thin rings at the rim. Each thin ring is a third as wide as the previous
-    thin ring.
+    The depth of a point is ln(r / rho) / ln(1 / rho), where r is its radius in the template plane. The rings have equal
+    depths, except for the thin rings at the rim. Each thin ring is a third as wide as the previous thin ring.
 
     Args:
         resolution: Fineness of the mesh.
@@ -257,8 +255,10 @@ def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
     if resolution.rim == 0:
         return np.broadcast_to(even_edges, (*rho.shape, even_edges.size))
 
-    # A step of ln |z| in the template plane is a step of the depth times ln(rho).
-    thin_depth = np.minimum(-layer / np.log(rho), _max_thin_depth(resolution))[..., None]  # of all thin rings together
+    # The width of the thin rings is about a step of ln r, because r is about 1 there. Divided by ln(1 / rho), it is a
+    # step of the depth.
+    depth_of_layer = -layer / np.log(rho)
+    thin_depth = np.minimum(depth_of_layer, _max_thin_depth(resolution))[..., None]  # of all thin rings together
     edges_of_even_rings = even_edges * (1.0 - thin_depth)
     edges_of_thin_rings = 1.0 - thin_depth * 3.0 ** -np.arange(1.0, resolution.rim + 1)
     edges_of_thin_rings[..., -1] = 1.0  # the last ring extends to the rim

@@ -76,14 +76,15 @@ class Geometry:
         Returns:
             The integration rules.
         """
-        # Weights of the integration points and of the nodes
+        # Weights of the Gauss points and of the nodes: reference weights times the determinant of the Jacobian
         rule = _quadrature(template.resolution.order)
         gradient, determinant = _film_gradient(rule.derivatives[:, None], points)
         weights = determinant * rule.weights
         node_jacobian = _jacobian(rule.node_derivatives[:, None], points)
         mass = node_jacobian.determinant * rule.node_weights
 
-        # Forces of the pressure at the nodes of the footprint, relative to the force on the whole film
+        # Forces of the pressure at the nodes of the footprint, relative to the force on the whole film. The mesh covers
+        # only one of several equal copies of the film, so its forces sum to 1 / copies.
         footprint = template.footprint
         if pressure is None:
             footprint_weights = weights[footprint]  # shape (n_footprint_element, n_point)
@@ -304,7 +305,9 @@ def from_oval(points: Complexes, oval: complex) -> Complexes:
     for _ in range(INVERSE_STEPS):
         relative_displacement = _relative_displacement(radius)
         residual = radius * (1.0 + relative_displacement * rim_displacement) - oval_radius
-        slope = 1.0 + 7.0 * rim_displacement * relative_displacement  # exact at the rim, approximate elsewhere
+        # With the cubic relative displacement d(r), the derivative of r d(r) is d + r d' = 7 d at the rim. The same
+        # ratio is used for all radii, which is sufficient for the convergence.
+        slope = 1.0 + 7.0 * rim_displacement * relative_displacement
         radius = radius - residual / slope
     return np.asarray(points * (radius / oval_radius))
 
@@ -373,8 +376,9 @@ def _quadrature(order: int) -> _Quadrature:
     nodes = lobatto_nodes(order)
     node_xi, node_eta = np.meshgrid(nodes, nodes)
     _, node_derivatives = tensor_basis(order, node_xi.ravel(), node_eta.ravel())
-    node_weight = lobatto_quadrature(order)
-    return _Quadrature(values, derivatives, weights, node_derivatives, np.outer(node_weight, node_weight).ravel())
+    line_weights = lobatto_quadrature(order)
+    node_weights = np.outer(line_weights, line_weights).ravel()
+    return _Quadrature(values, derivatives, weights, node_derivatives, node_weights)
 
 
 def _film_gradient(derivatives: Array, points: np.ndarray) -> tuple[Array, Array]:

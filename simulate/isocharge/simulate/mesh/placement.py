@@ -87,7 +87,8 @@ class Placement:
             layer: Width of the thin rings at the rim, in film radii.
             rotation: Further rotation of the footprint, a number or of the shape of `distance`, rad.
         """
-        # Corners of the core polygon, followed by the centroid, which is real because the press lies on the x axis
+        # Corners of the core polygon on the film, followed by the centroid of the footprint. The centroid is a real
+        # number, because the press lies on the x axis.
         centroid = np.asarray(distance, dtype=float) / film_radius
         if probe.is_axisymmetric:
             rotation = 0.0
@@ -95,8 +96,9 @@ class Placement:
         core = centroid[..., None] + probe.core(film_radius) * rotation_factor[..., None]
         corners = np.concatenate([core, centroid[..., None]], axis=-1)
 
-        # `stops` are the corners of the footprint and the points half-way between them. The innermost circle is the
-        # footprint itself, or encloses it. `reach` is the largest distance of the inner blocks from its centre.
+        # The innermost circle is the footprint itself, or encloses it. `reach` is the largest distance of the blocks
+        # inside the circle from its centre. `stops` are the corners of the footprint and the points half-way between
+        # them, at which the sectors around the footprint begin.
         stops: Complexes = np.asarray(corners @ blocks.boundary[:: blocks.split].T)
         if probe.topology.fills_circle:
             centre = centroid
@@ -110,7 +112,7 @@ class Placement:
                 boundary = probe.boundary(blocks.boundary_parameter[:: blocks.split])
                 stops = np.asarray(centroid[..., None] + boundary / film_radius * rotation_factor[..., None])
 
-        # Conformal map of the innermost circle, and the angles and depths of the elements around it
+        # Compute the conformal map of the innermost circle, and the angles and depths of the elements around it.
         c, rho = automorphism_onto(centre, radius)
         circle_angles = sector_angles(blocks, stops, reach, centroid, centre, radius, c * rho)
         template_layer = layer * (1.0 + c) / (1.0 - c)  # width of the thin rings in the template plane

@@ -245,14 +245,14 @@ def _correct_sectors(
         radial: Coordinates from the inner to the outer side, shape (n,); changed in place.
         angular: Coordinates along the sector, shape (n,); changed in place.
     """
-    first_element = element.copy()
+    first_element = element.copy()  # because `element` changes in the loop
     for shift in range(1, blocks.n_sector // 2 + 1):
         is_outside = _overshoot(radial, angular) > SECTOR_TOLERANCE
         rows = np.flatnonzero(is_outside & (first_element >= blocks.n_quad))
         if rows.size == 0:
             return
 
-        # Sector of each of these points in its layer
+        # Sector in its layer for each point that is outside of its element. Quadrilaterals have no sectors.
         row_corners = QuadCorners(*(corner[rows] for corner in corners))
         in_last_layer = first_element[rows] >= blocks.last_layer.start
         layer_start = np.where(in_last_layer, blocks.last_layer.start, blocks.n_quad)
@@ -348,6 +348,7 @@ def _sides(placement: Placement, blocks: Blocks, element: Integers, corners: Qua
     Returns:
         Points of both sides and their derivatives with respect to the angular coordinate, each of shape (n,).
     """
+    # The elements are ordered from the inside out: quadrilaterals of the core polygon, then the layers of sectors.
     in_sector = element >= blocks.n_quad
     in_last_layer = element >= blocks.last_layer.start
     sector = np.where(in_sector, (element - blocks.n_quad) % blocks.n_sector, 0)

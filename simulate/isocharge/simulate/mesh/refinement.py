@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from isocharge.common.arrays import Array, Complexes, Integers
+from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.mesh.coating import Coating
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.mesh.template import Template, sample_points
@@ -200,14 +200,18 @@ class RefinedTemplate(Template):
         hanging = np.array(list(sources), dtype=np.intp)
         regular = np.setdiff1d(np.arange(self.n_node), hanging)
 
-        # A regular node has the weight 1 in its own row. A hanging node has order + 1 weights in its row.
+        # A regular node has the weight 1 in its own row. A hanging node has order + 1 weights in its row, one for each
+        # node on the side of the larger element.
+        source_nodes = [side_nodes for side_nodes, _ in sources.values()]
+        source_weights = [weights for _, weights in sources.values()]
         row = np.concatenate([regular, np.repeat(hanging, order + 1)])
-        column = np.concatenate([regular, *(side_nodes for side_nodes, _ in sources.values())])
-        weight = np.concatenate([np.ones(regular.size), *(weights for _, weights in sources.values())])
+        column = np.concatenate([regular, *source_nodes])
+        weight = np.concatenate([np.ones(regular.size), *source_weights])
         single_step = csr_array((weight, (row, column)), shape=(self.n_node, self.n_node))
 
+        # A hanging node may depend on another hanging node. Substitute until only regular nodes remain.
         constraint = single_step
-        while np.isin(constraint.indices, hanging).any():  # a hanging node may depend on another hanging node
+        while np.isin(constraint.indices, hanging).any():
             constraint = single_step @ constraint
             constraint.eliminate_zeros()
         return constraint
@@ -310,17 +314,36 @@ def refine(mesh: PlacedMesh, lines: Complexes, finest: float) -> PlacedMesh:
         if not is_split.any():
             break
 
-        # Halve along xi (axis 0) first, then along eta. The second halves are appended, and may be halved again.
-        for axis in (0, 1):
-            halved = is_split[:, axis]
-            size[halved, axis] *= 0.5
-            second_low = low[halved].copy()
-            second_low[:, axis] += size[halved, axis]
-            parent = np.concatenate([parent, parent[halved]])
-            low = np.concatenate([low, second_low])
-            size = np.concatenate([size, size[halved]])
-            is_split = np.concatenate([is_split, is_split[halved]])
+        # Halve along xi first, then along eta. The second halves of the first step may be halved again.
+        parent, low, size = _halve(parent, low, size, is_split[:, 0], axis=0)
+        is_split_along_eta = np.concatenate([is_split[:, 1], is_split[is_split[:, 0], 1]])
+        parent, low, size = _halve(parent, low, size, is_split_along_eta, axis=1)
     return replace(mesh, template=RefinedTemplate(base, parent, low, size))
+
+
+def _halve(parent: Integers, low: Array, size: Array, is_halved: Booleans, axis: int) -> tuple[Integers, Array, Array]:
+    """Halve some elements along one local coordinate. The first half replaces the element, the second is appended.
+
+    Args:
+        parent: Index of the original element of each element, shape (n_element,).
+        low: Local coordinates of the lower corner of each element in its original element, shape (n_element, 2).
+        size: Extents of each element in these local coordinates, shape (n_element, 2).
+        is_halved: Whether each element is halved, shape (n_element,).
+        axis: Local coordinate that is halved, 0 for xi and 1 for eta.
+
+    Returns:
+        The arrays `parent`, `low` and `size` of the new elements.
+    """
+    new_size = size.copy()
+    new_size[is_halved, axis] *= 0.5
+    size_of_half = new_size[is_halved]
+    low_of_second_half = low[is_halved]
+    low_of_second_half[:, axis] += size_of_half[:, axis]
+    return (
+        np.concatenate([parent, parent[is_halved]]),
+        np.concatenate([low, low_of_second_half]),
+        np.concatenate([new_size, size_of_half]),
+    )
 
 
 def _corners_and_middle(mesh: PlacedMesh, parent: Integers, low: Array, size: Array) -> tuple[Complexes, Complexes]:

@@ -82,7 +82,8 @@ def chebyshev_nodes(count: int, low: float, high: float) -> Array:
 def barycentric_weights(nodes: Array) -> Array:
     """Compute the barycentric weights of distinct nodes.
 
-    The differences of the nodes are scaled with the length of the interval, so that their products do not overflow.
+    The weight of a node is the reciprocal of the product of its differences from all other nodes. The differences are
+    scaled to an interval of the length 4, on which the products neither overflow nor underflow for many nodes.
 
     Args:
         nodes: Interpolation nodes, shape (n,).
@@ -92,7 +93,7 @@ def barycentric_weights(nodes: Array) -> Array:
     """
     scale = 4.0 / np.ptp(nodes) if nodes.size > 1 else 1.0
     difference = (nodes[:, None] - nodes[None, :]) * scale
-    np.fill_diagonal(difference, 1.0)
+    np.fill_diagonal(difference, 1.0)  # the difference of a node from itself does not count
     return np.asarray(1.0 / difference.prod(axis=1))
 
 
@@ -217,11 +218,13 @@ def cubic_weights(points: Array, count: int, periodic: bool = False) -> tuple[In
     Returns:
         Indices of the four nodes, and their weights, each of shape (..., 4).
     """
+    # The point lies between the second and the third of the four nodes, except near the ends of the grid.
     first_node = np.floor(points).astype(np.intp) - 1
     if not periodic:
         first_node = np.clip(first_node, 0, count - 4)
 
-    # Signed distances of the point from the four nodes
+    # Signed distances of the point from the four nodes. The weight of a node is the product of the distances from the
+    # other three nodes, divided by its value at the node itself.
     from_0 = (points - first_node)[..., None]
     from_1 = from_0 - 1.0
     from_2 = from_0 - 2.0

@@ -160,14 +160,15 @@ def trace_outline(path: Complexes, width: float) -> Complexes:
     Returns:
         Corners, anticlockwise, shape (2 n,), mm. Corners of a bend sharper than `MIN_BEND` allows are NaN.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # repeated points and sharp bends result in NaN
         sections = np.diff(path)
         normal = 1j * sections / np.abs(sections)  # to the left of each section
         normal_before = np.append(normal[:1], normal)  # at each point; the ends have a single section
         normal_after = np.append(normal, normal[-1:])
 
-        # The mitre is the displacement of a corner along the bisector of the normals before and after the point. The
-        # cosine is that of the angle of the bend.
+        # The mitre is the displacement of a corner from the path, along the bisector of the unit normals n and m before
+        # and after the point. Its components along n and m are half of the width, so it is proportional to n + m with
+        # the factor (width / 2) / (1 + cos(bend)), where the product n . m is the cosine of the bend.
         one_plus_cosine = 1.0 + (normal_before * np.conj(normal_after)).real
         one_plus_cosine = np.where(one_plus_cosine < MIN_BEND, np.nan, one_plus_cosine)
         mitre = 0.5 * width * (normal_before + normal_after) / one_plus_cosine

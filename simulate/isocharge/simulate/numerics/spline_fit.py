@@ -32,7 +32,7 @@ def fit_spline(position: Array, values: Array, knots: tuple[Array, Array], fixed
     Returns:
         The spline, whose values have the shape of `values` without the first axis.
     """
-    # A cubic spline has 4 coefficients less than knots.
+    # A cubic spline has 4 coefficients less than knots along each axis.
     x_knots, y_knots = knots
     x_count = x_knots.size - 4
     y_count = y_knots.size - 4
@@ -44,13 +44,16 @@ def fit_spline(position: Array, values: Array, knots: tuple[Array, Array], fixed
     free_design = _design_matrix(position, knots)[:, free]
     free_penalty = _penalty_matrix(x_count, y_count).tocsc()[:, free]
 
-    # Normal equations, whose matrix is positive definite and needs no pivoting
+    # Solve the normal equations, whose matrix is positive definite and needs no pivoting.
     normal_matrix = (free_design.T @ free_design + free_penalty.T @ free_penalty).tocsc()
     right_side = np.ascontiguousarray(free_design.T @ values.reshape(len(position), -1))
     factors = splu(normal_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    coefficients = np.zeros((is_free.size, right_side.shape[1]))  # one column for each component of the values
-    coefficients[free] = factors.solve(right_side)
-    return scipy.interpolate.NdBSpline(knots, coefficients.reshape(x_count, y_count, *values.shape[1:]), 3)
+    flat_coefficients = np.zeros((is_free.size, right_side.shape[1]))  # one column for each component of the values
+    flat_coefficients[free] = factors.solve(right_side)
+
+    coefficients = flat_coefficients.reshape(x_count, y_count, *values.shape[1:])
+    cubic_degree = 3
+    return scipy.interpolate.NdBSpline(knots, coefficients, cubic_degree)
 
 
 def _design_matrix(position: Array, knots: tuple[Array, Array]) -> csr_array:

@@ -72,11 +72,15 @@ def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMa
         The coloured areas, for which a colour bar can be drawn.
     """
     x, y = limit_map.rings.position.reshape(-1, 2).T  # mm
+    # Draw the errors as colours. Errors outside the range of the colours get the first or the last colour.
     levels = np.geomspace(MIN_ERROR_mm, MAX_ERROR_mm, 25)
     errors = np.clip(limit_map.position.ravel(), MIN_ERROR_mm, MAX_ERROR_mm)
     shades = axes.tricontourf(x, y, errors, levels, norm=LogNorm(), cmap="viridis")
+
+    # Draw the folds, which are positions (x, y), the working area, and the electrodes.
     folds = identification.area.folds
-    axes.plot(*folds.T, ".", color=FELT, ms=3)
+    fold_x, fold_y = folds.T
+    axes.plot(fold_x, fold_y, ".", color=FELT, ms=3)
     draw_circle(axes, identification.area.radius, ls="--", lw=1.8, color="white")
     draw_electrodes(axes, identification.sensor)
     axis_limits = (-identification.area.searched, identification.area.searched)
@@ -95,6 +99,8 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
         identification: The identification, which contains a map for each force.
     """
     area = identification.area
+
+    # Draw two curves for each force. With fewer forces than colours, the last colours are used.
     colours = FORCE_COLOURS[len(FORCE_COLOURS) - len(identification.maps) :]
     for limit_map, colour in zip(identification.maps, colours, strict=True):
         distance = limit_map.rings.distance
@@ -103,6 +109,8 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
         axes.semilogy(distance, median_error, color=colour, label=f"{limit_map.force:g} N")
         axes.semilogy(distance, largest_error, ":", color=colour)
     axes.plot([], [], ":", color=INK, label="worst of the ring")  # an entry of the legend for all dotted curves
+
+    # Mark the allowed error, the working area, and the distance of the nearest fold if there is one.
     axes.axhline(area.error, color=FELT, lw=0.8)
     axes.axvline(area.radius, ls="--", color=INK, label=f"working area, {area.radius:g} mm")
     if np.isfinite(area.fold_radius):
@@ -133,7 +141,7 @@ def error_maps_picture(design: Design) -> Figure:
     """
     case = design.case
     layouts = [(design.sensor, design.after)]
-    if design.before:
+    if design.before:  # the initial layout is the first one; a design without one has a single map
         layouts.insert(0, (case.sensor, design.before))
 
     # All maps have the same range of colours, and the same axes that show all electrodes.

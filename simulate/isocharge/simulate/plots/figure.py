@@ -106,8 +106,10 @@ def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
     Returns:
         The bytes of the file.
     """
+    # Without these entries, matplotlib writes the present date. PNG files have no date.
     date_metadata: dict[str, dict[str, None]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
     buffer = BytesIO()
+    # A fixed salt replaces the random identifiers of SVG elements. Text is stored as text, not as outlines.
     with rc_context({"svg.hashsalt": "isocharge", "svg.fonttype": "none"}):
         figure.savefig(buffer, format=kind, dpi=DPI, metadata=date_metadata[kind])
     return buffer.getvalue()

@@ -115,7 +115,8 @@ def draw_charge_map(axes: Any, charge_map: ChargeMap, number: int, force: float 
         force: Force of the presses, N.
         count: Number of angles of the grid.
     """
-    x, y = _polar_grid(charge_map.domain.radius, count // 2, count)
+    # The radius needs half as many points as the diameter.
+    x, y = _polar_grid(charge_map.domain.radius, rings=count // 2, angles=count)
     contact = np.stack([x.ravel(), y.ravel(), np.full(x.size, force)], axis=1)
     values = charge_map.charges(contact)[:, number].reshape(x.shape)
     axes.contourf(x, y, values, levels=30, cmap="YlGnBu")
@@ -131,8 +132,9 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
         equilibrium: The solved press.
     """
     radius = equilibrium.film.radius
-    x, y = _polar_grid(DRAWN_RADIUS * radius, 240, 361)
-    depth = deflection(equilibrium, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
+    x, y = _polar_grid(DRAWN_RADIUS * radius, rings=240, angles=361)
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    depth = deflection(equilibrium, points).reshape(x.shape)
     shades = axes.contourf(x, y, depth, levels=24, cmap="viridis_r")
     axes.figure.colorbar(shades, ax=axes, shrink=0.8, label="deflection, mm")
     draw_circle(axes, radius, color=INK)
@@ -146,6 +148,7 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
         axes: Axes of matplotlib.
         equilibrium: The solved press.
     """
+    # Draw the deflection downwards, against the signed distance from the centre in the direction of the press.
     distance_along_section = np.linspace(-DRAWN_RADIUS, DRAWN_RADIUS, 801) * equilibrium.film.radius
     x, y = equilibrium.at
     distance = hypot(x, y)
@@ -155,9 +158,11 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
     axes.plot(distance_along_section, -depth, color=INK, lw=1.5)
 
     # Mark the probe as a bar above the film, with an arrow to the deepest point.
-    half_width = equilibrium.probe.reach
-    axes.plot([distance - half_width, distance + half_width], [0.25, 0.25], color=FELT, lw=5, solid_capstyle="butt")
-    axes.annotate("", (distance, -depth.max()), (distance, 0.2), arrowprops={"arrowstyle": "->", "color": FELT})
+    bar_ends = [distance - equilibrium.probe.reach, distance + equilibrium.probe.reach]
+    axes.plot(bar_ends, [0.25, 0.25], color=FELT, lw=5, solid_capstyle="butt")
+    arrow_tip = (distance, -depth.max())
+    arrow_start = (distance, 0.2)  # just below the bar
+    axes.annotate("", arrow_tip, arrow_start, arrowprops={"arrowstyle": "->", "color": FELT})
     axes.set(
         title=f"cut through probe and centre: {depth.max():.2f} mm deep",
         xlabel="along the cut, mm",

@@ -165,6 +165,8 @@ class Film:
         check_stress("film pretension", self.pretension, -MAX_SLACK, MAX_PRETENSION, SensorError)
         if not 0.0 <= self.poisson < 0.5:
             raise SensorError(f"film poisson: expected 0 <= poisson < 0.5, got {self.poisson}")
+
+        # Coat, and properties that depend on the direction
         max_stiffness = MAX_COAT_STIFFNESS * self.young * self.thickness
         if self.coat is not None and not 0.0 < self.coat.stiffness <= max_stiffness:
             raise SensorError(
@@ -182,6 +184,8 @@ class Film:
             )
         if not abs(self.oval) <= MAX_OVAL:
             raise SensorError(f"film oval: expected a share up to {MAX_OVAL:g}, got {self.oval}")
+
+        # Temperature, pressure on the back, and shape
         for expansion in (*(self.expansion or ()), self.ring_expansion):
             if not abs(expansion) <= MAX_EXPANSION:
                 raise SensorError(

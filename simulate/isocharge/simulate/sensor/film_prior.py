@@ -251,7 +251,7 @@ class FilmPrior:
             SensorError: If an electrode may lie over the rim.
         """
         sensor = self.sensor
-        max_shift = float(np.hypot(MAX_DEVIATION, MAX_DEVIATION)) * self.spread.shift
+        max_shift = float(np.hypot(MAX_DEVIATION, MAX_DEVIATION)) * self.spread.shift  # along x and y together
         for electrode in sensor.electrodes:
             corners = sensor.calibration.place(np.concatenate(electrode.parts))
             farthest = np.linalg.norm(corners, axis=1).max()
@@ -325,7 +325,8 @@ class FilmPrior:
         Returns:
             Parameters, shape (count, n_parameter).
         """
-        # Draw all parameters from normal distributions, and repeat this for values outside the bounds.
+        # Draw all parameters from normal distributions, and repeat this for values outside the bounds. Each repetition
+        # draws an array of the full size, from which only the needed values are taken.
         lower_bounds, upper_bounds = self.bounds
         drawn = self.mean + self.std * rng.standard_normal((count, len(self.names)))
         is_outside = (drawn < lower_bounds) | (drawn > upper_bounds)
@@ -334,7 +335,7 @@ class FilmPrior:
             drawn = np.where(is_outside, replacement, drawn)
             is_outside = (drawn < lower_bounds) | (drawn > upper_bounds)
 
-        # The pretension is distributed uniformly, and all other parameters normally.
+        # The pretension is distributed uniformly, so the values that were drawn for it above are replaced.
         drawn[:, self.index("pretension")] = self.spread.pretension * rng.random(count)
         return drawn
 
@@ -413,6 +414,7 @@ class FilmPrior:
             if value != expected:
                 raise SensorError(f"{sensor.name}: {what}: expected those of {described.name}, {expected}, got {value}")
 
+        # A logarithm raises a ValueError if the signs differ, which is possible for d31 and d32 only.
         components = _components_of(sensor, probe)
         try:
             values = [

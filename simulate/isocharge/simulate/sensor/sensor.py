@@ -146,6 +146,8 @@ class Electrode:
             )
         if self._is_convex:
             return (np.array(self.corners),)
+
+        # Charge is collected where metal on the front overlaps metal on the back. An empty back is metal everywhere.
         front = [to_complex(np.array(polygon)) for polygon in self.front]
         back = [to_complex(np.array(polygon)) for polygon in self.back]
         return tuple(to_corners(part) for part in union_parts(front, back))
@@ -285,6 +287,8 @@ class Sensor:
             SensorError: If a value is not allowed, or an electrode overlaps another one or the rim.
         """
         object.__setattr__(self, "electrodes", _as_tuples(self.electrodes))  # the dataclass is frozen
+
+        # Readout, names of the electrodes, and calibration
         for value, options in ((self.readout, get_args(Readout)), (self.surface, get_args(Surface))):
             if value not in options:
                 raise SensorError(f"expected one of {options}, got {value!r}")
@@ -305,6 +309,8 @@ class Sensor:
         if not set(gains) <= set(names):
             unknown = sorted(set(gains) - set(names))
             raise SensorError(f"calibration gain: no electrode named {shown(unknown)}, have {cut(str(names))}")
+
+        # Shapes and positions of the electrodes
         _check_layout(self.electrodes)
         for electrode in self.electrodes:
             _check_on_film(electrode, self.film, self.calibration)
@@ -418,6 +424,8 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
             raise SensorError(f"{name}: its front and its back have no area in common, so nothing collects; move one")
         corners = np.array(electrode.corners)
         check_length(name, float(np.ptp(corners, axis=0).max()), MIN_EXTENT, SensorError)
+
+        # An electrode that is declared as a square must have the corners of a square, and no other metal.
         lower_left, lower_right, *_ = corners
         side = float(lower_right[0] - lower_left[0])
         expected_corners = Electrode.of_square(electrode.name, electrode.centre, side).corners

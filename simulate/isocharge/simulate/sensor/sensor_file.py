@@ -343,7 +343,7 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
         raise SensorError(
             f"readout 'edge' needs squares, and in a sensor file all squares have one side: got {sides} mm"
         )
-    shared_side = next(iter(sides.values()), None)
+    shared_side = next(iter(sides.values()), None)  # side of the first square; None if there are no squares
     tables: dict[str, Any] = {}
     if shared_side is not None:
         tables[SIDE] = shared_side
@@ -378,6 +378,7 @@ def _film(table: FilmTable) -> Film:
     The section contains either one Young's modulus or the moduli (E1, E2), and either one pretension or the components
     (T11, T22, T12).
     """
+    # Young's moduli along both axes, and their geometric mean
     if isinstance(table.young_GPa, list):
         young_1, young_2 = table.young_GPa
     else:
@@ -385,6 +386,7 @@ def _film(table: FilmTable) -> Film:
     # The mean of equal values is not computed, because it would have rounding errors.
     mean_young = young_1 if young_1 == young_2 else float(np.sqrt(young_1 * young_2))
 
+    # Components of the pretension, and the mean of the components along both axes
     if isinstance(table.pretension_MPa, list):
         tension_11, tension_22, tension_12 = table.pretension_MPa
     else:
@@ -431,7 +433,7 @@ def _electrodes(table: Mapping[str, float | Point | PolygonTable], roles: Mappin
         table: The section `electrodes`.
         roles: The section `roles`. An electrode that it does not contain determines the position.
     """
-    side = table.get(SIDE)
+    side = table.get(SIDE)  # of all squares
     for name, value in table.items():
         role = roles.get(name, "position")
         if isinstance(value, PolygonTable):

@@ -130,11 +130,13 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     nodal_displacement = equilibrium.field[mesh.template.nodes[element]]
     total_strain = strain(gradient @ nodal_displacement, groups.squared_amplitude)
 
-    # Strain of bending from the second derivatives of W, and jump of the strain at the edges of a coat
+    # Strain of bending from the second derivatives of W
     if surface != "middle":
         nodal_slope_of_deflection = node_slope(equilibrium)[element, :, :, 2]
         second_derivatives = gradient @ nodal_slope_of_deflection
         total_strain += _bending_strain(equilibrium, surface, second_derivatives)
+
+    # At the edges of a coat, the mesh represents the mean strain of the bare and the coated film.
     if mesh.coat is not None:
         total_strain = mesh.coat.film_strain(_rotated(equilibrium, points), total_strain)
 
@@ -143,6 +145,8 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     press_stress[is_reflected, 2] *= -1.0
     x, y = equilibrium.at
     film_stress = rotate_stress(press_stress, np.arctan2(y, x))
+
+    # Subtract the stress of the film before the contact. It is zero without a static pressure.
     if equilibrium.rest is None:
         return film_stress
     return np.asarray(film_stress - touch_stress(equilibrium.rest, points, surface))
@@ -222,7 +226,9 @@ def node_slope(equilibrium: Equilibrium) -> Array:
 
 
 def _bending_strain(equilibrium: Equilibrium, surface: Surface, hessian: Array) -> Array:
-    """Compute the scaled bending strain at a surface.
+    """Compute the scaled bending strain at a surface: the height of the surface times the curvatures of the film.
+
+    The height of a surface above the mid-surface is `HEIGHT` times half of the thickness.
 
     Args:
         equilibrium: The solved press.
@@ -233,7 +239,8 @@ def _bending_strain(equilibrium: Equilibrium, surface: Surface, hessian: Array) 
         (E11, E22, 2 E12), shape (..., 3), in units of A^2.
     """
     film = equilibrium.film
-    half_thickness = 0.5 * film.thickness / (film.radius * np.sqrt(equilibrium.groups.squared_amplitude))
+    amplitude = np.sqrt(equilibrium.groups.squared_amplitude)
+    half_thickness = 0.5 * film.thickness / (film.radius * amplitude)  # scaled, for curvatures in units of the strain
     curvature = np.stack(
         [hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1] + hessian[..., 1, 0]],
         axis=-1,
@@ -262,9 +269,10 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
     if film.oval:
         angle = np.arctan2(points[:, 1], points[:, 0])
         rim_distance = film.radius * (1.0 + film.oval * np.cos(2.0 * (angle - film.oval_axis)))
-    is_outside = ~(distance <= rim_distance * (1.0 + 1e-9))  # also points that are not a number
+    # The condition is negated, so that points with NaN count as outside. The tolerance is for rounding errors.
+    is_outside = ~(distance <= rim_distance * (1.0 + 1e-9))
     if is_outside.any():
-        x, y = points[np.argmax(is_outside)]
+        x, y = points[np.argmax(is_outside)]  # the first point outside
         raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {film.radius:.4g} mm")
     return equilibrium.mesh.locate(_rotated(equilibrium, points))
 

@@ -46,7 +46,8 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
     components = 3 if groups.bending == 0.0 else 4  # bending has an auxiliary unknown
     n_direction = 1 if mesh.template.half else 2  # a half template has no displacement across its symmetry line
 
-    # Mean in-plane displacement of the footprint since the contact; `load` contains the weights of the footprint
+    # Mean in-plane displacement of the footprint since the contact. `geometry.load` contains the weights of the nodes
+    # in the mean over the footprint.
     field_before_contact = np.zeros_like(solved.field) if solved.rest is None else solved.rest.field
     slip = geometry.load @ (solved.field - field_before_contact)[:, :n_direction]
 
@@ -59,12 +60,13 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
             unit_load[:, direction] = geometry.load
             compliance[:, direction] = geometry.load @ factor.solve(unit_load)[:, :n_direction]
 
-    # The side load that reverses the slip, converted to N and rotated from the frame of the press
+    # The side load that reverses the slip. Convert it to N, and rotate it from the frame of the press to x and y.
     scaled_force = np.zeros(2)
     scaled_force[:n_direction] = -np.linalg.solve(compliance, slip)
     x, y = solved.at
     rotation = np.exp(1j * np.arctan2(y, x))
-    force = complex(*scaled_force) * side_force_unit(solved.film, groups.squared_amplitude) * rotation  # Fx + i Fy
+    force_unit = side_force_unit(solved.film, groups.squared_amplitude)
+    force = complex(*scaled_force) * force_unit * rotation  # Fx + i Fy
     return float(force.real), float(force.imag)
 
 

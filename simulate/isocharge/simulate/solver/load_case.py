@@ -266,16 +266,19 @@ def place_coated(
     x, y = at
     angle = float(np.arctan2(y, x))
     rotation_and_scale = np.exp(-1j * angle) / film.radius
-    coat_layers = tuple(
-        tuple(to_complex(np.array(part)) * rotation_and_scale for part in coat_layer) for coat_layer in film.coat.layers
-    )
+    coat_layers = []
+    for coat_layer in film.coat.layers:
+        outlines = [to_complex(np.array(part)) * rotation_and_scale for part in coat_layer]
+        coat_layers.append(tuple(outlines))
 
-    # The stresses of the three unit strains form an elasticity matrix over E of the film.
+    # The stresses of the three unit strains form an elasticity matrix over E of the film. The elasticity does not
+    # depend on the force, so any force may be used.
     unit_strains = np.eye(3)
-    film_moduli = scaled_stress(unit_strains, DimensionlessGroups.of(film, 1.0, bending=False, angle=angle))
+    groups = DimensionlessGroups.of(film, force=1.0, bending=False, angle=angle)
+    film_moduli = scaled_stress(unit_strains, groups)
     stiffness_ratio = film.coat.stiffness / (film.young * film.thickness)
     coat_moduli = stiffness_ratio * stress(unit_strains, film.poisson)
-    return coated(mesh, coat_layers, film_moduli, coat_moduli)
+    return coated(mesh, tuple(coat_layers), film_moduli, coat_moduli)
 
 
 def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None) -> float:
@@ -314,8 +317,10 @@ def choose_mesh(case: LoadCase) -> PlacedMesh:
     for resolution in _candidate_resolutions(case):
         mesh = case.place(resolution)
         error = shape_error(mesh)
-        if error <= 0.5 * case.accuracy:
+        if error <= 0.5 * case.accuracy:  # the other half is for the omitted terms of the theory
             return mesh
+
+    # No mesh is sufficient. The last one is the finest mesh.
     if error > MAX_SHAPE_ERROR:
         raise too_near_the_rim(case, resolution)
     return mesh
@@ -350,7 +355,7 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     """
     film = case.film
     probe = case.probe
-    # Any mesh under the press has the same conformal map, so a coarse mesh is sufficient here.
+    # Place a mesh to obtain the conformal map. All meshes under the press have the same conformal map.
     coarse_resolution = Resolution(order=2, around=8, rings=1)
     placement = place(film, probe, case.at, coarse_resolution, layer=0.1).placement
 
@@ -359,7 +364,7 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     is_crowded = not probe.topology.fills_circle and needed_radius > film.radius
 
     # A better accuracy requires a higher order. A small probe (rho) and the stretch of the conformal map require more
-    # rings.
+    # rings. The factors are empirical.
     extra_order = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.accuracy)))
     first_order = 5 if case.theory.bending and film.coat is None else 4
     rings_for_stretch = min(2.0 * math.log(_stretch(placement)), 4.0)
@@ -385,11 +390,14 @@ def _thin_rings(placement: Placement, layer: float) -> int:
         placement: Placement of the mesh under the press.
         layer: Width of the thin rings, in film radii.
     """
-    # Widths of the boundary layer in the template plane, relative to the depth of all rings in ln r
+    # Widths of the boundary layer in the template plane, relative to the depth of all rings in ln r. The upper bounds
+    # limit the thin rings to the neighbourhood of the rim.
     stretch = _stretch(placement)
     total_depth = -float(np.log(placement.rho))
     largest_width = min(layer * stretch / total_depth, 1.0 / 8.0)
     smallest_width = min(min(layer, 0.2) / stretch / total_depth, 1.0 / 8.0)
+
+    # The logarithm to the base 3 is the number of rings between both widths if each ring is a third as wide.
     return 1 + math.floor(THIN_RINGS_PER_FACTOR * math.log(largest_width / smallest_width, 3.0))
 
 

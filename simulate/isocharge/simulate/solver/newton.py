@@ -103,7 +103,8 @@ def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Ar
     Returns:
         Scaled displacements (U1, U2, W), shape (n_node, 3).
     """
-    # The term rho^2 rounds the tip of the deflection under the probe.
+    # The height replaces the factor (3 / pi)^(1/3), which is about 1. The term rho^2 rounds the tip of the deflection
+    # under the probe.
     shape = np.cbrt(1.0 + rho**2) - np.cbrt(np.abs(z) ** 2 + rho**2)
     field = np.zeros((z.size, 3))
     field[:, 2] = groups.height * shape
@@ -142,6 +143,7 @@ def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
     Returns:
         The result, which has not converged if the linear system is nearly singular.
     """
+    # The first solve computes W. All solves use the tangent of the flat film.
     flat_field = np.zeros((assembly.free.shape[0], 3))
     factor = assembly.factor(elastic.tangent(flat_field))
     field = factor.solve(-elastic.residual(flat_field))
@@ -212,6 +214,7 @@ def solve_newton(
         if iteration == MAX_ITERATIONS or _stalled(step_sizes):
             return iterate.result(False, iteration, f"no progress any more after {iteration} steps")
 
+        # Compute the Newton step.
         guard_tension = _guard_tension(elastic, relative_residual)
         factor = factor_tangent(elastic, assembly, iterate.field, guard_tension)
         step = factor.solve(-iterate.residual)
@@ -301,9 +304,10 @@ def _energy_norm(elastic: ElasticFilm, field: Array, step: Array, residual: Arra
 
 
 def _guard_tension(elastic: ElasticFilm, relative_residual: float) -> float:
-    """Return the tension that is added to the tangent. It is proportional to the relative residual.
+    """Return the tension that is added to the tangent far from the equilibrium, where a film may be compressed.
 
-    The tension is zero if the relative residual is at most `GUARD_BELOW`.
+    The tension is proportional to the relative residual, and at most `GUARD_TENSION` times the tension that the load
+    induces. It is zero if the relative residual is at most `GUARD_BELOW`.
     """
     if relative_residual <= GUARD_BELOW:
         return 0.0

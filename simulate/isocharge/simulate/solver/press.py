@@ -84,7 +84,8 @@ def press(
         SceneError: If the press cannot exist, or the mesh is too distorted.
         SolveError: If the solve fails and `throw` is True.
     """
-    case = LoadCase.of(film, probe, at, force, settings, start.mesh if start else None, side_force)
+    start_mesh = start.mesh if start else None
+    case = LoadCase.of(film, probe, at, force, settings, start_mesh, side_force)
     with single_threaded_blas():
         if settings.resolution != "auto":
             solved = _solve(case, case.place(settings.resolution), start)
@@ -220,7 +221,10 @@ def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
     mesh = equilibrium.mesh
     elastic = ElasticFilm(mesh.geometry, equilibrium.groups.without_probe)
     solver = assembly(mesh.template, elastic.components)
-    result = solve_newton(elastic, solver, _static_start(mesh, elastic.groups), tolerance)
+    first_field = _static_start(mesh, elastic.groups)
+    result = solve_newton(elastic, solver, first_field, tolerance)
+
+    # Both solves count as iterations, and both must converge.
     rest = replace(equilibrium, groups=elastic.groups, field=result.field, force=0.0, side_force=(0.0, 0.0))
     equilibrium = replace(equilibrium, rest=rest, iterations=equilibrium.iterations + result.iterations)
     if result.converged:
@@ -245,11 +249,12 @@ def _elastic(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
     x, y = case.at
     force_factor = force / case.force
     side_x, side_y = case.side_force
+    direction = float(np.arctan2(y, x))  # of the press from the centre
     groups = DimensionlessGroups.of(
         case.film,
         force,
         bending=case.theory.bending,
-        angle=float(np.arctan2(y, x)),
+        angle=direction,
         side_force=(force_factor * side_x, force_factor * side_y),
     )
     return ElasticFilm(geometry, groups)
@@ -273,11 +278,14 @@ def _solve_nonlinear(
     Returns:
         The result, which may not have converged.
     """
+    # First iterate without a starting equilibrium
     template_points = mesh.placement.to_template(from_oval(mesh.node_points, mesh.oval))
     schwerin_field = schwerin_start(template_points, float(mesh.placement.rho), elastic.groups)
     if elastic.groups.static_pressure != 0.0:
         schwerin_field += _static_start(mesh, elastic.groups)
-    result = solve_newton(elastic, solver, _start_field(start, mesh.template, schwerin_field), case.tolerance)
+
+    start_field = _start_field(start, mesh.template, default=schwerin_field)
+    result = solve_newton(elastic, solver, start_field, case.tolerance)
     if result.converged:
         return result
     return _solve_by_load_steps(case, result, mesh.geometry, solver, schwerin_field)
@@ -340,6 +348,7 @@ def _start_field(start: Equilibrium | None, template: Template, default: Array) 
     if start is None:
         return default
     start_template = start.mesh.template
+    # Compare the blocks, the resolution except for the order, and the refinement along a coat.
     if (start_template.topology, start_template.half) != (template.topology, template.half):
         return default
     resolution_with_same_order = replace(start_template.resolution, order=template.resolution.order)
@@ -364,6 +373,7 @@ def resampled(field: Array, before: Template, after: Template) -> Array:
     """
     values = tensor_values(before.resolution.order, after.xi, after.eta)
     interpolated = np.empty((after.n_node, 3))
+    # A node of several elements is assigned several times. The field is continuous, so the values are equal.
     interpolated[after.nodes] = values @ field[before.nodes]
     return interpolated
 

@@ -51,7 +51,8 @@ class StressField:
 def _tension(direction: tuple[float, float, float]) -> Change:
     """Return the function that adds a tension to the pretension of a film.
 
-    The tension is stated as a multiple of E A^2 plus the mean pretension.
+    The unit of the tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A the amplitude
+    that scales the deflection of the press.
 
     Args:
         direction: Components (T11, T22, T12) of one unit.
@@ -59,7 +60,7 @@ def _tension(direction: tuple[float, float, float]) -> Change:
 
     def with_tension(solved: Equilibrium, value: float) -> Equilibrium:
         """Return the equilibrium with `value` units of the additional tension."""
-        unit = 1.0 + solved.groups.tension
+        unit = 1.0 + solved.groups.tension  # over E A^2, like all tensions in `groups`
         anisotropy = Anisotropy(moduli=np.zeros((3, 3)), tension=value * unit * np.array(direction))
         return replace(solved, groups=replace(solved.groups, anisotropy=anisotropy))
 
@@ -130,7 +131,10 @@ FIELDS = {
 
 
 def _side_load(direction: tuple[float, float]) -> Change:
-    """Return the function that adds a side load to a press. The unit of the side load is E h a A^2.
+    """Return the function that adds a side load to a press.
+
+    The unit of the side load is E h a A^2, with Young's modulus E, thickness h and radius a of the film, and the
+    amplitude A that scales the deflection of the press.
 
     Args:
         direction: Unit vector (x, y) of the side load.
@@ -228,8 +232,8 @@ def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface:
     with single_threaded_blas():
         components = 3 if solved.groups.bending == 0.0 else 4  # bending has an auxiliary unknown
         elastic = ElasticFilm(solved.mesh.geometry, solved.groups)
-        even_assembly = assembly(solved.mesh.template, components, False)
-        odd_assembly = assembly(solved.mesh.template, components, True)
+        even_assembly = assembly(solved.mesh.template, components, odd=False)
+        odd_assembly = assembly(solved.mesh.template, components, odd=True)
         even_factor = factor_tangent(elastic, even_assembly, solved.field)
         odd_factor = factor_tangent(elastic, odd_assembly, solved.field)
         changes = []
@@ -251,17 +255,17 @@ def _stress_change(solved: Equilibrium, field: StressField, solve: Callable[[Arr
     Returns:
         Change per unit of the imperfection, shape (n_element, n_local, 3).
     """
-    # Film with a positive and with a negative step of the imperfection, at first with the original displacements
+    # Add a positive and a negative step of the imperfection. The displacements are not in equilibrium yet.
     above = field.change(solved, STEP)
     below = field.change(solved, -STEP)
 
-    # Change of the displacements that restores the equilibrium after one positive step. The change of the residual by
-    # one step is half of the difference.
+    # Compute the change of the displacements that restores the equilibrium after one positive step. The change of the
+    # residual by one step is half of the difference.
     residual_above = ElasticFilm(above.mesh.geometry, above.groups).residual(above.field)
     residual_below = ElasticFilm(below.mesh.geometry, below.groups).residual(below.field)
     displacement_change = -0.5 * solve(residual_above - residual_below)
 
-    # Central difference of the stress
+    # Compute the derivative of the stress by a central difference.
     equilibrium_above = replace(above, field=above.field + displacement_change)
     equilibrium_below = replace(below, field=below.field - displacement_change)
     stress_above = nodal_stress(equilibrium_above, surface)

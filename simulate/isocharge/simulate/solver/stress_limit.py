@@ -35,7 +35,8 @@ def largest_stress(film: Film, probe: Probe, force: float) -> float:
         SceneError: If the press cannot exist.
         SolveError: If no equilibrium is reached.
     """
-    return principal_stress(press(film, probe, (0.0, 0.0), force))[1]
+    _, largest = principal_stress(press(film, probe, (0.0, 0.0), force))
+    return largest
 
 
 def stress_caution(film: Film, probe: Probe, force: float, limit: float = DEFAULT_STRESS_LIMIT) -> str:

@@ -53,6 +53,9 @@ class _AirFactor:
 def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, guard: float = 0.0) -> TangentFactor:
     """Factorise the tangent at a field, including the stiffness of trapped air.
 
+    The tangent is K + c v v', where K is the matrix of the film, v contains the integration weights of the volume, and
+    c is the stiffness of the air. The formula of Sherman and Morrison uses only the factorisation of K.
+
     Args:
         elastic: The discrete film.
         assembly: Linear solver for its mesh.
@@ -63,11 +66,12 @@ def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, guard
         Factorisation of the tangent.
     """
     film_factor = assembly.factor(elastic.tangent(field, guard))
-    has_no_air = elastic.back is None or elastic.groups.compression == 0.0
-    if elastic.back is None or has_no_air or assembly.odd:  # odd fields do not compress the air
+    if elastic.back is None or elastic.groups.compression == 0.0:  # no trapped air
+        return film_factor
+    if assembly.odd:  # odd fields do not compress the air
         return film_factor
 
-    # Formula of Sherman and Morrison in the docstring of this module: v = weights, y = response, c = air_stiffness
+    # The correction of a solution x is -c / (1 + c v . y) (v . x) y, with y = K^-1 v.
     weights = elastic.back.weights
     uniform_pressure = np.zeros_like(field)
     uniform_pressure[:, 2] = weights
