@@ -99,10 +99,10 @@ else:  # hidden from type checkers, which would otherwise accept every misspelt 
             name: Name of the attribute.
         """
         if name not in __all__:
-            return _version_attribute(name)
+            return _version_attribute(name)  # raises AttributeError for all names except `__version__`
         with require("train"):
             value = getattr(import_module("isocharge.train.needs_torch"), name)
-        globals()[name] = value
+        globals()[name] = value  # Python then no longer calls this function for this name
         return value
 
     del TYPE_CHECKING

@@ -113,18 +113,21 @@ def calibrate_command(
 
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
+    # Without presses, an earlier calibration is moved to another temperature: its parameters are computed for it.
     is_moved = file is None and earlier is not None and temperature_C is not None
     _check_usage(file, output, next_count, temperature_C, is_moved=is_moved)
     _check_side_forces(file, friction, side_force, is_moved=is_moved)
+
+    # The problem describes the films that the sensor may be. An earlier calibration restricts them.
     problem = CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models)
     problem = replace(problem, stress_limit=stress_limit, friction=friction, side_force=side_force)
-    result: CalibrationResult | None = None
+    result: CalibrationResult | None = None  # None if only presses are proposed
     with calibration_folder(output, problem) if output is not None else nullcontext():
         presses = None
         if file is not None:
             presses = read_press_file(file, problem.electrodes, position_std_mm, force_std)
             presses = _with_temperature(presses, temperature_C)
-        if is_moved and earlier is not None and temperature_C is not None:
+        if is_moved and earlier is not None and temperature_C is not None:  # the last two only for type checkers
             result = read_moved(earlier, problem, temperature_C)
         elif earlier is not None:
             knows_temperature = presses is not None and presses.knows_temperature
@@ -134,6 +137,7 @@ def calibrate_command(
         if result is not None and output is not None:
             _write(result, output)
 
+    # The next presses are chosen for the calibrated film, or for all possible films if nothing was calibrated.
     proposed: list[ProposedPress] = []
     if next_count:
         film = None if result is None else result.posterior
@@ -160,8 +164,8 @@ def _fit(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationRe
     """Calibrate the film by presses, and print the cautions of the calibration.
 
     Args:
-        presses: The presses.
-        problem: The possible films.
+        presses: The measured presses.
+        problem: Description of the films that the sensor may be.
     """
     say(f"fitting the film to {len(presses)} presses")
     result = calibrate(presses, problem)
@@ -172,6 +176,8 @@ def _fit(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationRe
 
 def _print_result(result: CalibrationResult | None, proposed: list[ProposedPress], *, json: bool) -> None:
     """Print the result of a calibration, if there is one, and the proposed presses.
+
+    For each proposed press, the errors of position and force are printed that would remain after this press.
 
     Args:
         result: Result of the calibration; None if only presses are proposed.

@@ -49,7 +49,7 @@ def distil_command(
             f'--int8: expected no --config beside it, got {config}; write weights = "int8" under [network] in this '
             "file instead"
         )
-    model_folder = find_model(model, models)
+    model_folder = find_model(model, models)  # the teacher
     if config is not None:
         fit_config = load_config(config)
     elif int8:
@@ -60,6 +60,8 @@ def distil_command(
     case = StudentCase.of(load_model(model_folder).metadata)
     options = ReleaseOptions(output, version, fresh=fresh, json=json)
     version_folder = options.check_version_folder(case.sensor.electrode_names)  # raises before the long computation
+
+    # The student is trained on simulated presses and the contacts that the teacher estimates for them.
     with shown_progress():
         presses = simulated_presses(case.sensor, case.probes, case.domain.radius, case.domain.force_range)
     data = student_data(model_folder, presses)

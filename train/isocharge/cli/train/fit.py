@@ -127,6 +127,8 @@ def fit_command(
     """
     notations = probe or [DEFAULT_PROBE]
     options = ReleaseOptions(output, version, fresh=fresh, json=json)
+
+    # With --films: a network for all films.
     if films:
         film_prior = _film_prior(dataset, sensor, notations, radius, config)
         _release_films_model(film_prior, FilmsConfig(radius=parse_radius_mm(radius)), options)
@@ -137,22 +139,29 @@ def fit_command(
         # Refuse an unsuitable model folder before the simulation, which takes a while.
         options.check_version_folder(load_sensor(sensor).electrode_names)
     fit_config = load_config(config) if config else FitConfig()
+
+    # Measured presses of a sensor without a description: a network that is trained on the presses alone.
     if press_file is not None and sensor is None:
         presses = _read_presses_of_unknown_sensor(press_file, radius, position_std_mm, force_std)
         pressing_probes = tuple(probe or ["unknown"])
         _release_presses_model(presses, pressing_probes, fit_config, options)
         return
 
-    if dataset is not None and not dataset.is_dir():
-        rig = _read_rig(dataset, sensor, notations, radius, position_std_mm, force_std)
+    # The path may also be a pipe, or a file that does not exist, which `_read_rig` refuses.
+    measured_file = dataset if dataset is not None and not dataset.is_dir() else None
+    if measured_file is not None:
+        # Measured presses of a described sensor: the presses calibrate the film if a network for all films exists.
+        rig = _read_rig(measured_file, sensor, notations, radius, position_std_mm, force_std)
         problem = calibration_problem(rig, models)
         if problem is not None:
             refuse_training_options(config, version, radius)
             calibrate_into(rig.presses, problem, output, json=json)
             return
+        # Otherwise a network is trained on simulated charges that the presses correct.
         with shown_progress():
             data = rig_data(rig, seed=fit_config.training.seed)
     else:
+        # A network is trained on a dataset, or on presses that are simulated here.
         with shown_progress():
             data = _read_or_simulate_data(dataset, sensor, notations, radius)
     _release_data_model(data, fit_config, options)
@@ -190,7 +199,7 @@ def _release_presses_model(
         options: Options of the command.
     """
     version_folder = options.check_version_folder(presses.electrodes)
-    sensor_name = options.model_folder.resolve().name
+    sensor_name = options.model_folder.resolve().name  # the sensor has no other name than that of the model
 
     def train(run: ResumableRun) -> Fitted:
         """Train the network, and save the state in the run."""
@@ -287,7 +296,7 @@ def _read_rig(
     """
     if not file.exists():
         raise InputError(f"{file}: expected a dataset folder, or a CSV file of measured presses; there is neither")
-    if sensor is None:
+    if sensor is None:  # the file is then a pipe, because `fit_command` handles a regular file without a sensor
         raise InputError(
             f"{file}: expected --sensor SENSOR for presses that are not in a regular file, got no sensor; add this "
             "option"
@@ -330,6 +339,7 @@ def refuse_training_options(config: Path | None, version: int, radius: str) -> N
     Raises:
         InputError: If one of the options is given.
     """
+    # Each option is compared with its default, because Typer does not show whether the user gave the option.
     if config is not None:
         raise InputError(
             "--config: the presses calibrate this film and no network is trained, so training settings have no effect, "

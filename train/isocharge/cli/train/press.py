@@ -129,26 +129,30 @@ def press_command(
 
     Example: isocharge train press --port /dev/ttyACM0 --sensor four-25um-biaxial -o presses.csv
     """
-    problem = replace(CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models), stress_limit=stress_limit)
+    problem = CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models)
+    problem = replace(problem, stress_limit=stress_limit)
     if earlier is not None:
         problem = replace(problem, earlier=read_earlier(earlier, problem))
+
+    # A machine makes the presses of a list. Otherwise a person makes them, who is asked about each press.
     contacts = None if press_list is None else read_press_list(press_list)
     is_asked = contacts is None and not yes
     sensor_port = SensorPort(
         url=port,
         device=device,
         baud=baud,
-        reconnects=contacts is None,
+        reconnects=contacts is None,  # a machine goes on while the port is lost, so its session must end
         keyboard=_keyboard() if is_asked else None,
     )
+    on_taken: OnTaken = _ignore_press
+    if json:
+        on_taken = _print_proposing if contacts is None else _print_press
+
     stds = {"position_std_mm": position_std_mm, "force_std": force_std}
     with open_press_file(output, problem.sensor, problem.probe, fresh=fresh) as press_file:
         session = _open_session(press_file, problem, until, stds)
         if contacts is not None:
             _check_list(contacts, session, str(press_list))
-        on_taken: OnTaken = _ignore_press
-        if json:
-            on_taken = _print_proposing if contacts is None else _print_press
         try:
             with _open_events(sensor_port, problem) as events:
                 dialogue = Dialogue(session, events, Screen(problem.electrodes), on_taken)
@@ -158,9 +162,10 @@ def press_command(
                     dialogue.follow_machine(contacts)
         finally:
             _say_what_is_written(session, output)
-    if not len(session):
+
+    if len(session) == 0:
         raise PressError(f"no press was taken, so {output} is not written")
-    if session.refusal:
+    if session.refusal:  # the reason why the presses cannot be used for a calibration
         raise PressError(f"{output}: {session.refusal}")
     say(f"To make a model: isocharge train calibrate {shlex.quote(str(output))} --sensor {sensor} -o my-film")
 
@@ -212,7 +217,7 @@ def _open_events(port: SensorPort, problem: CalibrationProblem) -> Iterator[Pres
     stream = ReadingStream(problem.electrodes, board, reader=f"sensor {problem.sensor.name}")
     watch = PressWatch(problem.electrodes)
     with (
-        no_frames_advice_added(port.url, port.device),
+        no_frames_advice_added(port.url, port.device),  # outermost, because it changes the errors of the others
         open_source(port.url, baud=port.baud, reconnect=port.reconnects, request=board.request) as source,
         PressEvents(source, stream, watch, port.keyboard) as events,
     ):

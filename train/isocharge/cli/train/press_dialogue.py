@@ -59,10 +59,11 @@ class Screen:
     def show_phase(self, watched: WatchResult) -> None:
         """Print the instruction of the present phase, and the charges while a press settles.
 
-        Within one phase, at least `LINE_INTERVAL_s` pass between two lines.
+        Within one phase, at least `LINE_INTERVAL_s` pass between two lines. Phases without an instruction, such as that
+        of a steady press, print nothing.
 
         Args:
-            watched: Result of the watch for the last reading.
+            watched: Result of the press watch for the last reading: phase, time for which the press is held, charges.
         """
         if watched.phase not in PHASE_TEXTS:
             return
@@ -78,7 +79,7 @@ class Screen:
             line += f", {watched.held_s:.1f} s: {self._charge_text(watched.charge_pC)}"
         if watched.reason:
             line += f" ({watched.reason})"
-        say(line)
+        say(line)  # not `self.say`, which would begin a new phase
 
     def show_steady(self, press: SteadyPress) -> None:
         """Print the charges of a steady press."""
@@ -137,7 +138,7 @@ class Dialogue:
         """
         first_row = _count_rows_made(self._session, contacts)
         try:
-            # A press before the tare would be lost, and each later press would be taken for the one before it.
+            # A press before the tare would be lost. Each later press would then be taken for the one before it.
             self._wait_for(Phase.waiting)
             self._screen.say("The tare is measured. Let the machine begin.")
             for row_number, contact in enumerate(contacts[first_row:], start=first_row + 1):
@@ -192,24 +193,25 @@ class Dialogue:
             asks: Whether to ask where a steady press was made. Otherwise it counts as made where it was proposed.
         """
         proposed = self._session.proposed
-        press: SteadyPress | None = None  # the steady press about which a question is open
+        steady_press: SteadyPress | None = None  # the press about which a question is open
         self._screen.say(f"{len(self._session) + 1}. Press {describe_press(proposed.contact)} and hold.")
-        self._events.arm()
-        # Undoing an earlier press changes the proposal, except that the answer about a steady press comes first.
-        while press is not None or self._session.proposed is proposed:
+        self._events.arm()  # only presses from now on count
+
+        # Undoing an earlier press changes the proposal, which ends the loop. An open question must be answered first.
+        while steady_press is not None or self._session.proposed is proposed:
             event = self._events.next()
-            if isinstance(event, str):  # a typed line
-                is_settled = self._handle_line(event, press, proposed.contact)
+            if isinstance(event, str):  # a typed line: an answer or a command
+                is_settled = self._handle_line(event, steady_press, proposed.contact)
                 if is_settled:
                     return
-            elif press is not None:
+            elif steady_press is not None:
                 continue  # readings do not matter while the question is open
             elif event.press is not None:
                 self._screen.show_steady(event.press)
                 if not asks:
                     self._take(event.press, proposed.contact)
                     return
-                press = event.press
+                steady_press = event.press
                 self._screen.say(QUESTION)
             elif event.phase == Phase.refused:
                 self._screen.say(f"   not taken: {event.reason}; press again")
@@ -246,7 +248,7 @@ class Dialogue:
             proposed: Contact (x, y, F) that was proposed, shape (3,), mm and N.
 
         Returns:
-            Whether the dialogue continues with the next proposed press.
+            Whether the proposed press is settled, so that the next press is to be proposed.
 
         Raises:
             SessionEnd: If the user quits.
@@ -263,14 +265,14 @@ class Dialogue:
             contact = proposed if isinstance(answer.contact, str) else answer.contact  # the text means "as proposed"
             return self._take(press, contact)
 
-        # The remaining command removes a press: the steady press that is not taken yet, or an earlier press.
+        # The remaining command is "undo". It removes the steady press that is not taken yet, or an earlier press.
         if answer.number == "last" and press is not None:
             self._screen.say("   this press is not taken")
             return True
         removed_number = self._session.undo(answer.number)
         self._screen.say(f"   press {removed_number} is removed")
         self._say_summary()
-        return False
+        return False  # a question about a steady press remains open; otherwise the proposed press may have changed
 
     def _take(self, press: SteadyPress, contact: Array) -> bool:
         """Add a press to the session, and return whether the session accepts it.
@@ -305,11 +307,12 @@ def _count_rows_made(session: PressSession, contacts: Array) -> int:
         session: The session.
         contacts: Contacts of the list, shape (n_row, 3), mm and N.
     """
-    if not len(session):
+    if len(session) == 0:
         return 0
     last_contact = session.presses.contact[-1]
     is_equal = np.isclose(contacts, last_contact, rtol=0.0, atol=SAME_CONTACT_TOLERANCE, equal_nan=True)
-    equal_rows = np.flatnonzero(is_equal.all(axis=1))
-    if not equal_rows.size:
+    equal_rows = np.flatnonzero(is_equal.all(axis=1))  # x, y and F are equal
+    if equal_rows.size == 0:
         return 0
-    return int(equal_rows[-1]) + 1
+    last_row = int(equal_rows[-1])
+    return last_row + 1

@@ -43,7 +43,7 @@ class PressEvents:
         self._keyboard = keyboard
         self._queue: Queue[tuple[int, WatchResult | str | Exception]] = Queue()
         self._stop = threading.Event()
-        self._arm_count = 0
+        self._arm_count = 0  # number of calls of `arm`
         self._port_thread = threading.Thread(target=self._read_port, name="press port", daemon=True)
 
     def __enter__(self) -> Self:
@@ -84,16 +84,17 @@ class PressEvents:
     def _read_port(self) -> None:
         """Read the port until its end, and put the events of the readings into the queue.
 
+        The watch finds steady presses in the readings. A call of `arm` in another thread makes the watch begin again.
         Each event contains the number of earlier calls of `arm`, so that events from before the last call can be
         discarded. The method runs in its own thread.
         """
-        arm_count = self._arm_count
+        arm_count = self._arm_count  # number of calls for which the watch is armed
         try:
             for chunk in self._chunks:
                 if self._stop.is_set():
                     return
-                was_armed = arm_count != self._arm_count
-                if was_armed:
+                must_be_armed = arm_count != self._arm_count
+                if must_be_armed:
                     arm_count = self._arm_count
                     self._watch.arm()
                 for reading in self._stream.feed(chunk):

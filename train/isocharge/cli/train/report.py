@@ -74,13 +74,15 @@ def report_command(
 
     Example: isocharge train report presses -o report
     """
+    # Find the datasets and, for each of them, the model to compare.
     refuse_finished(output)
     if model and len(model) != len(datasets):
         raise InputError(f"--model: expected one model for each of {len(datasets)} datasets, got {len(model)}")
     loaded_datasets = [_read_dataset(path, sensor, probe) for path in datasets]
     model_names = model or [dataset.sensor.name for dataset in loaded_datasets]
     model_folders = [find_model(name) for name in model_names]
-    student_folders = _find_students(student, model_names)
+    student_folders = _find_students(student, model_names)  # small models, which are compared as well
+
     settings = QUICK if quick else Settings()
     with shown_progress():
         record = write_report(
@@ -91,6 +93,8 @@ def report_command(
             command=this_command(),
             fresh=fresh,
         )
+
+    # Print the verdicts, with one section of the report for each dataset.
     for section in record["datasets"]:
         for sentence in section["verdict"]["sentences"]:
             say(f"{section['sensor']}: {sentence}")

@@ -88,7 +88,8 @@ def train_and_release(
 ) -> None:
     """Train a network, release it as a version folder, and print its errors.
 
-    If the command is stopped, the state of the training is kept, and the same command continues it.
+    If the command is stopped, the state of the training is kept beside the version folder, and the same command
+    continues it.
 
     Args:
         train: Function that trains the network and saves its state in the given run.
@@ -97,9 +98,10 @@ def train_and_release(
         options: Options of the command.
         write_release: Function that writes the version folder.
     """
+    model_folder = version_folder.parent
     with shown_run(version_folder), resume_parts(version_folder, identity, fresh=options.fresh) as run:
         trained = train(run)
-        released = write_release(trained, version_folder.parent, version=options.version, command=this_command())
+        released = write_release(trained, model_folder, version=options.version, command=this_command())
     if options.json:
         show_json({"folder": str(released.folder), "errors": dict(released.metadata.errors)})
     say(f"{released.folder}: {_errors_sentence(released.metadata)}")
@@ -126,6 +128,7 @@ def _measured_presses_words(metadata: ModelMetadata) -> str:
     press_count = metadata.errors.get("measured_presses")
     if not press_count:
         return ""
+    # The metadata of a model that was trained on presses alone contain the number of folds of the cross-validation.
     is_cross_validated = "folds" in metadata.made_with.get("measured", {})
     if is_cross_validated:
         return f"on {press_count:.0f} measured presses at places that were left out, "

@@ -86,9 +86,11 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
         PressError: If the records of the presses are impossible, or no film explains them. The message names the
             reason if it is found.
     """
-    presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
+    presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)  # columns in the order of the sensor
     presses, domain_cautions = _checked_presses(presses, problem)
 
+    # The estimate holds at the mean temperature of the presses. The estimate of an earlier calibration is therefore
+    # converted to this temperature before the fit.
     at_C = None
     if presses.knows_temperature:
         at_C = float(temperatures(presses).mean())
@@ -100,7 +102,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
         side_force_map = None
         if problem.friction > 0.0:
             posterior, side_force_map = _fit_with_friction(problem, data, posterior, at_C)
-        elif problem.side_force > 0.0:
+        elif problem.side_force > 0.0:  # only later contacts have side forces, so the fit does not change
             side_force_map = solve_side_forces(problem.charges, posterior.parameters)
 
     _refuse_unexplained(presses, problem, posterior)
@@ -128,8 +130,11 @@ def _checked_presses(presses: MeasuredPresses, problem: CalibrationProblem) -> t
     check_channels(presses, problem.charges)
     _check_enough_measured(presses, problem)
     inside_presses, cautions = _within_domain(presses, problem)
+
+    # Presses that differ much from all films are refused only if a mistake explains them. Otherwise, the fit decides.
     is_far_from_films = misfit(inside_presses, problem.charges) > MISLEADING_MISFIT
     if is_far_from_films and find_mistakes(inside_presses, problem.charges):
+        # A closed back can look like a mistake, so it is examined first.
         refuse_closed_back(inside_presses, problem.charges)
         raise unexplained_error(inside_presses, problem.charges, FAR_FROM_ALL_FILMS)
     return inside_presses, cautions
@@ -152,16 +157,17 @@ def _fit_with_friction(
     Returns:
         The estimate of the film, and the effects of side forces from which it was computed.
     """
-    friction_coefficient = problem.friction
+    expected_friction = problem.friction
+    estimated_friction = expected_friction
     for _ in range(MAX_FRICTION_ROUNDS):
         side_force_map = solve_side_forces(problem.charges, posterior.parameters)
-        data_with_friction = with_friction(
-            data, problem.charges, side_force_map, posterior.contact, friction_coefficient
-        )
-        fitted = fit_film(problem.charges, data_with_friction, problem.before, at_C, friction=problem.friction)
-        parameter_change = np.abs(fitted.parameters - posterior.parameters) / problem.prior.std
-        posterior = fitted
-        friction_coefficient = posterior.nuisances[FRICTION.name].value
+        data_with_friction = with_friction(data, problem.charges, side_force_map, posterior.contact, estimated_friction)
+
+        # Each fit begins again from the estimates before the presses, of the film and of the friction.
+        previous = posterior
+        posterior = fit_film(problem.charges, data_with_friction, problem.before, at_C, friction=expected_friction)
+        estimated_friction = posterior.nuisances[FRICTION.name].value
+        parameter_change = np.abs(posterior.parameters - previous.parameters) / problem.prior.std
         if parameter_change.max() < MAX_FRICTION_STEP:
             break
     return posterior, side_force_map
@@ -173,6 +179,9 @@ def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tup
     Args:
         presses: The presses.
         problem: The possible films, which have charges only within a domain.
+
+    Returns:
+        The presses within the domain, and the warning; an empty list if all presses lie within the domain.
 
     Raises:
         PressError: If more than half of the presses lie outside.
@@ -189,7 +198,7 @@ def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tup
     )
     is_mostly_outside = is_outside.mean() > 0.5
     if is_mostly_outside and len(presses) == 1:
-        raise PressError(sentence)
+        raise PressError(sentence)  # a single press does not suggest a mistake in all records, such as a wrong unit
     if is_mostly_outside:
         raise unexplained_error(presses, problem.charges, MOSTLY_OUTSIDE)
     return presses[~is_outside], [f"{sentence}; left out"]
@@ -208,7 +217,7 @@ def _scaled_by_scatter(posterior: FilmPosterior) -> tuple[FilmPosterior, list[st
         The estimate, and a caution if the errors were increased.
     """
     chi2, degrees_of_freedom = posterior.total
-    if degrees_of_freedom == 0.0:
+    if degrees_of_freedom == 0.0:  # without redundant measurements, no scatter can be observed
         return posterior, []
     probability_of_chance = chi_square.probability_above(chi2, degrees_of_freedom)
     if probability_of_chance >= UNCERTAIN_PROBABILITY:
@@ -256,17 +265,19 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
     film_probability = chi_square.probability_above(squared_distance, deviation.size)
     is_improbable = film_probability < STRAINED_PROBABILITY
 
+    # Mistakes are searched for only if the film is unusual: it is imperfect or improbable, or presses were left out.
     is_unusual = posterior.imperfect or posterior.bad.any() or film_probability < ODD_PROBABILITY
     is_mistaken = is_unusual and bool(find_mistakes(presses, problem.charges))
     if not (is_unexplained or is_improbable or is_mistaken):
         return
 
-    refuse_closed_back(presses, problem.charges)
-    reason = UNUSUAL_FILM
+    refuse_closed_back(presses, problem.charges)  # raises a more specific error if the back is closed
     if is_unexplained or is_improbable:
-        press_ratio = chi2 / max(degrees_of_freedom, 1.0)
-        film_ratio = squared_distance / deviation.size
-        reason = large_residual(float(np.sqrt(max(press_ratio, film_ratio))))
+        mean_square_of_presses = chi2 / max(degrees_of_freedom, 1.0)
+        mean_square_of_film = squared_distance / deviation.size
+        reason = large_residual(float(np.sqrt(max(mean_square_of_presses, mean_square_of_film))))
+    else:
+        reason = UNUSUAL_FILM
     raise unexplained_error(presses, problem.charges, reason)
 
 
@@ -281,6 +292,8 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
         before: The estimate before the presses.
     """
     # Presses that were left out as wrong make further mistakes likely, unless many good presses agree with each other.
+    # The probability is a rule of thumb: it is proportional to the number of presses that were left out, and inversely
+    # proportional to the square of the number of good presses.
     good_count = int((~posterior.bad).sum())
     left_out_count = int(posterior.bad.sum())
     mistake_probability = min(left_out_count / (good_count * good_count), MAX_MISTAKE_PROBABILITY)
@@ -288,8 +301,9 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
         mistake_probability += MISTAKE_PROBABILITY * good_count
     correct_probability = 1.0 - mistake_probability
 
+    # Mean of the covariances of both cases. The estimate before the presses contains only the first of the unknowns of
+    # the posterior.
     joint = correct_probability * posterior.joint
-    # The estimate before the presses contains the first of the unknowns of the posterior.
     prior_unknowns = slice(0, len(before.unknowns))
     joint[prior_unknowns, prior_unknowns] += mistake_probability * before.unknown_covariance
     parameters = slice(0, len(before.parameters))
@@ -319,8 +333,11 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
             f"only {len(good)} {noun}: a wrong one among so few cannot be recognised, and the stated errors include "
             "this possibility; with more than three presses they become much smaller"
         )
+    # A calibration describes the effect of a closed back by imperfections of the film.
     if posterior.imperfect and has_closed_back(good, problem.charges):
         yield CLOSED_BACK_CAUTION
+
+    # Nuisances are effects of the session that are not properties of the film, such as a drift of the charges.
     for nuisance in NUISANCES:
         if posterior.probability(nuisance.name) > PROBABLE:
             yield nuisance.caution(posterior.nuisances[nuisance.name])
@@ -352,7 +369,7 @@ def _position_cautions(presses: MeasuredPresses) -> Iterator[str]:
             "no position is known: positions will be correct only up to the shift and the rotation of the electrodes, "
             "and only if the charges are in the right columns"
         )
-    elif len(positions) > 1:
+    elif len(positions) > 1:  # a single position has no extent
         extent_mm = np.ptp(positions, axis=0).max()
         if extent_mm < CLOSE_MM:
             yield (

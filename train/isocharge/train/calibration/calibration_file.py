@@ -149,7 +149,7 @@ def _temperature_table(posterior: FilmPosterior) -> dict[str, Any] | None:
         return None
     film_covariance = posterior.joint if posterior.imperfect else posterior.covariance
     film_std = np.sqrt(np.diag(film_covariance))
-    covariance_with_film = warming.covariance[: film_std.size]  # without the unknowns that are not in the file
+    covariance_with_film = warming.covariance[: film_std.size]  # the unknowns in the file are the first ones
     correlations = _divide_by_std(covariance_with_film, warming.std * film_std)
     return {
         "at_C": warming.at_C,
@@ -194,6 +194,7 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
         coefficients, film_std = _read_coefficients(path, table.discrepancy, problem, parameter_std)
         film_correlations = _film_correlations(path, table.discrepancy, film_std, parameter_correlations)
 
+    # If the film changes with temperature, its correlations are checked together with those of the change.
     if table.temperature is None:
         film_covariance = _positive_semidefinite(path, film_correlations) * np.outer(film_std, film_std)
         warming = None
@@ -377,6 +378,7 @@ def _with_temperature(path: Path, table: _Temperature, correlations: Array, std:
                 f"{path}: temperature.pretension_per_K.{key}: expected at most {largest_Pa_per_K:g} Pa/K, "
                 f"got {number:g}"
             )
+    # A file without these correlations is of an older version, in which the change was uncorrelated with the film.
     given_row: list[Correlation] = table.correlations or [0.0] * std.size
     if len(given_row) != std.size:
         raise PressError(

@@ -56,20 +56,22 @@ def has_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> bool:
     placed = presses[presses.placed]
     if not len(placed):
         return False
+    # If there are fewer presses than rows, some rows are equal, and each press is examined only once.
     evenly_spaced_rows = np.linspace(0, len(placed) - 1, MAX_EXAMINED).round().astype(int)
     examined = placed[np.unique(evenly_spaced_rows)]
 
     # The charges are computed for a few pretensions, and interpolated between them.
     vented_charges = _interpolated(expected_charges(charges, examined.contact))
     vented_misfit = charge_misfit(charges, examined.contact, examined.charge_pC, vented_charges)
-    needs_other_explanation = MIN_VENTED_MISFIT < vented_misfit < np.inf
-    if not needs_other_explanation:
+    is_explained = vented_misfit <= MIN_VENTED_MISFIT
+    is_comparable = vented_misfit < np.inf  # the misfit is infinite if many presses lie outside the domain
+    if is_explained or not is_comparable:
         return False
 
     contact = charges.into_domain(examined.contact)
     try:
         solved_charges = np.array([_closed_charges(charges, share, contact) for share in PRETENSIONS])
-    except (SceneError, SolveError):
+    except (SceneError, SolveError):  # a film with a closed back cannot be solved, so nothing is known about the back
         return False
     closed_charges = _interpolated(solved_charges)
     closed_misfit = charge_misfit(charges, examined.contact, examined.charge_pC, closed_charges)
@@ -124,10 +126,10 @@ def _closed_charges(charges: FilmCharges, pretension_share: float, contact: Arra
     parameters[prior.index("pretension")] = pretension_share * prior.spread.pretension
     sensor, probe = prior.film(parameters)
     back_volume = CAVITY_DEPTH_mm * np.pi * sensor.film.radius**2
-    closed = replace(sensor, film=replace(sensor.film, back_volume=back_volume))
+    closed_sensor = replace(sensor, film=replace(sensor.film, back_volume=back_volume))
     settings = SolveSettings(accuracy=ACCURACY)
     charge_rows = []
     for x, y, force in contact.tolist():
-        solved_press = press(closed.coated_film, probe, (x, y), force, settings)
-        charge_rows.append(touch_charge(closed, solved_press))
+        solved_press = press(closed_sensor.coated_film, probe, (x, y), force, settings)
+        charge_rows.append(touch_charge(closed_sensor, solved_press))
     return np.array(charge_rows)

@@ -138,7 +138,7 @@ class ContactSensitivity:
             contact_jacobian=-(whitened_gain @ film_slopes),
             noise_covariance=noise_covariance,
             misfit_jacobian=derivatives_with_adjusted_contacts(film_slopes, contact_slopes),
-            log_charge_jacobian=film_slopes * (sigma / charge)[:, :, None],
+            log_charge_jacobian=film_slopes * (sigma / charge)[:, :, None],  # from units of the noise to ln Q
             charge_gain=whitened_gain / sigma[:, None, :],
         )
 
@@ -239,7 +239,8 @@ def _information_roots(
 ) -> Array:
     """Compute a matrix R for each press whose product R' R is the information of the press.
 
-    The rows of R are the derivatives of the residuals of the charges and of the measured contact (x, y, ln F). The
+    The rows of R are the derivatives of the residuals of the charges and of the measured contact (x, y, ln F) with
+    respect to the unknowns of the film. The contact of the press is adjusted to each change of the unknowns. The
     arguments are those of `information_of`.
 
     Returns:
@@ -247,7 +248,8 @@ def _information_roots(
     """
     contact_slopes, film_slopes = _whitened_slopes(problem, parameters, contact)
 
-    # The measured contact is the contact itself with errors, so it does not depend on the film.
+    # The contact that the rig measures depends only on the contact itself. Each coordinate has its own error, so its
+    # derivatives form a diagonal matrix. The derivatives with respect to the film are zero.
     rig_weights = np.array([1.0 / position_std_mm, 1.0 / position_std_mm, 1.0 / force_std])
     rig_contact_slopes = np.broadcast_to(np.diag(rig_weights), (len(contact), 3, 3))
     rig_film_slopes = np.zeros((len(contact), 3, film_slopes.shape[2]))
@@ -308,20 +310,23 @@ def next_presses(
         PressError: If all candidate positions are avoided.
         SceneError: If even the smallest force exceeds the stress limit.
     """
-    film = film or problem.expected
-    sensitivity = ContactSensitivity.at(problem, film.unknowns)
+    if film is None:
+        film = problem.expected
     if avoid_mm is None:
         avoid_mm = np.empty((0, 2))
+    sensitivity = ContactSensitivity.at(problem, film.unknowns)
     candidates = _candidates(problem.domain.radius, problem.proposed_forces, avoid_mm)
-    # R of each candidate, shape (n_candidate, n_residual, n_unknown)
+    # For each candidate, the matrix R whose product R' R is the information that the press adds about the film, shape
+    # (n_candidate, n_residual, n_unknown)
     information_roots = _information_roots(problem, film.unknowns, candidates, position_std_mm, force_std)
     error_weights = sensitivity.error_weights()
+
     covariance = film.unknown_covariance  # after each round, the covariance that is expected after the chosen presses
     proposed = []
     for _ in range(count):
-        best, covariance = _best_candidate(information_roots, covariance, error_weights)
+        best_index, covariance = _best_candidate(information_roots, covariance, error_weights)
         error = sensitivity.contact_error(covariance)
-        x, y, force = candidates[best].tolist()
+        x, y, force = candidates[best_index].tolist()
         proposed.append(ProposedPress(x, y, force, error.position_mm, error.force_percent))
     return proposed
 
@@ -345,10 +350,12 @@ def _best_candidate(information_roots: Array, covariance: Array, error_weights: 
     innovation = np.eye(n_residual) + projection @ information_roots.swapaxes(1, 2)  # 1 + R C R'
     weighted_projection = projection @ error_weights @ projection.swapaxes(1, 2)  # R C S C R'
     error_reduction = np.einsum("nij,nji->n", np.linalg.inv(innovation), weighted_projection)  # traces of products
-    best = int(np.argmax(error_reduction))
+    best_index = int(np.argmax(error_reduction))
+
     # (R C)' (1 + R C R')^-1 (R C) of the best candidate
-    covariance_reduction = projection[best].T @ np.linalg.solve(innovation[best], projection[best])
-    return best, covariance - covariance_reduction
+    best_projection = projection[best_index]
+    covariance_reduction = best_projection.T @ np.linalg.solve(innovation[best_index], best_projection)
+    return best_index, covariance - covariance_reduction
 
 
 def _candidates(radius: float, force_range: tuple[float, float], avoid_mm: Array) -> Array:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array, Integers
+from isocharge.simulate import Domain, ForwardMap
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.numerics.disk_least_squares import minimise
 from isocharge.train.calibration.film_charges import FilmCharges
@@ -78,21 +79,68 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
         data: The presses.
         start: Contacts (x, y, ln F) at which the search begins, shape (n, 3).
     """
-    layout = charges.layout
+    residuals = _ContactResiduals.of(charges, unknowns, data, start)
     domain = charges.domain
-    films, film_weights = neighbouring_films(charges, unknowns, data)
-    forward_maps = [charges.forward_map(film[layout.parameters]) for film in films]
+    scaled_start = (start - domain.centre) / domain.scale
+    scaled_contact, residual = minimise(residuals.at, scaled_start, min_change=MIN_CHANGE)
+    return AdjustedContacts(scaled_contact * domain.scale + domain.centre, residual)
 
-    # The factor of imperfections and discrepancy on the charges changes slowly with the contact. It takes long to
-    # compute, so it is approximated as a linear function of the contact about the start.
-    start_factor = np.ones_like(data.charge)
-    factor_slopes = np.zeros((*data.charge.shape, 3))
-    if unknowns[layout.coefficients].any():
-        film_factors = [_values_and_slopes(partial(charges.factor, film), with_force(start)) for film in films]
-        start_factor, factor_slopes = _interpolated(film_factors, film_weights)
 
-    def residuals(rows: Integers, scaled_contact: Array) -> tuple[Array, Array]:
-        """Return the residuals of some presses, and their derivatives with respect to the scaled contact.
+class _ContactResiduals(NamedTuple):
+    """Residuals of presses on one film as a function of the contacts, in the form that `minimise` expects.
+
+    The charge of a press is interpolated between films with neighbouring pretensions. It is the product of the charge
+    without coefficients and of a factor by the coefficients (imperfections and discrepancy). The factor changes slowly
+    with the contact and takes long to compute, so it is approximated as a linear function of the contact.
+
+    Attributes:
+        domain: Contacts for which the films have charges.
+        data: The presses.
+        forward_maps: Forward map of each of k films, between which the charges are interpolated.
+        film_weights: Weight of each film in each press, shape (n, k).
+        start: Contacts (x, y, ln F) about which the factor is linear, shape (n, 3).
+        start_factor: Factors at these contacts, shape (n, n_electrode).
+        factor_slopes: Derivatives of the factors with respect to (x, y, ln F), shape (n, n_electrode, 3).
+    """
+
+    domain: Domain
+    data: PressData
+    forward_maps: list[ForwardMap]
+    film_weights: Array
+    start: Array
+    start_factor: Array
+    factor_slopes: Array
+
+    @classmethod
+    def of(cls, charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> "_ContactResiduals":
+        """Compute everything that does not depend on the contacts of the search.
+
+        Args:
+            charges: The films.
+            unknowns: Unknowns of the film under the presses, as `FilmCharges.film` takes them.
+            data: The presses.
+            start: Contacts (x, y, ln F) at which the search begins, shape (n, 3).
+        """
+        layout = charges.layout
+        films, film_weights = neighbouring_films(charges, unknowns, data)
+        forward_maps = [charges.forward_map(film[layout.parameters]) for film in films]
+        start_factor = np.ones_like(data.charge)
+        factor_slopes = np.zeros((*data.charge.shape, 3))
+        if unknowns[layout.coefficients].any():  # without coefficients, the factor is 1
+            film_factors = [_values_and_slopes(partial(charges.factor, film), with_force(start)) for film in films]
+            start_factor, factor_slopes = _interpolated(film_factors, film_weights)
+        return cls(
+            domain=charges.domain,
+            data=data,
+            forward_maps=forward_maps,
+            film_weights=film_weights,
+            start=start,
+            start_factor=start_factor,
+            factor_slopes=factor_slopes,
+        )
+
+    def at(self, rows: Integers, scaled_contact: Array) -> tuple[Array, Array]:
+        """Compute the residuals of some presses, and their derivatives with respect to the scaled contact.
 
         Args:
             rows: Indices of the presses, shape (k,).
@@ -101,40 +149,43 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
         Returns:
             Residuals, shape (k, n_electrode + 3), and derivatives, shape (k, 3, n_electrode + 3).
         """
-        contact = scaled_contact * domain.scale + domain.centre
-        displacement = (contact - start[rows])[:, None]  # shape (k, 1, 3)
-        factor = start_factor[rows] + (factor_slopes[rows] * displacement).sum(axis=2)
-        film_charges = [_values_and_slopes(forward_map.charges, with_force(contact)) for forward_map in forward_maps]
-        charge, charge_slopes = _interpolated(film_charges, film_weights[rows])
+        contact = scaled_contact * self.domain.scale + self.domain.centre  # (x, y, ln F)
+        film_charges = [
+            _values_and_slopes(forward_map.charges, with_force(contact)) for forward_map in self.forward_maps
+        ]
+        charge, charge_slopes = _interpolated(film_charges, self.film_weights[rows])
+
+        # Linear approximation of the factor about the start
+        factor_slopes = self.factor_slopes[rows]  # shape (k, n_electrode, 3)
+        displacement = (contact - self.start[rows])[:, None]  # shape (k, 1, 3)
+        factor = self.start_factor[rows] + (factor_slopes * displacement).sum(axis=2)
 
         # Derivatives of factor * charge by the product rule, shape (k, n_electrode, 3)
-        product_slopes = factor[:, :, None] * charge_slopes + charge[:, :, None] * factor_slopes[rows]
-        presses = data[rows]
-        residual_slopes = presses.residual_slopes(product_slopes) * domain.scale  # per unit of the scaled contact
+        product_slopes = factor[:, :, None] * charge_slopes + charge[:, :, None] * factor_slopes
+        presses = self.data[rows]
+        residual_slopes = presses.residual_slopes(product_slopes) * self.domain.scale  # per unit of the scaled contact
         return presses.residual(factor * charge, contact), residual_slopes.swapaxes(1, 2)
-
-    scaled_start = (start - domain.centre) / domain.scale
-    scaled_contact, residual = minimise(residuals, scaled_start, min_change=MIN_CHANGE)
-    return AdjustedContacts(scaled_contact * domain.scale + domain.centre, residual)
 
 
 def neighbouring_films(charges: FilmCharges, unknowns: Array, data: PressData) -> tuple[list[Array], Array]:
     """Return films with different pretensions, between which the charges of each press are interpolated.
 
-    The pretension of the film may differ from press to press, for example because of the temperature.
+    The pretension of the film may differ from press to press, for example because of the temperature. The returned
+    films are copies of the given film that differ only in their pretension.
 
     Args:
         charges: The films.
         unknowns: Unknowns of the film.
-        data: The presses.
+        data: The presses, with the change of the pretension during each press.
 
     Returns:
         The unknowns of k films, and their weights in each press, shape (n, k).
     """
-    pretension = charges.layout.parameter("pretension")
+    pretension = charges.layout.parameter("pretension")  # index in the vector of unknowns
     lower, upper = charges.prior.bounds
     pretension_bounds = float(lower[pretension]), float(upper[pretension])
     node_pretensions, film_weights = data.pretension_nodes(float(unknowns[pretension]), pretension_bounds)
+
     films = []
     for node_pretension in node_pretensions:
         film = unknowns.copy()
@@ -187,7 +238,7 @@ def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tu
         Values, shape (n, n_electrode). Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3).
     """
     x_step, y_step, log_force_step = CONTACT_STEPS
-    # One call for the contacts and for the three displaced copies of them.
+    # One call for the contacts and for the three displaced copies of them, because this is faster than four calls.
     displaced = np.repeat(contact[None], 4, axis=0)
     displaced[1, :, 0] += x_step
     displaced[2, :, 1] += y_step
@@ -205,10 +256,8 @@ def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tu
 def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> Array:
     """Return the initial contacts of the search for the adjusted contacts.
 
-    The search begins at the contact that the rig measured. If the position of a press is unknown, `CANDIDATE_POSITIONS`
-    positions are compared. The search begins at the position where the ratios between the charges of the film are
-    closest to the measured ratios. The ratios hardly depend on the stiffness and on the coefficients of the film, which
-    are not known yet.
+    The search begins at the contact that the rig measured. If the position of a press is unknown, it begins at the
+    position where the ratios between the charges of the film are most similar to the measured ratios.
 
     Args:
         charges: The films.
@@ -220,20 +269,37 @@ def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> Ar
     """
     start = data.contact.copy()
     is_position_unknown = ~data.has_place
-    if not is_position_unknown.any():
-        return start
+    if is_position_unknown.any():
+        start[is_position_unknown, :2] = _most_similar_positions(charges, unknowns, data[is_position_unknown])
+    return start
 
-    # Candidates (x, y, F) with a typical force, from positions x + i y that are distributed evenly over the domain.
-    lattice = charges.domain.radius * sunflower(CANDIDATE_POSITIONS)
-    typical_force = np.exp(np.median(data.contact[is_position_unknown, 2]))
-    candidates = np.column_stack([lattice.real, lattice.imag, np.full(CANDIDATE_POSITIONS, typical_force)])
 
-    log_charge = np.log(np.maximum(data.charge[is_position_unknown], 1.0))
-    log_measured = np.where(data.has_charge[is_position_unknown], log_charge, np.nan)
+def _most_similar_positions(charges: FilmCharges, unknowns: Array, data: PressData) -> Array:
+    """Find the positions where the ratios between the charges of a film are most similar to the measured ratios.
+
+    For each press, `CANDIDATE_POSITIONS` positions are compared. Ratios are used because they hardly depend on the
+    stiffness and on the coefficients of the film, which are not known yet.
+
+    Args:
+        charges: The films.
+        unknowns: Unknowns of the film.
+        data: The presses.
+
+    Returns:
+        Positions (x, y), shape (n, 2), mm.
+    """
+    # Candidates (x, y, F) with a typical force, from positions x + i y that are distributed evenly over the domain
+    complex_positions = charges.domain.radius * sunflower(CANDIDATE_POSITIONS)
+    typical_force = np.exp(np.median(data.contact[:, 2]))
+    forces = np.full(CANDIDATE_POSITIONS, typical_force)
+    candidates = np.column_stack([complex_positions.real, complex_positions.imag, forces])
+    log_computed = np.log(charges.charges(unknowns, candidates))  # shape (n_candidate, n_electrode)
+
+    log_charge = np.log(np.maximum(data.charge, 1.0))  # limited to at least 1 pC, because charges may be negative
+    log_measured = np.where(data.has_charge, log_charge, np.nan)
+
     # The ratios agree if the logarithms of measured and computed charges differ by the same amount on all electrodes,
     # so that the variance of these differences is zero.
-    candidate_charge = charges.charges(unknowns, candidates)
-    log_quotient = log_measured[:, None] - np.log(candidate_charge)  # shape (n_unknown, n_candidate, n_electrode)
-    closest = np.nanvar(log_quotient, axis=2).argmin(axis=1)
-    start[is_position_unknown, :2] = candidates[closest, :2]
-    return start
+    log_quotient = log_measured[:, None] - log_computed  # shape (n, n_candidate, n_electrode)
+    most_similar = np.nanvar(log_quotient, axis=2).argmin(axis=1)
+    return candidates[most_similar, :2]

@@ -78,23 +78,27 @@ def cross_validate(
     is_judged = complete(presses) & ~posterior.bad & ~problem.domain.is_outside(presses.contact)
     if is_judged.sum() < FEWEST_MEASURED:
         return None
+
     # Presses that cannot be judged are in no fold, so the film is fitted to them in every round.
     no_fold = -1
     fold = np.full(len(presses), no_fold)
     fold[is_judged] = folds_by_place(presses.contact[is_judged], FOLD_COUNT)
 
+    # Estimates for the presses, which are filled in fold by fold
     contact = np.empty((len(presses), 3))
     std = np.empty((len(presses), 3))
     misfit = np.empty((len(presses), 1))
     for fold_index in range(FOLD_COUNT):
         is_held_out = fold == fold_index
-        is_fitted = _thinned(~is_held_out & ~posterior.bad)
+        is_fitted = _thinned(~is_held_out & ~posterior.bad)  # not all presses if there are very many
         with threadpool_limits(1):  # many small matrices, for which a second thread only waits
             film = refit_film(
                 problem.charges, data[is_fitted], problem.before, posterior, at_C, friction=problem.friction
             )
-        answers = network_of(film).predict(presses.charge_pC[is_held_out])
-        contact[is_held_out], std[is_held_out], misfit[is_held_out] = answers
+        fold_contact, fold_std, fold_misfit = network_of(film).predict(presses.charge_pC[is_held_out])
+        contact[is_held_out] = fold_contact
+        std[is_held_out] = fold_std
+        misfit[is_held_out] = fold_misfit
 
     # The difference between estimated and measured contacts has the errors of both.
     force_N = presses.contact[:, 2]

@@ -118,7 +118,7 @@ def check_places(presses: MeasuredPresses, radius: float) -> None:
     """
     places = presses.contact[:, :2]
     distance = np.hypot(places[:, 0], places[:, 1])
-    outside_rows = np.flatnonzero(distance >= radius)
+    outside_rows = np.flatnonzero(distance >= radius)  # the comparison is false for positions that were not measured
     if outside_rows.size:
         row = outside_rows[0]
         raise PressError(
@@ -127,7 +127,7 @@ def check_places(presses: MeasuredPresses, radius: float) -> None:
         )
     measured_places = places[np.isfinite(places[:, 0])]
     spread = np.ptp(measured_places, axis=0).max() if len(measured_places) else 0.0
-    if 0.0 < spread < MIN_POSITION_RANGE_MM:
+    if 0.0 < spread < MIN_POSITION_RANGE_MM:  # repeated presses at one place, with a spread of zero, are allowed
         raise PressError(
             f"all places lie within {spread:.3g} mm of each other; positions are in mm: were they written in metres?"
         )
@@ -148,18 +148,30 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
         if np.isnan(channel_charge).all():
             raise PressError(f"electrode {name!r}: no press has a charge of it; a calibration needs all electrodes")
 
-    # The charges of each channel relative to those of the others: measured, and smallest among the films.
     ratios = _charge_ratios(charge)
-    smallest_film_ratios = np.ones_like(ratios)
-    placed_contact = presses.contact[presses.placed]
-    if len(placed_contact):
-        film_ratios = [_charge_ratios(film_charge) for film_charge in expected_charges(charges, placed_contact)]
-        smallest_film_ratios = np.minimum(np.min(film_ratios, axis=0), 1.0)
-
+    smallest_film_ratios = _smallest_film_ratios(presses, charges)
     for name, channel_charge, ratio, film_ratio in zip(
         presses.electrodes, charge.T, ratios, smallest_film_ratios, strict=True
     ):
         _check_channel(name, channel_charge, ratio, film_ratio)
+
+
+def _smallest_film_ratios(presses: MeasuredPresses, charges: FilmCharges) -> Array:
+    """Return the smallest charge of each channel on one of the films, relative to the charges of the other channels.
+
+    Args:
+        presses: The measured presses. Those with a known place and force are computed for each film.
+        charges: Charges of the films of the calibration.
+
+    Returns:
+        Ratios as in `_charge_ratios`, but not larger than 1, shape (n_electrode,). All ratios are 1 if no press has a
+        known place and force.
+    """
+    placed_contact = presses.contact[presses.placed]
+    if not len(placed_contact):
+        return np.ones(len(presses.electrodes))
+    film_ratios = [_charge_ratios(film_charge) for film_charge in expected_charges(charges, placed_contact)]
+    return np.asarray(np.minimum(np.min(film_ratios, axis=0), 1.0))
 
 
 def _check_channel(name: str, charge: Array, ratio: float, smallest_film_ratio: float) -> None:
@@ -251,19 +263,19 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     # The charges of the films are computed for all corrected contacts at once, which is faster.
     all_contacts = np.concatenate([correction.contact for correction in corrections])
     charges_by_correction = np.split(expected_charges(charges, all_contacts), len(corrections), axis=1)
-    misfit_by_sentence = {
-        correction.sentence: charge_misfit(charges, correction.contact, correction.charge, film_charges)
-        for correction, film_charges in zip(corrections, charges_by_correction, strict=True)
-    }
+    corrected_misfits = {}  # misfit after each correction, by the sentence about the mistake
+    for correction, film_charges in zip(corrections, charges_by_correction, strict=True):
+        corrected_misfits[correction.sentence] = charge_misfit(
+            charges, correction.contact, correction.charge, film_charges
+        )
 
-    smallest_misfit = min(misfit_by_sentence.values())
     limit_for_improvement = CLEARER * misfit(presses, charges)
-    limit_for_similarity = MAX_MISFIT_RATIO * smallest_misfit
-    best_first = sorted(misfit_by_sentence.items(), key=lambda item: item[1])
+    limit_for_similarity = MAX_MISFIT_RATIO * min(corrected_misfits.values())
+    sentences_best_first = sorted(corrected_misfits, key=corrected_misfits.__getitem__)
     return [
         sentence
-        for sentence, corrected_misfit in best_first
-        if corrected_misfit < limit_for_improvement and corrected_misfit <= limit_for_similarity
+        for sentence in sentences_best_first
+        if corrected_misfits[sentence] < limit_for_improvement and corrected_misfits[sentence] <= limit_for_similarity
     ]
 
 
@@ -291,6 +303,7 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
         charge: Measured charges, shape (n, n_electrode), pC.
         expected: Charges of each film, shape (n_film, n, n_electrode), pC.
     """
+    # A contact lies outside the domain if the nearest contact of the domain is another one.
     is_outside = (charges.into_domain(contact) != contact).any(axis=1)
     if is_outside.mean() > MAX_OUTSIDE_FRACTION:
         return np.inf
@@ -334,17 +347,21 @@ def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterat
     contact = presses.contact
     charge = presses.charge_pC
     electrodes = presses.electrodes
+
+    # Swapped columns: `electrode_of_column` contains the index of the electrode whose charges each column holds.
     for electrode_of_column in _fitting_orders(presses, charges):
         held_names = ", ".join(electrodes[electrode_index] for electrode_index in electrode_of_column)
         sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {held_names}"
         column_of_electrode = np.argsort(electrode_of_column)  # the inverse permutation
         yield Correction(sentence, contact, charge[:, column_of_electrode])
 
+    # Rotated or reflected axes
     for description, matrix in AXES:
         position = contact[:, :2] @ matrix.T
         rotated_contact = np.column_stack([position, contact[:, 2]])
         yield Correction(f"the rig's axes are not the film's: {description}", rotated_contact, charge)
 
+    # Wrong units, each of either the positions, the forces or the charges
     for unit in OTHER_UNITS:
         position_factor = unit.factor if unit.values == "positions" else 1.0
         force_factor = unit.factor if unit.values == "forces" else 1.0
@@ -374,8 +391,10 @@ def _fitting_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple
     for expected in expected_charges(charges, presses.contact):
         log_expected = _log_charge(expected)
         log_ratio = log_measured[:, :, None] - log_expected[:, None]  # shape (n, n_column, n_electrode)
-        # The median is subtracted, because a common factor of all charges does not matter.
+        # The median is subtracted, because a common factor of all charges does not matter. The limit reduces the effect
+        # of outliers.
         squared_deviation = np.minimum((log_ratio - np.nanmedian(log_ratio)) ** 2, MAX_SQUARED_DEVIATION)
+        # The best assignment has the smallest sum of these distances, with each electrode assigned to one column.
         distance = np.nansum(squared_deviation, axis=0)  # shape (n_column, n_electrode)
         _, electrode_of_column = linear_sum_assignment(distance)
         orders.add(tuple(electrode_of_column.tolist()))

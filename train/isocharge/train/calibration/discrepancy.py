@@ -44,8 +44,11 @@ area, the error of this approximation is below the noise."""
 def terms(contact: Array, domain: Domain) -> Array:
     """Compute the polynomials of the discrepancy, each times the standard deviation of its coefficient.
 
-    The standard deviations are those for a discrepancy of the size s = 1. For a contact outside the domain, the values
-    at the nearest contact of the domain are returned.
+    The discrepancy of a film is a smooth function of the contact that is added to the logarithms of its charges. Its
+    terms are the products T_i(x / r) T_j(y / r) T_m(l) of Chebyshev polynomials, where r is the radius of the domain
+    and l is the logarithm of the force, scaled to [-1, 1]. The standard deviation of a coefficient is
+    FADING^(i + j + m) for a discrepancy of the size 1. For a contact outside the domain, the values at the nearest
+    contact of the domain are returned.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -60,7 +63,7 @@ def terms(contact: Array, domain: Domain) -> Array:
     unit_contact[:, :2] /= np.maximum(distance, 1.0)[:, None]  # changes only positions outside the unit disk
     unit_contact[:, 2] = np.clip(unit_contact[:, 2], -1.0, 1.0)
 
-    # Polynomials of each coordinate, shape (n, DEGREE + 1), from which the products are selected by their degrees
+    # Polynomials of all degrees in each coordinate, shape (n, DEGREE + 1), from which those of each term are selected
     x_values, y_values, force_values = (chebyshev.chebvander(column, DEGREE) for column in unit_contact.T)
     degrees = _degrees()
     x_degree, y_degree, force_degree = degrees.T

@@ -113,8 +113,9 @@ class FilmCharges(FilmMaps):
     def factor(self, unknowns: Array, contact: Array, charge: Array | None = None) -> Array:
         """Compute the factors by which modes, traces and discrepancy change the charges of a film.
 
-        The discrepancy is a polynomial of the contact for ln(factor). Modes and traces with negligible coefficients are
-        left out, because their charges take time to compute.
+        Modes are imperfections of the film, such as an uneven tension. Traces are lines to the electrodes that collect
+        charge. The discrepancy is a polynomial of the contact for ln(factor). Modes and traces with negligible
+        coefficients are left out, because their charges take time to compute.
 
         Args:
             unknowns: Parameters and coefficients, as in `film`.
@@ -158,14 +159,18 @@ class FilmCharges(FilmMaps):
         mode_coefficients = unknowns[layout.modes]
         trace_coefficients = unknowns[layout.traces]
         factor = np.ones_like(charge)
+
+        # First order: the added charges are proportional to the coefficients.
         if np.abs(trace_coefficients).max() > NEGLIGIBLE:
             forward_map = self.forward_map(parameters)
             trace_jacobian = trace_charges(forward_map, self._trace_lines, contact)  # shape (n, n_electrode, n_trace)
             factor += trace_jacobian @ trace_coefficients / charge
-        if np.abs(mode_coefficients).max(initial=0.0) > NEGLIGIBLE:
+        if np.abs(mode_coefficients).max(initial=0.0) > NEGLIGIBLE:  # there may be no modes
             modes = self._mode_charges(parameters, contact, charge)
-            unevenness, _ = self._unevenness(self._pretension(parameters), mode_coefficients)
             factor += modes.mode_jacobian @ mode_coefficients / charge
+
+            # Second order: an uneven tension acts like a lower mean tension.
+            unevenness, _ = self._unevenness(self._pretension(parameters), mode_coefficients)
             factor *= np.exp(unevenness * modes.log_unevenness)
         return np.maximum(factor, MIN_FACTOR)
 
@@ -176,8 +181,9 @@ class FilmCharges(FilmMaps):
     def _mode_charges(self, parameters: Array, contact: Array, charge: Array) -> ModeCharges:
         """Return the effects of the modes on the charges of presses, from a cache if possible.
 
-        The cache contains the results for two films. A result is used again for the same sensor and contacts. For other
-        contacts on the same film, only its modes are used again.
+        The modes depend only on the film and the probe, but their charges also depend on the sensor and on the
+        contacts. A cached result is therefore returned for the same film, probe, sensor and contacts. If only film and
+        probe are the same, the modes are taken from the cache, and their charges are computed.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -190,9 +196,8 @@ class FilmCharges(FilmMaps):
             no_modes = np.zeros((*charge.shape, 0))
             return ModeCharges(None, sensor, contact, mode_jacobian=no_modes, log_unevenness=np.zeros_like(charge))
 
-        # The modes depend only on film and probe. Their charges also depend on the sensor and on the contacts.
-        key = (sensor.film, forward_map.probe)
-        cached = self._cached_modes.get(key)
+        film_and_probe = (sensor.film, forward_map.probe)
+        cached = self._cached_modes.get(film_and_probe)
         if cached is not None and cached.sensor == sensor and np.array_equal(cached.contact, contact):
             return cached
         if cached is not None and cached.modes is not None:
@@ -200,13 +205,16 @@ class FilmCharges(FilmMaps):
         else:
             modes = self.family.imperfections.mode_map(forward_map, self.modes)
         computed = self._computed_mode_charges(modes, forward_map, parameters, contact, charge)
+        self._cache_mode_charges(film_and_probe, computed)
+        return computed
 
-        is_cache_full = len(self._cached_modes) > 1
-        if key not in self._cached_modes and is_cache_full:
+    def _cache_mode_charges(self, film_and_probe: tuple[Film, Probe], computed: ModeCharges) -> None:
+        """Store a result of `_mode_charges`. The cache contains the results for at most two films."""
+        is_full = len(self._cached_modes) > 1
+        if is_full and film_and_probe not in self._cached_modes:
             oldest_key = next(iter(self._cached_modes))
             del self._cached_modes[oldest_key]
-        self._cached_modes[key] = computed
-        return computed
+        self._cached_modes[film_and_probe] = computed
 
     def _computed_mode_charges(
         self, modes: ModeMap, forward_map: ForwardMap, parameters: Array, contact: Array, charge: Array
@@ -224,7 +232,7 @@ class FilmCharges(FilmMaps):
         sensor = forward_map.sensor
         fields = replace(modes.fields, sensor=sensor) if modes.fields is not None else None
         modes_of_sensor = replace(modes, film=forward_map, fields=fields)
-        mode_jacobian = modes_of_sensor.mode_jacobian(contact) * self._mode_stds
+        mode_jacobian = modes_of_sensor.mode_jacobian(contact) * self._mode_stds  # per standard deviation of each mode
 
         pretension_derivative = self.difference("pretension", parameters, contact, charge)
         log_tension_derivative = self._pretension(parameters) * pretension_derivative / charge  # d ln Q / d ln T
@@ -359,8 +367,9 @@ class FilmCharges(FilmMaps):
     def _load_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
         """Compute the derivatives of ln(factor of modes and traces) with respect to pretension, ln E and ln h.
 
-        Like the charges, the factor depends only on F / (E h a) and T / E. Two finite differences therefore determine
-        all three derivatives.
+        T is the pretension, E is Young's modulus, h is the thickness, and a is the radius of the film. Like the
+        charges, the factor depends on them only through F / (E h a) and T / E. Two finite differences, one with respect
+        to ln F and one with respect to T, therefore determine all three derivatives.
 
         Args:
             unknowns: Parameters and coefficients of the film.
@@ -368,27 +377,31 @@ class FilmCharges(FilmMaps):
 
         Returns:
             Derivatives by the name of the parameter, each of shape (n, n_electrode). There are none if the
-            coefficients are small.
+            coefficients of modes and traces are small, because the derivatives are negligible then.
         """
-        film = self._without_terms(unknowns)
+        film = self._without_terms(unknowns)  # the discrepancy does not depend on the parameters
         if np.abs(film[self.layout.imperfections]).max() < LARGEST_LOCAL_COEFFICIENT:
             return {}
+
+        # Finite difference with respect to ln F
         factor = self.factor(film, contact)
         _, _, log_force_step = CONTACT_STEPS
         factor_with_force = self.factor(film, contact * [1.0, 1.0, np.exp(log_force_step)])
         force_derivative = (factor_with_force - factor) / log_force_step
 
+        # Finite difference with respect to T
         film_with_tension, step = self._stepped(film, "pretension")
         tension_step = step * self.prior.std[self.layout.parameter("pretension")]
         tension_derivative = (self.factor(film_with_tension, contact) - factor) / tension_step
 
-        # Chain rule for factor = f(F / (E h a), T / E)
+        # Chain rule for factor = f(F / (E h a), T / E): d/d ln h = -d/d ln F, and d/d ln E = -d/d ln F - T d/dT
         derivatives = {
             "pretension": tension_derivative,
             "young": -force_derivative - self._pretension(film) * tension_derivative,
             "thickness": -force_derivative,
         }
-        return {name: derivative / np.maximum(factor, MIN_FACTOR) for name, derivative in derivatives.items()}
+        positive_factor = np.maximum(factor, MIN_FACTOR)
+        return {name: derivative / positive_factor for name, derivative in derivatives.items()}  # of ln(factor)
 
     def _trace_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
         """Compute the derivatives of ln(factor of traces) with respect to the parameters that do not change the load.
@@ -404,6 +417,7 @@ class FilmCharges(FilmMaps):
             Derivatives with respect to each parameter over its prior standard deviation, by the name of the parameter,
             each of shape (n, n_electrode).
         """
+        # A film with the traces alone. The factors of discrepancy and modes are assumed not to change.
         film = self._without_terms(unknowns)
         film[self.layout.modes] = 0.0
         factor = self.factor(film, contact)
@@ -413,5 +427,5 @@ class FilmCharges(FilmMaps):
                 continue
             stepped_film, step = self._stepped(film, name)
             derivative = (self.factor(stepped_film, contact) - factor) / step
-            log_derivatives[name] = derivative / np.maximum(factor, MIN_FACTOR)
+            log_derivatives[name] = derivative / np.maximum(factor, MIN_FACTOR)  # d ln f = df / f
         return log_derivatives

@@ -123,10 +123,11 @@ class FilmPosterior(FilmEstimate):
         """
         if self.imperfect:
             return super().drifted(prior, knows_temperature=knows_temperature)
+
+        # Remove the coefficients of imperfections and discrepancy. The parameters are the first unknowns.
         warming = self.warming
         if warming is not None:
-            n_parameter = len(self.parameters)
-            warming = warming.with_unknowns(n_parameter)  # the parameters are the first unknowns
+            warming = warming.with_unknowns(len(self.parameters))
         parameters_only = FilmEstimate(self.parameters, self.covariance, warming=warming)
         return parameters_only.drifted(prior, knows_temperature=knows_temperature)
 
@@ -142,7 +143,8 @@ def fit_film(
     """Estimate the film from presses, and leave out bad presses.
 
     The film is fitted to all presses first. If some residuals are too large, the presses that agree with each other are
-    searched for, and only they are fitted.
+    searched for, and only they are fitted. These fits assume that the parameters of the film explain the presses alone.
+    Further fits then consider hypotheses, which are combinations of other effects, such as imperfections of the film.
 
     Args:
         charges: The films.
@@ -155,8 +157,9 @@ def fit_film(
     problem = FitProblem.of(charges, initial, knows_temperature=at_C is not None, friction=friction)
     degrees_of_freedom = _degrees_of_freedom(data)
     every_press = np.ones(len(data), dtype=bool)
-    no_effects = Hypothesis()
+    no_effects = Hypothesis()  # the hypothesis that the parameters alone explain the presses
 
+    # Fit all presses, and find the good ones among them if some residuals are too large.
     is_kept = every_press
     solved = problem.solve(data, is_kept, problem.mean, no_effects)
     can_be_judged = len(data) >= MIN_PRESSES_TO_JUDGE
@@ -164,16 +167,19 @@ def fit_film(
         is_kept, start = _agreeing_presses(problem, data, solved, degrees_of_freedom)
         kept_data = data[is_kept]
         solved = problem.solve(kept_data, np.ones(len(kept_data)), start, no_effects)
+
+    # Repeat the fit with the most probable hypothesis until the film and the selection of presses no longer change.
     settled = problem.settle(data, is_kept, degrees_of_freedom, solved, no_effects)
 
     # If the film has imperfections, the presses that were left out may be good ones. The film is fitted to all presses
     # if this is more probable than that these presses were recorded wrongly.
     if not settled.is_kept.all():
         unknowns = settled.solved.unknowns
-        film_of_all = SolvedFilm(unknowns, problem.adjusted_contacts(unknowns, data))
-        mixture_of_all = problem.mixture(data, film_of_all)
-        log_density_of_mistakes = _log_density_of_mistakes(data, ~settled.is_kept)
-        if mixture_of_all.log_evidence > settled.mixture.log_evidence + log_density_of_mistakes:
+        film_with_all_presses = SolvedFilm(unknowns, problem.adjusted_contacts(unknowns, data))
+        mixture_of_all = problem.mixture(data, film_with_all_presses)
+        log_evidence_without_mistakes = mixture_of_all.log_evidence
+        log_evidence_with_mistakes = settled.mixture.log_evidence + _log_density_of_mistakes(data, ~settled.is_kept)
+        if log_evidence_without_mistakes > log_evidence_with_mistakes:
             settled = problem.settle(data, every_press, degrees_of_freedom, settled.solved, mixture_of_all.best)
     return _posterior(problem, data, degrees_of_freedom, settled, at_C)
 
@@ -209,9 +215,12 @@ def refit_film(
     start[layout.coefficients] = previous.coefficients
     start[layout.nuisances] = [previous.nuisances[nuisance.name].value for nuisance in NUISANCES]
 
+    # A hypothesis is a combination of effects that the parameters of the film do not describe.
     every_press = np.ones(len(data), dtype=bool)
     most_probable = max(previous.probabilities, key=lambda hypothesis: previous.probabilities[hypothesis])
     solved = problem.solve(data, every_press, start, most_probable)
+
+    # With the hypothesis without effects, `settle` begins with the solved film instead of another fit.
     degrees_of_freedom = _degrees_of_freedom(data)
     settled = problem.settle(data, every_press, degrees_of_freedom, solved, Hypothesis())
     return _posterior(problem, data, degrees_of_freedom, settled, at_C)
@@ -242,10 +251,10 @@ def _is_suspicious(chi2: Array, degrees_of_freedom: Array) -> bool:
 def _agreeing_presses(
     problem: FitProblem, data: PressData, solved: SolvedFilm, degrees_of_freedom: Array
 ) -> tuple[Booleans, Array]:
-    """Find the film with which most presses agree.
+    """Find the film with which most presses agree, and the presses that agree with it.
 
     The film is fitted repeatedly. Presses with large residuals get smaller weights, as for errors with Student's t
-    distribution. Presses whose residuals remain too large are then left out.
+    distribution.
 
     Args:
         problem: The least-squares problem.
@@ -263,18 +272,30 @@ def _agreeing_presses(
         if np.abs(weight / previous_weight - 1.0).max() < WEIGHT_TOLERANCE:
             break
         solved = problem.solve(data, weight, solved.unknowns, Hypothesis())
+    return _is_good(solved.contacts.chi2, degrees_of_freedom), solved.unknowns
 
-    chi2 = solved.contacts.chi2
-    degrees_of_freedom = np.maximum(degrees_of_freedom, 1.0)
-    # The residuals of all presses may be larger than expected. The limit for bad presses is then increased by the same
-    # factor.
-    expected_median = np.maximum(chi_square.value_exceeded_with(0.5, degrees_of_freedom), 0.1)
+
+def _is_good(chi2: Array, degrees_of_freedom: Array) -> Booleans:
+    """Return which presses agree with a film, shape (n,). If most presses do not agree, all count as good.
+
+    A press agrees if chance explains its residuals with a probability of `BAD_PROBABILITY` or more, corrected for the
+    number of presses (Bonferroni).
+
+    Args:
+        chi2: Sum of squared residuals of each press, shape (n,).
+        degrees_of_freedom: Number of redundant measurements of each press, shape (n,).
+    """
+    # The distribution is not defined for zero degrees of freedom. Presses without redundancy have no residuals.
+    positive_degrees = np.maximum(degrees_of_freedom, 1.0)
+    limit = chi_square.value_exceeded_with(BAD_PROBABILITY / len(chi2), positive_degrees)
+
+    # The residuals of all presses may be larger than expected. The limit is then increased by the same factor.
+    expected_median = np.maximum(chi_square.value_exceeded_with(0.5, positive_degrees), 0.1)
     typical_ratio = max(1.0, float(np.median(chi2 / expected_median)))
-    limit = chi_square.value_exceeded_with(BAD_PROBABILITY / len(data), degrees_of_freedom) * typical_ratio
-    is_good = chi2 <= limit
+    is_good = chi2 <= limit * typical_ratio
     if np.mean(~is_good) > MAX_BAD_SHARE:  # no film explains most presses: leave out none of them
-        is_good = np.ones_like(is_good)
-    return is_good, solved.unknowns
+        return np.ones_like(is_good)
+    return np.asarray(is_good)
 
 
 def _log_density_of_mistakes(data: PressData, is_mistake: Booleans) -> float:
@@ -303,8 +324,10 @@ def _posterior(
         at_C: Temperature of the film, degrees Celsius; None if temperatures were not measured.
     """
     layout = problem.layout
-    mixture = settled.mixture
+    mixture = settled.mixture  # average over all hypotheses, as a difference from the mean before the presses
     unknowns = np.clip(problem.mean + mixture.mean, *problem.bounds)
+
+    # Root-mean-square scatter of the forces over the hypotheses
     scatter_variance = sum(
         probability * hypothesis.force_scatter**2 for hypothesis, probability in mixture.probabilities.items()
     )
@@ -314,6 +337,7 @@ def _posterior(
     start = settled.solved.contacts.contact if settled.is_kept.all() else None
     contacts = problem.adjusted_contacts(unknowns, data.with_force_scatter(mixture.best.force_scatter), start)
 
+    # The unknowns are those of the film, which are reported with their covariance, and nuisances of the session.
     nuisances = _nuisance_estimates(layout, unknowns, mixture.covariance)
     joint = mixture.covariance[layout.film, layout.film] + problem.gain_covariance(nuisances, force_scatter)
     warming = None

@@ -67,7 +67,8 @@ class FilmMaps:
         min_load, max_load = self.family.limits["load"]
         position_step, _, _ = CONTACT_STEPS
         radius = EDGE * max_distance * film.radius - position_step
-        min_force = float(min_load * max_stiffness) * (2.0 - EDGE) * FORCE_MARGIN
+        above_edge = 2.0 - EDGE  # as far above 1 as `EDGE` is below 1
+        min_force = float(min_load * max_stiffness) * above_edge * FORCE_MARGIN
         max_force = float(max_load * min_stiffness) * EDGE / FORCE_MARGIN
         return Domain(radius, (min_force, max_force))
 
@@ -116,7 +117,8 @@ class FilmMaps:
         pretension = parameters[self.prior.index("pretension")]
         derivatives = {name: self.difference(name, parameters, contact, charge) for name in STEPPED}
 
-        # Chain rule for Q = E q(F / (E h a), T / E, h / a), with respect to ln E and ln h
+        # Chain rule for Q = E q(F / (E h a), T / E, h / a), with respect to ln E and ln h. The finite difference for
+        # "thickness" is computed at a constant load F / (E h a), so the change of the load is added here.
         derivatives["young"] = charge - force_derivative - pretension * derivatives["pretension"]
         derivatives["thickness"] = derivatives["thickness"] - force_derivative
 

@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.train.calibration import chi_square
+from isocharge.train.calibration.bounded_normal import most_probable_within
 from isocharge.train.calibration.contacts import (
     AdjustedContacts,
     adjust_contacts,
@@ -73,9 +74,6 @@ SMALLEST_DERIVATIVE = 1e-12
 
 BOUND_MARGIN = 1e-3
 """Smallest distance of a start from the bounds, in standard deviations, because the method must start inside them."""
-
-BOUND_TOLERANCE = 1e-9
-"""Distance beyond a bound that is ignored, in standard deviations."""
 
 
 class SolvedFilm(NamedTuple):
@@ -263,24 +261,31 @@ class FitProblem:
     ) -> SettledFit:
         """Repeat the fit until the film and the selection of presses no longer change, at most `MAX_ROUNDS` times.
 
-        Each round fits the film with the most probable hypothesis of the previous round. Presses that were left out
-        before are used again if they now agree with the film.
+        Each round fits the film with the most probable hypothesis of the previous round. A hypothesis is a combination
+        of effects that the parameters of the film do not describe. Presses that were left out before are used again if
+        they now agree with the film.
 
         Args:
             data: All presses.
             is_kept: Which presses are kept at first, shape (n,).
             degrees_of_freedom: Measured numbers beyond three for each press, shape (n,).
-            solved: The film that explains the kept presses without any hypothesis.
+            solved: The film at which the first round begins. If the hypothesis has no effects, this film is not fitted
+                again for the first round.
             hypothesis: Hypothesis of the first round.
+
+        Returns:
+            The presses, the film and the mixture of the last round.
         """
-        if hypothesis != Hypothesis():
+        has_effects = hypothesis != Hypothesis()
+        if has_effects:
             solved = self._solve_kept(data, is_kept, solved.unknowns, hypothesis)
         for round_index in range(MAX_ROUNDS):
             mixture = self.mixture(data[is_kept], solved)
-            # Distance from the film at which the residuals are linearised to the estimate of the linear model.
+            # The estimate is that of a linear model about the solved film, so it must be near this film.
             step = self.mean + mixture.mean - solved.unknowns
             is_step_small = np.abs(step[self.layout.parameters]).max() < MAX_LINEAR_STEP
 
+            # Add the presses that now agree with the film. Without further presses, this search is not necessary.
             is_kept_next = is_kept
             if not is_kept.all():
                 is_kept_next = is_kept | self.agrees(data, solved, mixture, degrees_of_freedom)
@@ -301,8 +306,8 @@ class FitProblem:
     def agrees(self, data: PressData, solved: SolvedFilm, mixture: Mixture, degrees_of_freedom: Array) -> Booleans:
         """Return which presses agree with a film, given its uncertainty, shape (n,).
 
-        A press agrees if the sum of its squared residuals, weighted with their covariance, does not exceed a quantile
-        of the chi-squared distribution.
+        A press agrees if r' S^-1 r does not exceed a quantile of the chi-squared distribution. Here r are the residuals
+        of the press for the estimated unknowns, and S is their covariance by noise and by the uncertainty of the film.
 
         Args:
             data: The presses. They may include presses that the fit did not use.
@@ -313,10 +318,12 @@ class FitProblem:
         data = data.with_force_scatter(mixture.best.force_scatter)
         contacts = self.adjusted_contacts(solved.unknowns, data)
         jacobian = self.derivatives(SolvedFilm(solved.unknowns, contacts), data)
-        # Residuals for the estimated unknowns, by the linear model about the solved film.
+
+        # Residuals r for the estimated unknowns, by the linear model about the solved film.
         step = self.mean + mixture.mean - solved.unknowns
         residual = contacts.residual + jacobian @ step
-        # Covariance of the residuals of each press: measurement noise (1) plus the uncertainty of the film.
+
+        # Covariance S of the residuals of each press: measurement noise (1) plus the uncertainty of the film.
         residual_count = jacobian.shape[1]
         covariance = np.eye(residual_count) + jacobian @ mixture.covariance @ jacobian.swapaxes(1, 2)
         weighted_residual = np.linalg.solve(covariance, residual[:, :, None])[:, :, 0]
@@ -339,27 +346,43 @@ class FitProblem:
         unknowns = solved.unknowns
         contacts = self.adjusted_contacts(unknowns, data, solved.contacts.contact)
         jacobian = self.derivatives(SolvedFilm(unknowns, contacts), data)
-        deviation = unknowns - self.mean
-        model = LinearModel.of(jacobian.reshape(-1, unknowns.size), contacts.residual.ravel(), deviation)
+        models_by_scatter = self._models_by_force_scatter(SolvedFilm(unknowns, contacts), data, jacobian)
+        mixture = mix_hypotheses(models_by_scatter, self._prior_covariance)
+        bounded_unknowns = most_probable_within(self.bounds, self.mean + mixture.mean, mixture.covariance)
+        return mixture._replace(mean=bounded_unknowns - self.mean)
 
-        # A scatter of the forces is additional noise of each press, in the direction in which the force changes its
-        # residuals.
-        force_derivative = self._force_derivative(unknowns, data, contacts)
+    def _models_by_force_scatter(
+        self, solved: SolvedFilm, data: PressData, jacobian: Array
+    ) -> dict[float, LinearModel]:
+        """Return the linear model of the residuals about a film for each scatter of the forces.
+
+        A scatter of the forces is additional noise of each press, in the direction in which the stated force changes
+        the residuals of the press.
+
+        Args:
+            solved: The film, and the contacts of the presses on it.
+            data: The presses.
+            jacobian: Derivatives of the residuals with respect to the unknowns, shape (n, n_electrode + 3, n_unknown).
+
+        Returns:
+            Linear model for each of `FORCE_SCATTERS`, which are relative standard deviations.
+        """
+        residual = solved.contacts.residual
+        deviation = solved.unknowns - self.mean
+        model = LinearModel.of(jacobian.reshape(-1, solved.unknowns.size), residual.ravel(), deviation)
+
+        force_derivative = self._force_derivative(solved.unknowns, data, solved.contacts)
         length = np.linalg.norm(force_derivative, axis=1)
-        direction = force_derivative / np.maximum(length, SMALLEST_DERIVATIVE)[:, None]
+        direction = force_derivative / np.maximum(length, SMALLEST_DERIVATIVE)[:, None]  # unit vectors
         # Jacobian and residual in this direction: sums over the residuals k of each press n, for each unknown u
         jacobian_along = np.einsum("nk,nku->nu", direction, jacobian)
-        residual_along = (direction * contacts.residual).sum(axis=1)
-        models_by_scatter = {}
+        residual_along = (direction * residual).sum(axis=1)
+
+        models = {}
         for scatter in FORCE_SCATTERS:
             added_variance = (scatter * length) ** 2
-            models_by_scatter[scatter] = model.with_added_noise(
-                jacobian_along, residual_along, deviation, added_variance
-            )
-
-        mixture = mix_hypotheses(models_by_scatter, self._prior_covariance)
-        bounded_unknowns = _most_probable_within(self.bounds, self.mean + mixture.mean, mixture.covariance)
-        return mixture._replace(mean=bounded_unknowns - self.mean)
+            models[scatter] = model.with_added_noise(jacobian_along, residual_along, deviation, added_variance)
+        return models
 
     def adjusted_contacts(self, unknowns: Array, data: PressData, start: Array | None = None) -> AdjustedContacts:
         """Return the contact of each press that agrees best with a film.
@@ -394,6 +417,7 @@ class FitProblem:
         layout = self.layout
         film_unknowns = layout.film if with_coefficients else layout.parameters
         contact = with_force(solved.contacts.contact)
+
         # Derivatives of the charges on neighbouring films, between which the charges of each press are interpolated.
         films, film_weights = self._neighbouring_films(solved.unknowns, data)
         charge_by_contact = [self.charges.by_contact(film, contact) for film in films]
@@ -402,11 +426,12 @@ class FitProblem:
             for film, by_contact in zip(films, charge_by_contact, strict=True)
         ]
 
-        # The film changes only the residuals of the charges, the first of each press. The nuisances change the charges
-        # directly, or they change the pretension.
+        # The film changes only the residuals of the charges, the first of each press.
         jacobian = np.zeros((*data.measured.shape, layout.count))
         charge_rows = slice(0, data.charge.shape[1])
         jacobian[:, charge_rows, film_unknowns] = data.weight[:, :, None] * weighted_sum(charge_by_film, film_weights)
+
+        # The nuisances change the charges directly, or they change the pretension, here in MPa.
         pretension = layout.parameter("pretension")
         by_pretension = jacobian[:, :, pretension] / self.charges.prior.std[pretension]
         jacobian[:, :, layout.nuisances] = nuisance_derivatives(data, by_pretension)
@@ -472,28 +497,3 @@ class FitProblem:
         # The stated force is treated as one unknown, so the arrays have a last axis of length 1.
         residual_by_force = data.force_derivative()[:, :, None]
         return derivatives_with_adjusted_contacts(residual_by_force, residual_by_contact)[:, :, 0]
-
-
-def _most_probable_within(bounds: tuple[Array, Array], mean: Array, covariance: Array) -> Array:
-    """Return the most probable unknowns of a normal distribution within bounds, shape (n_unknown,).
-
-    The unknown that is farthest beyond its bound is moved onto the bound, and the others change by their correlation
-    with it. These steps are repeated until no unknown is beyond its bound.
-
-    Args:
-        bounds: Lower and upper bounds, each of shape (n_unknown,).
-        mean: Mean of the normal distribution, shape (n_unknown,).
-        covariance: Covariance of the normal distribution, shape (n_unknown, n_unknown).
-    """
-    unknowns = mean
-    for _ in range(len(mean)):
-        excess = unknowns - np.clip(unknowns, *bounds)
-        farthest = int(np.abs(excess).argmax())
-        if abs(excess[farthest]) < BOUND_TOLERANCE:
-            break
-        # Change of each unknown for a change of 1 of the unknown that is moved onto its bound.
-        regression = covariance[:, farthest] / covariance[farthest, farthest]
-        unknowns = unknowns - excess[farthest] * regression
-        # Covariance of the other unknowns at a given value of the moved unknown
-        covariance = covariance - np.outer(regression, covariance[farthest])
-    return np.clip(unknowns, *bounds)

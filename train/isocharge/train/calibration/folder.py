@@ -183,6 +183,8 @@ def _write_version(result: CalibrationResult, folder: Path, command: str) -> Pat
     }
     if not result.moved:
         files[PRESSES] = presses_text(result.presses).encode()
+
+    # Files with which a service follows the pretension of the film
     fitted = result.fitted
     pretensions = pretensions_of(result, fitted.network)
     if pretensions is not None:
@@ -194,7 +196,7 @@ def _write_version(result: CalibrationResult, folder: Path, command: str) -> Pat
         folder,
         version=max(version_folders(folder), default=0) + 1,
         command=command,
-        card=lambda about, _: _card(result, about),
+        card=lambda about, _: _card(result, about),  # replaces the usual card of a model
     )
     return released.folder
 
@@ -278,6 +280,7 @@ def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> Calibr
     version = "/".join(version_folder.parts[-2:])
     moved = f"moved from {film.warming.at_C:.1f} C, {version}, to {to_C:.1f} C by the change in its calibration"
     moved_film = film.at_temperature(to_C, problem.prior)
+    # The result compares the moved film with the film before the move.
     return film_without_presses(replace(problem, earlier=film), moved_film, moved)
 
 

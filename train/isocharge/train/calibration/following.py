@@ -96,7 +96,7 @@ def _networks_at(pretensions_MPa: Array, result: CalibrationResult, network: Fol
     pretension = result.problem.prior.index("pretension")
     networks = []
     for pretension_MPa in pretensions_MPa:
-        if pretension_MPa == calibrated_parameters[pretension]:
+        if pretension_MPa == calibrated_parameters[pretension]:  # one of the pretensions is exactly the calibrated one
             networks.append(network)
             continue
         parameters = calibrated_parameters.copy()
@@ -155,7 +155,8 @@ def _with_correlations_of(network: FoldedNetwork, other: FoldedNetwork) -> Folde
     """
     if not network.n_angle:
         return other
-    # The outputs for the correlations are the `angle_columns` of the last layer and of the skip connection.
+    # The network computes the correlations as angles. These outputs are the `angle_columns` of the last layer and of
+    # the skip connection.
     columns = network.angle_columns
     last = network.layers.last
     angle_layer = Layer(last.weight[:, columns], last.bias[columns])
@@ -192,8 +193,8 @@ def _weight_names(network: FoldedNetwork) -> list[str]:
 
     names = []
     for array in _weight_arrays(network):
-        equal_constants = (name for name, values in constants.items() if np.array_equal(values, array))
-        names.append(next(equal_constants))
+        equal_names = [name for name, values in constants.items() if np.array_equal(values, array)]
+        names.append(equal_names[0])
     return names
 
 

@@ -70,7 +70,7 @@ class Hypothesis:
         Returns:
             Covariance, shape (n_unknown, n_unknown). The entries of the parameters of the film are zero.
         """
-        # Modes, traces and nuisances are independent.
+        # Modes, traces and nuisances are independent, so their part of the matrix is diagonal.
         variance = np.zeros(layout.count)
         variance[layout.modes] = self.modes**2
         variance[layout.traces] = self.traces**2
@@ -113,7 +113,9 @@ def hypotheses() -> Iterator[Hypothesis]:
         MODE_SIZES.items(), DISCREPANCY_SIZES.items(), *nuisance_stds_and_probabilities, FORCE_SCATTERS.items()
     )
     for combination in combinations:
-        modes, discrepancy, *nuisance_stds, force_scatter = [size for size, _ in combination]
+        sizes = [size for size, _ in combination]
+        probabilities = [probability for _, probability in combination]
+        modes, discrepancy, *nuisance_stds, force_scatter = sizes  # in the order of the arguments of `product`
         if modes > 0.0 and discrepancy == 0.0:
             continue
         yield Hypothesis(
@@ -121,7 +123,7 @@ def hypotheses() -> Iterator[Hypothesis]:
             discrepancy=discrepancy,
             nuisance_stds=tuple(nuisance_stds),
             force_scatter=force_scatter,
-            prior_probability=math.prod(probability for _, probability in combination),
+            prior_probability=math.prod(probabilities),  # the effects are independent
         )
 
     for discrepancy, probability in DISCREPANCY_SIZES.items():
@@ -210,12 +212,14 @@ class LinearModel(NamedTuple):
             Change of the mean by the presses, shape (n_unknown,), and covariance after the presses, shape (n_unknown,
             n_unknown). The mean of unknowns without a variance before the presses does not change.
         """
-        # The solution is in units of the root L of the prior covariance L L': the change of the mean is -L s, and the
-        # covariance is L P^-1 L' with the precision P.
+        # The solution is in units of the root L of the prior covariance L L'. It contains only active unknowns, which
+        # have a variance before the presses.
         solution = self._solve(prior_covariance)
         active = solution.active
         mean_change = np.zeros(len(active))
         mean_change[active] = -solution.prior_root @ solution.step
+
+        # Covariance L P^-1 L' with the precision P, whose Cholesky factor is a lower triangular matrix (True)
         covariance = np.zeros_like(prior_covariance)
         whitened_covariance = cho_solve((solution.precision_factor, True), solution.prior_root.T)
         covariance[np.ix_(active, active)] = solution.prior_root @ whitened_covariance
@@ -228,9 +232,11 @@ class LinearModel(NamedTuple):
             prior_covariance: Covariance of the unknowns before the presses, shape (n_unknown, n_unknown).
         """
         active = np.diag(prior_covariance) > 0.0
-        active_block = np.ix_(active, active)
+        active_block = np.ix_(active, active)  # rows and columns of the active unknowns
         prior_root = np.asarray(np.linalg.cholesky(prior_covariance[active_block]), np.float64)
-        # In units of this root, the unknowns have the covariance 1 before the presses.
+
+        # In units of this root L, the unknowns have the covariance 1 before the presses. With the normal matrix N, the
+        # inverse of their covariance after the presses is therefore the precision 1 + L' N L.
         precision = np.eye(len(prior_root)) + prior_root.T @ self.normal[active_block] @ prior_root
         precision_factor = np.asarray(np.linalg.cholesky(precision), np.float64)
         moment = prior_root.T @ self.moment[active]
@@ -293,27 +299,28 @@ def mix_hypotheses(
         prior_covariance: Function that returns the covariance of the unknowns before the presses for a hypothesis.
         considered: The hypotheses; by default all.
     """
-    considered = list(considered or hypotheses())
+    all_hypotheses = list(considered or hypotheses())
     log_weights = []  # logarithms of evidence times prior probability
-    for hypothesis in considered:
+    for hypothesis in all_hypotheses:
         model = models[hypothesis.force_scatter]
         log_hypothesis_evidence = model.log_evidence(prior_covariance(hypothesis))
         log_weights.append(log_hypothesis_evidence + np.log(hypothesis.prior_probability))
-    log_evidence = float(logsumexp(log_weights))
+    log_evidence = float(logsumexp(log_weights))  # of all hypotheses together
     probabilities = np.exp(np.array(log_weights) - log_evidence)
 
+    # Estimates of the hypotheses that are not negligible
     relevant = np.flatnonzero(probabilities > NEGLIGIBLE_PROBABILITY)
     means = []
     covariances = []
     for index in relevant:
-        hypothesis = considered[index]
+        hypothesis = all_hypotheses[index]
         model = models[hypothesis.force_scatter]
         hypothesis_mean, hypothesis_covariance = model.posterior(prior_covariance(hypothesis))
         means.append(hypothesis_mean)
         covariances.append(hypothesis_covariance)
 
     mean, covariance = _mixture_moments(probabilities[relevant], means, covariances)
-    probability_of_hypothesis = dict(zip(considered, probabilities.tolist(), strict=True))
+    probability_of_hypothesis = dict(zip(all_hypotheses, probabilities.tolist(), strict=True))
     return Mixture(mean, covariance, probability_of_hypothesis, log_evidence)
 
 

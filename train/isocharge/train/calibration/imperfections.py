@@ -70,7 +70,8 @@ def trace_lines(sensor: Sensor) -> Array:
         Points (x, y), shape (n_electrode, n_line, 2, 2), mm.
     """
     end_radius = TRACE_END * sensor.film.radius
-    # Points and directions in the plane are complex numbers x + i y, with one row for each electrode.
+    # Points and directions in the plane are complex numbers x + i y, with one row for each electrode and one column for
+    # each line. The arrays `centre` and `pad_radius` have a single column.
     centre = np.array([complex(*electrode.centre) for electrode in sensor.electrodes])[:, None]
     areas = [area_of(np.array(electrode.corners)) for electrode in sensor.electrodes]
     pad_radius = np.sqrt(np.array(areas) / np.pi)[:, None]
@@ -99,10 +100,12 @@ def trace_charges(forward_map: ForwardMap, lines: Array, contact: Array) -> Arra
     n_electrode = len(lines)
     points = ReadoutPoints.along(forward_map.sensor, lines)
     charge_per_mm = forward_map.field_charges(contact, EVEN_FIELD, points)
-    # Shape (n, n_electrode of the trace, 1, n_line), which is multiplied by (n_electrode of the trace, n_electrode, 1)
-    line_charge = TRACE_STD_MM * charge_per_mm.reshape(len(contact), n_electrode, 1, -1)
+    line_charge = TRACE_STD_MM * charge_per_mm.reshape(len(contact), n_electrode, 1, -1)  # (n, electrode, 1, line)
+
+    # The first axis is the electrode that receives the charge, and the second axis is the electrode of the line.
     is_own_electrode = np.eye(n_electrode)[:, :, None]
-    return np.asarray((line_charge * is_own_electrode).reshape(len(contact), n_electrode, -1))
+    charge_by_line = line_charge * is_own_electrode  # shape (n, n_electrode, n_electrode, n_line)
+    return np.asarray(charge_by_line.reshape(len(contact), n_electrode, -1))
 
 
 def trace_widths(coefficients: Array, covariance: Array) -> tuple[Array, Array]:
@@ -134,10 +137,11 @@ def tension_unevenness(pretension: float, tension_stds: Array, coefficients: Arr
         coefficients: Coefficients of the modes, in standard deviations, shape (n_mode,).
 
     Returns:
-        Unevenness, dimensionless, and its derivatives with respect to the coefficients, shape (n_mode,).
+        Unevenness, dimensionless, and its derivatives with respect to the coefficients, shape (n_mode,). The derivative
+        for a coefficient c with the standard deviation s is (s / T)^2 c / sqrt(1 - (e / T)^2).
     """
     relative_stds = tension_stds / max(pretension, MIN_TENSION)
-    squared_ratio = float(((relative_stds * coefficients) ** 2).sum())  # (e / T)^2
+    squared_ratio = float(((relative_stds * coefficients) ** 2).sum())  # (e / T)^2, summed over independent modes
     root = np.sqrt(1.0 - min(squared_ratio, LARGEST_SQUARED_RATIO))
     unevenness = 1.0 - root
     if squared_ratio >= LARGEST_SQUARED_RATIO:  # the unevenness is limited here and no longer changes

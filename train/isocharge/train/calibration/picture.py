@@ -114,6 +114,7 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
         result: The calibration.
     """
     quantities = list(result.quantities.values())[::-1]  # rows are numbered from the bottom to the top
+    # Change of the parameters by the presses. A quantity is a weighted sum of parameters, and so is its change.
     scaled_change = (result.posterior.parameters - result.problem.before.parameters) / result.problem.prior.std
     centre = np.array([quantity.weights @ scaled_change / quantity.before_std for quantity in quantities])
     half_width = np.array([NORMAL_95 * quantity.std / quantity.before_std for quantity in quantities])
@@ -137,7 +138,7 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
         )
     for index, quantity in enumerate(quantities):
         value_text = f"{quantity.value:.3g} ± {quantity.std:.2g}"
-        axes.annotate(value_text, (4.2, index), va="center", fontsize=8, annotation_clip=False)
+        axes.annotate(value_text, (4.2, index), va="center", fontsize=8, annotation_clip=False)  # right of the axes
     axes.set(
         title="quantities with 95 % intervals",
         xlabel="difference from the assumed value, in standard deviations",

@@ -140,14 +140,16 @@ class PressData:
         Returns:
             Pretensions, shape (k,), MPa, and the weight of each pretension for each press, shape (n, k).
         """
-        press_pretensions = np.clip(pretension + self.tension_change, *bounds)
+        press_pretensions = np.clip(pretension + self.tension_change, *bounds)  # shape (n,)
         low = float(press_pretensions.min(initial=np.inf))
         high = float(press_pretensions.max(initial=-np.inf))
         if high <= low:  # all presses have the same pretension, or there are no presses
             return np.array([low]), np.ones((len(self), 1))
+
         node_count = 2 + int(np.ceil((high - low) / NODE_DISTANCE_MPa))
         nodes = chebyshev_nodes(node_count, low, high)
-        return nodes, lagrange_values(nodes, barycentric_weights(nodes), press_pretensions)
+        weights = lagrange_values(nodes, barycentric_weights(nodes), press_pretensions)
+        return nodes, weights
 
     def residual(self, charge: Array, contact: Array) -> Array:
         """Return the residuals in units of their standard deviations, shape (n, n_electrode + 3).

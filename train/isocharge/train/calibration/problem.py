@@ -132,6 +132,8 @@ class FilmEstimate:
         if knows_temperature and self.warming is not None:
             drift_std[prior.index("pretension")] = CREEP
         covariance = self.covariance + np.diag(drift_std**2)
+
+        # The coefficients of imperfections and discrepancy change as well, if the estimate has them.
         joint = self.joint
         if joint.size:
             coefficient_drift_std = np.full(self.coefficients.size, COEFFICIENT_DRIFT_STD)
@@ -167,8 +169,10 @@ class FilmEstimate:
                 f"{upper:g} MPa: a temperature nearer to that of the presses"
             )
 
-        # The new pretension is the sum of the old pretension and the change. The covariances of this sum replace first
-        # the row and then the column of the pretension.
+        # The new pretension T + k w is the sum of the old pretension T and the change k w, with the difference k of the
+        # temperatures and the change w per kelvin. The covariance with another unknown u becomes
+        # cov(T, u) + k cov(w, u). It replaces first the row of the pretension, then cov(w, T), and then the column of
+        # the pretension.
         scaled_change = change_K / prior.std[pretension]
         covariance = self.unknown_covariance.copy()
         warming_covariance = self.warming.covariance.copy()
@@ -275,13 +279,14 @@ class CalibrationProblem:
         sensor_map = self.charges.forward_map(parameters)
         network_map = self.films.forward_map(parameters)
 
+        has_same_electrodes = self.prior is self.films.prior  # otherwise, the electrodes of the prior were replaced
+
         def charge_factor(contact: Array) -> Array:
             """Return the ratio of the film's charges to those of the training, shape (n, n_electrode).
 
             Args:
                 contact: Contacts (x, y, F), shape (n, 3), mm and N.
             """
-            has_same_electrodes = self.prior is self.films.prior
             if has_same_electrodes:
                 return factor(contact)
             electrode_factor = sensor_map.charges(contact) / network_map.charges(contact)
@@ -318,7 +323,7 @@ class CalibrationProblem:
             return self.earlier
         parameters = self.prior.parameters_of(self.sensor, self.probe)
         pretension = self.prior.index("pretension")
-        # A sensor file without a pretension does not mean a slack film.
+        # A sensor file without a pretension has the value 0, but its film is not necessarily slack.
         if parameters[pretension] <= 0.0:
             parameters[pretension] = self.prior.mean[pretension]
         prior_covariance = np.eye(parameters.size)  # in units of the prior standard deviations
@@ -365,6 +370,7 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
             reasons.append(f"{folder.parent.name}: {error}")
             continue
 
+        # The parameters of the sensor must lie in the range for which the network was trained.
         lower, upper = films.prior.bounds
         is_outside = (parameters < lower) | (parameters > upper)
         if not is_outside.any():

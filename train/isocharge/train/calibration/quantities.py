@@ -100,7 +100,7 @@ def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
             definition.meaning,
             value=float(definition.offset + definition.weights @ film.parameters),
             std=float(np.sqrt(scaled_weights @ film.covariance @ scaled_weights)),
-            before_std=float(np.sqrt(scaled_weights @ scaled_weights)),
+            before_std=float(np.sqrt(scaled_weights @ scaled_weights)),  # the parameters have the prior covariance 1
             weights=scaled_weights,
         )
     return table

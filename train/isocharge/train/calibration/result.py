@@ -117,7 +117,8 @@ class CalibrationResult:
             return self._network_of(film.unknowns, film.joint)
 
         data = PressData.of(self.presses, self.problem.noise, self.problem.charges.domain)
-        if self.side_force_map is not None and self.problem.friction > 0.0:
+        has_friction = self.problem.friction > 0.0  # side forces may also be those of later contacts alone
+        if self.side_force_map is not None and has_friction:
             friction = self.posterior.nuisances[FRICTION.name].value
             data = with_friction(data, self.problem.charges, self.side_force_map, self.posterior.contact, friction)
         return cross_validate(self.problem, self.presses, data, self.posterior, network_of, at_C)
@@ -201,6 +202,8 @@ class CalibrationResult:
         after = self.error_left
         before = self.error_left_before
         noise = self.sensitivity.noise_error
+
+        # Errors before and after the presses, or before and after the film was moved to another temperature
         event = "it was moved" if self.moved else "these presses"
         film_errors = (
             f"The uncertainty of the film causes errors of {after.position_mm:.2g} mm and {after.force_percent:.2g} % "
@@ -281,6 +284,8 @@ class CalibrationResult:
             return
         factor = self.problem.charges.factor(self.posterior.unknowns, self.sensitivity.contact)
         percent = 100.0 * rms(np.log(factor))
+
+        # Each press of the plan contains the error that is expected after it.
         plan = next_presses(self.problem, PLANNED_PRESSES, self.posterior)
         error_after_plan_mm = plan[-1].position_mm
         places = ", ".join(f"{press.force_N:.2f} N at ({press.x_mm:g}, {press.y_mm:g}) mm" for press in plan[:3])
@@ -316,6 +321,7 @@ def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved:
     estimated = slice(0, len(film.unknowns))
     joint[estimated, estimated] = film.unknown_covariance
     has_coefficients = film.coefficients.size > 0
+    hypothesis = Hypothesis(modes=float(has_coefficients))  # a film with coefficients counts as imperfect
     warming = film.warming
     if warming is not None:
         warming = warming.with_unknowns(layout.film_count)
@@ -331,7 +337,7 @@ def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved:
         bad=np.empty(0, dtype=bool),
         nuisances={nuisance.name: NuisanceEstimate(0.0, 0.0) for nuisance in NUISANCES},
         force_scatter=0.0,
-        probabilities={Hypothesis(modes=float(has_coefficients)): 1.0},
+        probabilities={hypothesis: 1.0},
     )
     side_force_map = None
     if problem.side_force > 0.0:

@@ -82,12 +82,13 @@ def read_answer(text: str) -> Answer:
         return Answer("take", np.full(len(CONTACT), np.nan))
 
     cells = word.split(",") if "," in word else word.split()
+    refusal = PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")  # at most 60 characters of the text
+    if len(cells) != len(CONTACT):
+        raise refusal
     try:
         contact = np.array([_cell_value(cell.strip()) for cell in cells])
     except ValueError:
-        contact = np.empty(0)  # refused below, as a wrong number of values is
-    if contact.shape != (len(CONTACT),):
-        raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")
+        raise refusal from None
     return Answer("take", contact)
 
 
@@ -177,7 +178,8 @@ class PressSession:
         """
         if self._proposed is not None:
             return self._proposed
-        skipped_mm = np.reshape(self._skipped_places, (-1, 2))  # a list of places may be empty
+
+        skipped_mm = np.reshape(self._skipped_places, (-1, 2))  # shape (0, 2) if no place was skipped
         film: FilmEstimate
         if self.result is not None:
             film = self.result.posterior

@@ -120,7 +120,10 @@ class SideForces:
 
     @cached_property
     def _log_factor(self) -> Series:
-        """Logarithm of `charge_factor` as a series, which is fast to evaluate."""
+        """Logarithm of the factor by which half of the friction changes the charges, as a series of the contact.
+
+        The series is fitted to `CONTACTS` contacts, because it is faster to evaluate than the effect of friction.
+        """
         contact = spread_contacts(self.domain, CONTACTS)
         unit_contact = self.domain.to_unit(contact)
         friction_charge = self.side_force_map.friction_charges(contact, self._coefficient)

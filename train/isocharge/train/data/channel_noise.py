@@ -88,7 +88,9 @@ class ChannelNoise:
         ]
         white_std, gain_std = np.sqrt(np.array(channel_variances)).T  # each of shape (n_electrode,)
         gain = np.maximum(gain_std, LEAST_GAIN)
-        white = np.maximum(white_std, LEAST_SHARE * gain * usual_size(charge))
+        # Presses with large charges alone do not determine the white noise, so it gets a share of the other noise.
+        smallest_white = LEAST_SHARE * gain * usual_size(charge)
+        white = np.maximum(white_std, smallest_white)
         return cls(white, gain)
 
     @classmethod
@@ -133,9 +135,11 @@ class ChannelNoise:
         positive_share = np.mean(charge > 0.0, axis=0)  # shape (n_electrode,)
         negative_share = np.mean(charge < 0.0, axis=0)
         has_both_signs = np.minimum(positive_share, negative_share) > BOTH_SIGNS
+        # Without a lower limit, the features of a channel with little noise would have a kink at the charge 0.
         lower_limit = np.where(has_both_signs, MIN_TRANSITION_RATIO * usual_size(charge), 0.0)
         # Above white / gain, the noise is mostly proportional to the charge.
-        return np.asarray(np.maximum(self.white / self.gain, lower_limit))
+        noise_corner = self.white / self.gain
+        return np.asarray(np.maximum(noise_corner, lower_limit))
 
     def scaled(self, factor: float) -> "ChannelNoise":
         """Return the noise model with all standard deviations multiplied by a factor."""
@@ -255,14 +259,16 @@ def _fit_variances(charge: Array, residual: Array) -> tuple[float, float]:
     mean_square = np.mean(residual**2)
     smallest_variance = 1e-12 * mean_square + TINY  # avoids a division by zero
     # Both columns are scaled to the root mean square 1, because the squared charges may be very large or small.
-    column_scale = np.sqrt(np.maximum((columns**2).sum(axis=0), TINY)) / np.sqrt(len(charge))
+    sum_of_squares = np.maximum((columns**2).sum(axis=0), TINY)
+    column_scale = np.sqrt(sum_of_squares) / np.sqrt(len(charge))
 
     variances = np.array([mean_square, 0.0])
     for _ in range(ROUNDS):
         expected_square = np.maximum(columns @ variances, smallest_variance)
         limited_square = np.minimum(residual**2, OUTLIER**2 * expected_square)  # limits the influence of outliers
         weighted_columns = columns / column_scale / expected_square[:, None]
-        scaled_variances, _ = nnls(weighted_columns, limited_square / expected_square)
+        weighted_square = limited_square / expected_square
+        scaled_variances, _ = nnls(weighted_columns, weighted_square)  # least squares without negative variances
         variances = scaled_variances / column_scale
     white_variance, gain_variance = variances.tolist()
     return white_variance, gain_variance

@@ -117,55 +117,26 @@ class ChargeField:
         Raises:
             TrainingError: If there are too few presses for the smallest degree.
         """
-        unit = domain.to_unit(presses.contact)
-        if presses.signed:
-            log_size = _fit_log_size(unit[:, 2], presses.charge)
-            size, _ = _size_and_slope(log_size, unit[:, 2])
-            target = presses.charge / size
-            first_degrees, *further_degrees = SIGNED_CANDIDATE_DEGREES
-            smallest_error_unit = NOISE_CORNER_pC
-        else:
-            log_size = None
-            target = np.log(presses.charge)
-            first_degrees, *further_degrees = CANDIDATE_DEGREES
-            smallest_error_unit = 0.0
-        error_unit = np.hypot(validation.charge, smallest_error_unit)  # errors are relative to this charge, pC
-
-        def fit_degrees(degree: int, force_degree: int) -> ChargeField | None:
-            """Fit a series of these degrees, and measure its error on the validation presses.
-
-            Not all presses are used if there are many for each term. If there are too few presses, return None.
-
-            Args:
-                degree: Largest total degree in x and y.
-                force_degree: Largest degree in the logarithm of the force.
-            """
-            n_term = series_term_count(degree, force_degree)
-            if FEWEST_PER_TERM * n_term > len(unit):
-                return None
-            used_rows = slice(0, ROWS_PER_TERM * n_term)
-            series = fit_series(unit[used_rows], target[used_rows], degree, force_degree)
-            field = cls(domain, electrodes, series, np.inf, log_size)  # its error is not known yet
-            charge_error = field.charges(validation.contact) - validation.charge
-            return replace(field, error=rms(charge_error / error_unit))
-
-        best_field = fit_degrees(*first_degrees)
+        fitter = _SeriesFitter.of(domain, electrodes, presses, validation)
+        candidate_degrees = SIGNED_CANDIDATE_DEGREES if presses.signed else CANDIDATE_DEGREES
+        first_degrees, *further_degrees = candidate_degrees
+        best_field = fitter.fit(*first_degrees)
         if best_field is None:
             fewest = FEWEST_PER_TERM * series_term_count(*first_degrees)
-            raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(unit)}")
+            raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(presses)}")
 
         # If the lowest degrees for taut films have a clearly smaller error, the film is taut.
         if not presses.signed and best_field.error > GOOD_ENOUGH:
             first_taut_degrees, *further_taut_degrees = TAUT_CANDIDATE_DEGREES
-            taut = fit_degrees(*first_taut_degrees)
-            if taut is not None and taut.error < TAUT_ERROR_RATIO * best_field.error:
-                best_field = taut
+            taut_field = fitter.fit(*first_taut_degrees)
+            if taut_field is not None and taut_field.error < TAUT_ERROR_RATIO * best_field.error:
+                best_field = taut_field
                 further_degrees = further_taut_degrees
 
         for degree, force_degree in further_degrees:
             if best_field.error < GOOD_ENOUGH:
                 break
-            field = fit_degrees(degree, force_degree)
+            field = fitter.fit(degree, force_degree)
             if field is None:  # there are too few presses for this degree and all higher ones
                 break
             if field.error < best_field.error:
@@ -183,24 +154,29 @@ class ChargeField:
         return derivatives
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Return charges and derivatives together, which takes half the time; see `ChargeMap`.
+        """Return charges and their derivatives together, which takes half the time of computing them one by one.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Charges, shape (n, n_electrode), pC, and their derivatives with respect to (x, y, ln F), shape (n,
+            n_electrode, 3).
         """
         unit = self.domain.to_unit(contact)
         # The second axis has the value of the series, and then its derivatives with respect to x, y and l.
         values_and_slopes = self._series.values(unit)  # shape (n, 4, n_electrode)
         value = values_and_slopes[:, 0]
         slopes = values_and_slopes[:, 1:]
-        if self.log_size is None:  # ln Q = value
+        if self.log_size is None:  # ln Q = value, so Q' = Q value'
             charge = np.exp(value)
             factor = charge
-        else:  # Q = S(l) * value
+        else:  # Q = S(l) value, so Q' = S (value' + (ln S)' value), where (ln S)' is not zero only along l
             size, log_size_slope = _size_and_slope(self.log_size, unit[:, 2])
             charge = size * value
             slopes[:, 2] += log_size_slope * value
             factor = size
+        # The division by the scale converts derivatives in unit coordinates into derivatives in x, y and ln F.
         return charge, factor[:, :, None] * slopes.swapaxes(1, 2) / self.domain.scale
 
     @cached_property
@@ -214,6 +190,68 @@ class ChargeField:
         if self.log_size is not None:
             return None
         return ChargeSeries(self._series, self.domain.radius, self.domain.force_range)
+
+
+@dataclass(frozen=True)
+class _SeriesFitter:
+    """Presses to which series of several degrees are fitted, and presses on which their errors are measured.
+
+    Attributes:
+        domain: Domain of the contacts.
+        electrodes: Names of the electrodes.
+        unit: Contacts of the fit in unit coordinates, shape (n, 3).
+        target: Values of the series at these contacts, ln Q or Q / S, shape (n, n_electrode).
+        log_size: Coefficients of ln S for charges of both signs; None for positive charges.
+        validation: Presses on which the errors are measured.
+        error_unit: Charges to which the errors are relative, pC, of the shape of the charges of `validation`.
+    """
+
+    domain: Domain
+    electrodes: tuple[str, ...]
+    unit: Array
+    target: Array
+    log_size: Array | None
+    validation: LabelledPresses
+    error_unit: Array
+
+    @classmethod
+    def of(
+        cls, domain: Domain, electrodes: tuple[str, ...], presses: LabelledPresses, validation: LabelledPresses
+    ) -> "_SeriesFitter":
+        """Compute the values of the series at the presses, and the units of the errors; see `ChargeField.fit`."""
+        unit = domain.to_unit(presses.contact)
+        if presses.signed:
+            log_size = _fit_log_size(unit[:, 2], presses.charge)
+            size, _ = _size_and_slope(log_size, unit[:, 2])
+            target = presses.charge / size
+            smallest_error_unit = NOISE_CORNER_pC  # charges near zero have large relative errors
+        else:
+            log_size = None
+            target = np.log(presses.charge)
+            smallest_error_unit = 0.0
+        error_unit = np.hypot(validation.charge, smallest_error_unit)
+        return cls(domain, electrodes, unit, target, log_size, validation, error_unit)
+
+    def fit(self, degree: int, force_degree: int) -> ChargeField | None:
+        """Fit a series of these degrees, and measure its error on the validation presses.
+
+        If there are many presses for each term of the series, only the first ones are used.
+
+        Args:
+            degree: Largest total degree in x and y.
+            force_degree: Largest degree in the logarithm of the force.
+
+        Returns:
+            The fitted field with its error; None if there are too few presses for these degrees.
+        """
+        n_term = series_term_count(degree, force_degree)
+        if FEWEST_PER_TERM * n_term > len(self.unit):
+            return None
+        used_rows = slice(0, ROWS_PER_TERM * n_term)
+        series = fit_series(self.unit[used_rows], self.target[used_rows], degree, force_degree)
+        field = ChargeField(self.domain, self.electrodes, series, np.inf, self.log_size)  # the error is not known yet
+        charge_error = field.charges(self.validation.contact) - self.validation.charge
+        return replace(field, error=rms(charge_error / self.error_unit))
 
 
 def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
@@ -251,7 +289,10 @@ def series_term_count(degree: int, force_degree: int) -> int:
 
 
 def fit_series(unit: Array, target: Array, degree: int, force_degree: int) -> Array:
-    """Fit a Chebyshev series in position and force by the normal equations, which are well conditioned here.
+    """Fit a Chebyshev series in position and force by least squares.
+
+    The normal equations are solved, which are well conditioned here. With one row of columns A for each contact, they
+    are (A' A + RIDGE n I) coefficients = A' target.
 
     Args:
         unit: Scaled contacts, shape (n, 3).
@@ -263,18 +304,18 @@ def fit_series(unit: Array, target: Array, degree: int, force_degree: int) -> Ar
         Coefficients, shape (degree + 1, degree + 1, force_degree + 1, k).
     """
     n_term = series_term_count(degree, force_degree)
-    normal = RIDGE * len(unit) * np.eye(n_term)
-    moment = np.zeros((n_term, target.shape[1]))
+    normal_matrix = RIDGE * len(unit) * np.eye(n_term)
+    right_side = np.zeros((n_term, target.shape[1]))
     n_chunk = len(unit) // CHUNK_SIZE + 1  # chunks limit the memory
     for rows in np.array_split(np.arange(len(unit)), n_chunk):
         position_terms, force_terms = chebyshev_terms(unit[rows], degree, force_degree)
         # Each column is the product of a polynomial in the position and a polynomial in the force.
         columns = (position_terms[:, :, None] * force_terms[:, None, :]).reshape(len(rows), -1)
-        normal += columns.T @ columns
-        moment += columns.T @ target[rows]
+        normal_matrix += columns.T @ columns
+        right_side += columns.T @ target[rows]
 
     # The coefficients of terms above the total degree remain zero.
-    solution = cho_solve(cho_factor(normal), moment)
+    solution = cho_solve(cho_factor(normal_matrix), right_side)
     series = np.zeros((degree + 1, degree + 1, force_degree + 1, target.shape[1]))
     series[position_degrees(degree)] = solution.reshape(-1, force_degree + 1, target.shape[1])
     return series
@@ -332,7 +373,7 @@ def invertible_domain(
         credible_ratio = CREDIBLE_FOLD_RATIO if has_little_noise else CREDIBLE_FOLD_RATIO_WITH_NOISE
         if fold_radius < credible_ratio * requested.radius:
             return requested, (_uncertain_fold_caution(fold_radius, requested.radius),)
-        fold_radius = np.inf
+        fold_radius = np.inf  # a fold near the edge is probably not real
 
     if fold_radius < SMALLEST_SHARE * requested.radius:
         raise DatasetError(
@@ -345,16 +386,22 @@ def invertible_domain(
         domain = requested.within(fold_radius)
         cautions.append(_fold_caution(field, presses, fold_radius))
     if has_little_noise:
-        cautions += _pair_cautions(within(field, SEARCHED_RADIUS_RATIO * domain.radius), noise)
+        searched_field = within(field, SEARCHED_RADIUS_RATIO * domain.radius)  # the field is inaccurate at the edge
+        cautions += _pair_cautions(searched_field, noise)
     return domain, tuple(cautions)
 
 
 def _pair_cautions(searched: ChargeMap, noise: NoiseModel) -> list[str]:
-    """Return a sentence about ambiguous pairs of contacts with the smallest force, if there are any.
+    """Return a sentence about pairs of distant contacts with the same charges, if there are any.
+
+    Only contacts with the smallest force are compared.
 
     Args:
         searched: Map from contacts to charges; its domain is searched.
         noise: Noise of good presses. Charges that differ by less than the noise count as equal.
+
+    Returns:
+        A list of one sentence, or an empty list.
     """
     smallest_force, _ = searched.domain.force_range
     pairs = find_ambiguous_pairs(searched, noise, smallest_force, N_PAIR_CONTACTS)
@@ -397,7 +444,7 @@ def _fold_caution(field: ChargeField, presses: LabelledPresses, fold_radius: flo
         f"the model is trained for {fold_radius:g} mm, not {requested_radius:g} mm, on {remaining_count} of "
         f"{len(presses)} presses"
     )
-    if field.of_positive is None:
+    if field.of_positive is None:  # some charges are negative
         return caution
     return f"{caution}; 'serve stream --track' follows contacts to {requested_radius:g} mm"
 

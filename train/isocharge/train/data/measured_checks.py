@@ -57,11 +57,11 @@ def check_measured_presses(presses: MeasuredPresses) -> None:
         _check_variation(name, charge)
         _check_size(name, charge)
     for name, values in {**contact_columns, **channels}.items():
-        _check_far_value(presses, name, values, values)
+        _check_far_value(presses, name, values, compared=values)
 
     # A force that is far too small is not far from the others, but its inverse is.
     force = contact_columns["force_N"]
-    _check_far_value(presses, "force_N", force, 1.0 / force)
+    _check_far_value(presses, "force_N", force, compared=1.0 / force)
     _check_independence(channels)
     PressedArea.of(presses.contact)  # raises if the positions enclose no area
 
@@ -81,7 +81,7 @@ def check_measured_dataset(dataset: Dataset) -> None:
         presses = MeasuredPresses(
             contact=np.column_stack([samples.x_mm, samples.y_mm, samples.force_N]),
             charge_pC=samples.charge_pC,
-            position_std_mm=np.full(count, POSITION_STD_MM),
+            position_std_mm=np.full(count, POSITION_STD_MM),  # the checks do not use the standard deviations
             force_std=np.full(count, FORCE_STD),
             electrodes=tuple(dataset.sensor.electrode_names),
             lines=tuple(range(count)),
@@ -150,8 +150,9 @@ def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compare
         PressError: If the largest distance exceeds `FARTHEST` times the usual distance.
     """
     distance = np.abs(compared - np.median(compared))
-    if not distance.any():
+    if not distance.any():  # all values are equal
         return
+    # Distances of zero are left out. If most values are equal, the usual distance would otherwise be zero.
     usual_distance = float(np.quantile(distance[distance > 0.0], USUAL_SHARE))
     row = int(distance.argmax())
     if distance[row] > FARTHEST * usual_distance:

@@ -176,7 +176,7 @@ def outline(places: Array) -> Array:
 def _circumradii(corners: Array) -> Array:
     """Compute the radii of the circumscribed circles of triangles.
 
-    The radius is the product of the lengths of the sides over four times the area.
+    The radius of a triangle with the sides a, b and c is a b c / (4 area).
 
     Args:
         corners: Corners (x, y) of the triangles, shape (n, 3, 2), mm.
@@ -270,11 +270,12 @@ def _enlarged_polygon(corners: Array, distance: float) -> Array:
     turning_angle = np.angle(all_sides / np.roll(all_sides, 1))
     points = all_points[np.abs(turning_angle) > MIN_TURN_rad]
 
-    # A corner moves along the bisector of the normals of both sides. The normal of a side points to the right.
+    # A corner moves along the bisector of the unit normals m and n of both sides. A displacement of the corner by
+    # (m + n) / (1 + m n) moves both sides by 1. The normal of a side points to the right, which is outwards.
     sides = np.roll(points, -1) - points
     next_normal = -1j * sides / np.abs(sides)
     previous_normal = np.roll(next_normal, 1)
-    cosine = (previous_normal * np.conj(next_normal)).real
-    mitre = (previous_normal + next_normal) / np.maximum(1.0 + cosine, 1e-9)  # displacement for a distance of 1
+    cosine = (previous_normal * np.conj(next_normal)).real  # scalar product of both normals
+    mitre = (previous_normal + next_normal) / np.maximum(1.0 + cosine, 1e-9)  # the limit avoids a division by zero
     limited_mitre = mitre * np.minimum(1.0, LONGEST_MITRE / np.abs(mitre))
     return to_corners(points + distance * limited_mitre)

@@ -213,7 +213,7 @@ def _residuals(
     start = chosen.contact[near_rows]
     exact_factor = chosen.charge[near_rows] / charge_map.charges(start)
     map_factor = np.clip(exact_factor, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
-    # To divide the charges and their noise by a factor gives the same residuals as to multiply the map by this factor.
+    # The residual (Q - f Q(c)) / sigma of the scaled map is equal to (Q / f - Q(c)) / (sigma / f).
     _, residual[near_rows] = explain(
         charge_map, charge[near_rows] / map_factor, sigma[near_rows] / map_factor, start, min_change=MIN_CHANGE
     )
@@ -286,7 +286,7 @@ def _draw_kind(kind: str, rng: np.random.Generator, charge: Array, other_charge:
             second_charge = other_charge[rng.integers(len(other_charge), size=len(charge))]
             exponent = rng.uniform(*PAIR_EXPONENTS, (len(charge), 1))
             return combined_charge(charge, second_charge, exponent)
-        case _:
+        case _:  # the kind "any"
             return _any_charges(rng, charge.shape, other_charge, noise)
 
 
@@ -307,6 +307,7 @@ def _moved_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Arr
     """
     one_per_press = (len(charge), 1)  # the shape of an array with one number for each press
     if isinstance(noise, ChannelNoise):
+        # The noise of a level has the standard deviation 1, so a distance between levels is a multiple of the noise.
         distance = 10.0 ** rng.uniform(*MOVED_LOG_DISTANCES, one_per_press)
         moved_level = noise.level(charge) + distance * rng.standard_normal(charge.shape)
         return noise.charge(moved_level)

@@ -67,13 +67,14 @@ class OutsidePresses:
         """
         reach = max(parse_probe(notation).reach for notation in probes)
         probe = Circle(reach)
-        if outermost_distance(sensor.film, probe) < MIN_WIDTH:
+        if outermost_distance(sensor.film, probe) < MIN_WIDTH:  # the probe is nearly as large as the film
             return None
         try:
-            return cls(whole_film_map(sensor, probe, force_range), inner=0.0)
+            charge_map = whole_film_map(sensor, probe, force_range)
         except (SceneError, SolveError) as error:
             _log.warning("presses outside the working area are not simulated: %s", error)
             return None
+        return cls(charge_map, inner=0.0)  # the working area is not known yet
 
     def beyond(self, radius: float) -> "OutsidePresses | None":
         """Return the presses outside a working area; None if the working area nearly reaches the clamp.

@@ -95,6 +95,8 @@ def is_measured(dataset: Dataset) -> bool:
 def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array:
     """Draw contacts whose positions are uniformly distributed over the disk, with log-uniform forces.
 
+    The squared distances from the centre are uniformly distributed, because the area grows with the square.
+
     Args:
         rng: Random number generator.
         domain: Disk and range of forces.
@@ -294,9 +296,10 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
     check_enough(count, len(presses), sensor.name)
     x_mm, y_mm, force_N = complete_presses.contact.T
     probe_column = np.full(count, probe.notation)
-    orientation_deg = np.zeros(count)
+    orientation_deg = np.zeros(count)  # the probe is not turned against its notation
     samples = Samples(x_mm, y_mm, force_N, probe_column, orientation_deg, complete_presses.charge_pC)
-    return Dataset(sensor, samples, {}, presses_sha256(complete_presses))
+    manifest: dict[str, object] = {}  # measured presses have no settings of a simulator
+    return Dataset(sensor, samples, manifest, presses_sha256(complete_presses))
 
 
 def complete(presses: MeasuredPresses) -> Booleans:

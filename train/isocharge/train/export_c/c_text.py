@@ -52,7 +52,8 @@ def c_array(name: str, values: NDArray[Any]) -> str:
     number_type = "signed char" if is_int8 else "float"
     as_text = str if is_int8 else c_float
     literals = ", ".join(as_text(value) for value in values.ravel())
-    # The comma after the last number keeps it together with its line; it is removed after the lines are broken.
+    # With a comma after it, the last number is as long as the others when the lines are broken. The comma is then
+    # removed.
     lines = wrap(f"{literals},", LINE_WIDTH, break_on_hyphens=False)
     numbers = "\n    ".join(lines).rstrip(",")
     return f"static const {number_type} {name}[{values.size}] = {{\n    {numbers}\n}};\n"
@@ -71,7 +72,8 @@ def c_string(text: str) -> str:
         is_plain = character == " " or (character.isascii() and character.isalnum())
         return character if is_plain else f"\\{byte:03o}"
 
-    return '"' + "".join(map(escape, text.encode())) + '"'
+    escaped = "".join(escape(byte) for byte in text.encode())
+    return f'"{escaped}"'
 
 
 def c_comment(text: str) -> str:

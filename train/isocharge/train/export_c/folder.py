@@ -3,6 +3,7 @@
 The folder is written completely or not at all.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -56,11 +57,7 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
     if chain.limit_pC is not None:
         numbers["LIMIT_PC"] = c_double(chain.limit_pC)
     for prefix, settings in _stage_settings(chain).items():
-        is_on = settings.pop("on", False)
-        numbers[SWITCHES[prefix]] = str(int(is_on))
-        for name, value in settings.items():
-            c_name = C_NAMES.get(name, name.upper())
-            numbers[f"{prefix}_{c_name}"] = _c_literal(value)
+        numbers.update(_stage_numbers(prefix, settings))
     lines = "\n".join(f"#define ISOCHARGE_{name} {text}" for name, text in numbers.items())
     return source_text("isocharge_device.h", origin=settings_origin(device), lines=lines)
 
@@ -72,6 +69,25 @@ def settings_origin(device: Device) -> str:
     return f'from the device file "{c_comment(device.name)}"'
 
 
+def _stage_numbers(prefix: str, settings: Mapping[str, Any]) -> dict[str, str]:
+    """Return the C literals of a stage by the names of their macros, without the common prefix of all macros.
+
+    The first macro is 1 if the stage is on, and 0 otherwise.
+
+    Args:
+        prefix: Prefix of the macros of the stage, for example "TARE".
+        settings: Settings of the stage with its switch `on`; empty for a stage that is not in the chain.
+    """
+    is_on = settings.get("on", False)
+    numbers = {SWITCHES[prefix]: str(int(is_on))}
+    for name, value in settings.items():
+        if name == "on":
+            continue
+        c_name = C_NAMES.get(name, name.upper())
+        numbers[f"{prefix}_{c_name}"] = _c_literal(value)
+    return numbers
+
+
 def _stage_settings(chain: Chain) -> dict[str, dict[str, Any]]:
     """Return the settings of each stage of a signal chain, by the prefix of its macros in C.
 
@@ -80,6 +96,7 @@ def _stage_settings(chain: Chain) -> dict[str, dict[str, Any]]:
     Args:
         chain: The signal chain.
     """
+    # A chain always has settings of the leak. Without a time constant, its charges do not leak.
     leak = None if chain.tau_s is None else chain.leak
     stages = {"HUM": chain.hum, "TARE": chain.tare, "LEAK": leak, "TOUCH": chain.touch, "THERMAL": chain.thermal}
     settings_by_prefix: dict[str, dict[str, Any]] = {}
@@ -88,9 +105,11 @@ def _stage_settings(chain: Chain) -> dict[str, dict[str, Any]]:
         settings.pop("pC_per_K", None)  # a chain in C has no pyroelectric charges
         settings_by_prefix[prefix] = settings
     if leak is not None:
-        del settings_by_prefix["LEAK"]["tau_s"]
-        # The chain has a time constant for each electrode, and the stage only one for all.
-        settings_by_prefix["LEAK"] = {"tau_s": chain.tau_s, **settings_by_prefix["LEAK"]}
+        # The settings of the leak have one time constant for all electrodes. The time constants of the chain, one for
+        # each electrode, replace it, and are written first.
+        leak_settings = settings_by_prefix["LEAK"]
+        del leak_settings["tau_s"]
+        settings_by_prefix["LEAK"] = {"tau_s": chain.tau_s, **leak_settings}
     return settings_by_prefix
 
 
@@ -188,7 +207,9 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
     metadata = loaded.metadata
     check_channels(device, metadata.electrodes, f"model {metadata.label}")
     network = read_graph(path.read_bytes(), str(path))
+    # The README contains the command between backticks, so the command itself must not contain any.
     command_in_one_line = " ".join(command.replace("`", "'").split())
+    example_charges = ["800.0f"] * len(metadata.electrodes)
     files = {
         "isocharge_model.h": model_header(metadata, network),
         "isocharge_model.c": model_source(metadata, network),
@@ -199,15 +220,25 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
             "README.md",
             label=metadata.label,
             command=command_in_one_line or "isocharge train export-c",
-            charges=", ".join(["800.0f"] * len(metadata.electrodes)),
+            charges=", ".join(example_charges),
             electrodes=c_comment(", ".join(metadata.electrodes)),
             origin=settings_origin(device),
         ),
     }
+    return files | _sketch_files(files, len(metadata.electrodes))
 
-    # The sketch for Arduino has a folder of its own, with copies of the sources.
+
+def _sketch_files(files: Mapping[str, str], n_electrode: int) -> dict[str, str]:
+    """Return the text of each file of the sketch for Arduino by its path in the folder of the export.
+
+    The sketch has a folder of its own, which contains copies of the sources. It computes in single precision.
+
+    Args:
+        files: Text of the files of the export by name.
+        n_electrode: Number of electrodes, each of which has an analogue pin.
+    """
     sketch = {name: files[name] for name in ("isocharge_model.h", "isocharge_model.c", *BOARD_SOURCES)}
     sketch["isocharge_device.h"] = SINGLE_PRECISION + files["isocharge_device.h"]
-    pins = ", ".join(f"A{pin_index}" for pin_index in range(len(metadata.electrodes)))
+    pins = ", ".join(f"A{pin_index}" for pin_index in range(n_electrode))
     sketch[f"{SKETCH}.ino"] = source_text("sketch.ino", pins=pins)
-    return files | {f"arduino/{SKETCH}/{name}": text for name, text in sketch.items()}
+    return {f"arduino/{SKETCH}/{name}": text for name, text in sketch.items()}

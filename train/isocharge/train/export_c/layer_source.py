@@ -70,6 +70,7 @@ class LayerSource:
         if self.bias is not None:
             arrays.append(c_array(f"{self.name}_bias", self.bias))
 
+        # The sums over integer weights are multiplied by the scale of their column.
         result = "y[j] + c[j]" if scale is None else f"y[j] * {self.name}_scale[j] + c[j]"
         if self.activation is not None:
             result = f"{self.activation.c_function}({result})"
@@ -92,15 +93,17 @@ class LayerSource:
 def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Block, ...]]:
     """Find the blocks of consecutive layers: two where two perceptrons run side by side, otherwise one.
 
-    The layers are examined from the last to the first one. For the last layer, it is known which outputs belong to
-    which perceptron. The rows of a layer then tell which of its inputs belong to which perceptron.
+    Where two perceptrons run side by side, a weight matrix is block diagonal: the inputs and outputs of the first
+    perceptron come first, and no weight connects both perceptrons. The layers are examined from the last to the first
+    one. For the last layer, it is known which outputs belong to which perceptron. The rows of a layer then show which
+    of its inputs belong to which perceptron.
 
     Args:
         weights: Weights of each layer except the first one, whose inputs both perceptrons share.
         first_width: Number of outputs of the last layer that belong to the first perceptron.
 
     Returns:
-        Blocks of each layer.
+        Blocks of each layer, as slices of the rows (inputs) and the columns (outputs) of its weights.
     """
     blocks: list[tuple[Block, ...]] = []
     n_first_output = first_width  # number of outputs of the examined layer that belong to the first perceptron
@@ -108,14 +111,16 @@ def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Bloc
         # The inputs of the second perceptron follow those of the first perceptron. They begin at the first row with a
         # weight for the outputs of the second perceptron.
         is_used_by_second = matrix[:, n_first_output:].any(axis=1)
-        n_first_input = int(is_used_by_second.argmax())
-        is_block_diagonal = n_first_input > 0 and not matrix[n_first_input:, :n_first_output].any()
+        n_first_input = int(is_used_by_second.argmax())  # index of the first true value
+        connects_second_to_first = matrix[n_first_input:, :n_first_output].any()
+        is_block_diagonal = n_first_input > 0 and not connects_second_to_first
         if is_block_diagonal:
             first = (slice(0, n_first_input), slice(0, n_first_output))
             second = (slice(n_first_input, None), slice(n_first_output, None))
             blocks.append((first, second))
             n_first_output = n_first_input  # the inputs of this layer are the outputs of the layer before it
         else:
+            # Both perceptrons share the inputs of this layer, so all layers before it have a single block, too.
             blocks.append((WHOLE_MATRIX,))
             n_first_output = 0
     return blocks[::-1]

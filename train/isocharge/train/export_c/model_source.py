@@ -70,7 +70,7 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         calls.append(f"{layer.name}({input_buffer}, {layer.name}_bias, {output_buffer});")
     calls.append(f"skip({buffers[0]}, skip_bias, skipped);")
     calls.append(f"last({buffers[-1]}, skipped, answers);")
-    hidden_buffers = dict.fromkeys(buffers[1:])  # each name once
+    hidden_buffers = dict.fromkeys(buffers[1:])  # each name once, in order
     return source_text(
         "isocharge_model.c",
         label=c_comment(metadata.label),
@@ -110,11 +110,10 @@ def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSour
 
     first_weight = weights_on_inputs(first.weight)
     hidden = [LayerSource("layer_0", first_weight, _single_precision(first.bias), activation=perceptron.activation)]
-    for layer_index, (layer, weight, blocks) in enumerate(
-        zip(others, other_weights, other_blocks, strict=True), start=1
-    ):
+    for layer, weight, blocks in zip(others, other_weights, other_blocks, strict=True):
+        name = f"layer_{len(hidden)}"
         bias = _single_precision(layer.bias)
-        hidden.append(LayerSource(f"layer_{layer_index}", weight, bias, blocks, perceptron.activation))
+        hidden.append(LayerSource(name, weight, bias, blocks, perceptron.activation))
     # The bias of the output layer is added with the skip layer.
     skip = LayerSource("skip", weights_on_inputs(perceptron.skip), _single_precision(perceptron.last.bias))
     last = LayerSource("last", last_weight, blocks=last_blocks)

@@ -66,9 +66,10 @@ class FilmInputs:
         """
         charge = presses.charge()[:N_WHITENING_FILMS]
         log_charge = np.log(np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE))
-        log_scale = scaling.log_charge_scale(presses.parameters[:N_WHITENING_FILMS])
-        scaled_log_charge = log_charge - log_scale[:, None]
-        mean, matrix = whitening(scaled_log_charge.reshape(-1, charge.shape[-1]))
+        log_scale = scaling.log_charge_scale(presses.parameters[:N_WHITENING_FILMS])  # shape (n_film, n_electrode)
+        scaled_log_charge = log_charge - log_scale[:, None]  # shape (n_film, n_press, n_electrode)
+        n_electrode = charge.shape[-1]
+        mean, matrix = whitening(scaled_log_charge.reshape(-1, n_electrode))
         return cls(scaling, mean, matrix)
 
     @property
@@ -164,6 +165,9 @@ class ConditionalPerceptron(nn.Module):
     def definition(self, context: Tensor) -> Perceptron[Tensor]:
         """Return the perceptrons of films, as one perceptron whose weights have a first axis for the film.
 
+        The context network computes features psi of each film. The weights of each layer are a sum of matrices with the
+        factors phi. The factors phi and the biases are linear functions of psi.
+
         Args:
             context: Contexts of the films, shape (n_film, n_context).
         """
@@ -175,7 +179,8 @@ class ConditionalPerceptron(nn.Module):
         layers = []
         for layer_index, (constant, bases, bias) in enumerate(zip(self.constant, self.bases, self.bias, strict=True)):
             weight = _mix_weights(constant, bases, phi[:, layer_index])
-            layers.append(Layer(weight, bias(psi)[:, None]))
+            film_bias = bias(psi)[:, None]  # shape (n_film, 1, n_output), the same for all presses on a film
+            layers.append(Layer(weight, film_bias))
         skip = _mix_weights(self.skip, self.skip_bases, phi[:, n_layer])
         *hidden, last = layers
         return Perceptron(tuple(hidden), last, skip, self.activation)

@@ -132,6 +132,10 @@ class FilmScaling:
     def _raw_context(self, parameters: Array) -> Array:
         """Compute the numbers that describe films, before they are standardised.
 
+        The numbers are the pretension strain, the ratio of d31 to d32, the thickness, the position (x, y) of the film
+        relative to the electrodes, the rotation of the electrodes, the probe radius, the mean scale of the charges, the
+        stiffness, and the gains relative to their mean. All except position, rotation and radius are logarithms.
+
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
 
@@ -151,7 +155,7 @@ class FilmScaling:
         centre = described_shift - rotated_shift
 
         shared_columns = [
-            np.log(strain + SOFTENING),
+            np.log(strain + SOFTENING),  # a slack film has the strain 0
             _shared(parameters, "d31") - _shared(parameters, "d32"),
             _shared(parameters, "thickness"),
             centre[..., 0],
@@ -167,7 +171,7 @@ class FilmScaling:
 
 
 def _shared(parameters: Array, name: str) -> Array:
-    """Return a parameter that does not belong to a single electrode, shape (...)."""
+    """Return the parameter with this name, which does not belong to a single electrode, shape (...)."""
     return np.asarray(parameters[..., SHARED.index(name)])
 
 

@@ -71,7 +71,9 @@ class FilmPresses:
         """Compute the charges of the films without noise.
 
         The parts of the charges for d31, d32 and d33 are multiplied by the factors of the film and added. The sums are
-        multiplied by the gains of the electrodes.
+        multiplied by the gains of the electrodes:
+
+            charge = gain factor * sum over the parts (part factor * part).
 
         Returns:
             Charges, shape (n_film, n_press, n_electrode), pC.
@@ -113,6 +115,7 @@ def draw_film_presses(
     Raises:
         DatasetError: If too many charges are not positive.
     """
+    # The number after the seed makes this sequence independent of the sequences of the presses.
     parameters = prior.draw(np.random.default_rng([seed, 0]), films)
     jobs = [(first_film, parameters[first_film : first_film + CHUNK]) for first_film in range(0, films, CHUNK)]
     press_films = partial(_press_films, prior, family, domain, presses, seed)
@@ -182,7 +185,7 @@ def _response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: 
 
     def charges(d31: float, d32: float, d33: float = 0.0) -> Array:
         """Return the charges of the film with other piezoelectric coefficients, shape (n_press, n_electrode), pC."""
-        if d31 == 0.0 and d32 == 0.0:
+        if d31 == 0.0 and d32 == 0.0:  # the sensor file has no such coefficient, so this part is zero
             return no_charge
         other_sensor = replace(forward_map.sensor, piezo=Piezo(d31, d32, d33))
         return replace(forward_map, sensor=other_sensor).charges(contact)
@@ -354,12 +357,14 @@ def _good_presses(source: FilmsSource, presses: int, seed: int, job: tuple[int, 
         Charges, pC, and then projection matrices, shape (presses, n_electrode, 1 + n_electrode).
     """
     film_number, parameters = job
+    # The numbers after the seed make this sequence independent of those of other films and other purposes.
     rng = np.random.default_rng([seed, 5, film_number])
     contact = draw_contacts(rng, source.domain, presses)
     charge, slopes = linearised(source.charge_map(parameters), contact)
     scaled_slopes = slopes / source.noise.sigma(charge)[:, :, None]
     # The projection removes the changes of the charges that a change of the contact explains. These changes are
-    # combinations of the columns of `scaled_slopes`, for which QR gives an orthonormal basis.
+    # combinations of the columns of `scaled_slopes`, for which QR gives an orthonormal basis B. The projection is
+    # I - B B'.
     basis, _ = np.linalg.qr(scaled_slopes)
     projection = np.eye(charge.shape[1]) - basis @ basis.transpose(0, 2, 1)
     return np.concatenate([charge[:, :, None], projection], axis=2)

@@ -103,7 +103,7 @@ def films_from_bytes(data: bytes, where: str) -> FilmsModel:
         if about["format"] != FORMAT:
             raise ModelError(f"{where}: format {about['format']} is not supported (this version reads {FORMAT})")
         return _model_from_arrays(about, arrays, sha256_of(data))
-    except ModelError:
+    except ModelError:  # it has a message of its own, but is one of the errors below
         raise
     except DAMAGED_FILE_ERRORS as error:
         raise ModelError(f"{where}: damaged ({type(error).__name__}: {error}); {ADVICE}") from error
@@ -274,7 +274,8 @@ def _unpacked(packed: Mapping[str, np.ndarray], activation: Activation) -> Condi
     """
     names = [name for name in packed if not name.endswith(".scale")]
     for name in names:
-        if max(packed[name].shape, default=1) > MAX_LAYER_WIDTH:
+        largest_dimension = max(packed[name].shape, default=1)  # an array without dimensions is a single number
+        if largest_dimension > MAX_LAYER_WIDTH:
             raise ValueError(f"{name}: expected layers of at most {MAX_LAYER_WIDTH} nodes, got {packed[name].shape}")
     arrays = {name: packed[name] * packed[f"{name}.scale"].astype(float) for name in names}
     return ConditionalWeights(arrays, activation)

@@ -195,12 +195,9 @@ class FilmsModel:
         sensor, probe = self.prior.film(parameters)
         rng = np.random.default_rng(SEED)
 
-        # Contacts for the test, for the corrections, and for the added variances. The number of drawn contacts is
-        # fixed, so that the contacts for the corrections do not depend on `n_test`.
+        # Contacts for the test, for the corrections, and for the added variances, whose charges are computed together
         n_train = N_CORRELATION_PRESSES if correlation else N_REGRESSION_PRESSES
-        drawn_contact = draw_contacts(rng, self.domain, N_TEST_PRESSES + N_CORRELATION_PRESSES)
-        test_contact = drawn_contact[N_TEST_PRESSES - n_test : N_TEST_PRESSES]
-        train_contact = drawn_contact[N_TEST_PRESSES : N_TEST_PRESSES + n_train]
+        test_contact, train_contact = self._draw_contacts(rng, n_test, n_train)
         uncertain_contact = np.empty((0, 3)) if added_variance is None else added_variance.contact
         contact = np.concatenate([test_contact, train_contact, uncertain_contact])
         test_rows, train_rows, uncertain_rows = np.split(np.arange(len(contact)), [n_test, n_test + n_train])
@@ -214,7 +211,8 @@ class FilmsModel:
         if correlation:
             network = with_correlation(network, presses[train_rows], self.noise, SEED)
         if added_variance is not None:
-            noisy_charge = self.noise.add(presses.charge[uncertain_rows.repeat(N_COPIES)], rng)
+            copied_rows = uncertain_rows.repeat(N_COPIES)  # each copy gets its own noise
+            noisy_charge = self.noise.add(presses.charge[copied_rows], rng)
             repeated_variance = added_variance.variance.repeat(N_COPIES, axis=0)
             network = add_variance(network, noisy_charge, repeated_variance)
         test = presses[test_rows]
@@ -230,6 +228,24 @@ class FilmsModel:
             provenance=provenance or Provenance(),
             requested_domain=self.domain,
         )
+
+    def _draw_contacts(self, rng: np.random.Generator, n_test: int, n_train: int) -> tuple[Array, Array]:
+        """Draw contacts for the test and contacts for the corrections.
+
+        The largest possible number of contacts is always drawn, and some of them are not used. The contacts for the
+        corrections therefore do not depend on the number of test contacts.
+
+        Args:
+            rng: Random number generator.
+            n_test: Number of contacts for the test, at most `N_TEST_PRESSES`.
+            n_train: Number of contacts for the corrections, at most `N_CORRELATION_PRESSES`.
+
+        Returns:
+            Contacts for the test, shape (n_test, 3), and for the corrections, shape (n_train, 3), mm and N.
+        """
+        drawn_contact = draw_contacts(rng, self.domain, N_TEST_PRESSES + N_CORRELATION_PRESSES)
+        test_candidates, train_candidates = np.split(drawn_contact, [N_TEST_PRESSES])
+        return test_candidates[N_TEST_PRESSES - n_test :], train_candidates[:n_train]
 
     def _adapt_to_factors(
         self, network: FoldedNetwork, presses: LabelledPresses, factors: Array, rng: np.random.Generator

@@ -53,13 +53,16 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
         and 0.1 % of the good presses exceed. For simulated presses, the result also contains the errors without noise,
         and the fractions of faults that cause an alarm. For measured presses, there is also the number of presses.
     """
-    if isinstance(presses, Dataset):
-        presses = LabelledPresses.of(presses)
-    test = fitted.test if presses is None else presses
+    if presses is None:
+        test = fitted.test
+    elif isinstance(presses, Dataset):
+        test = LabelledPresses.of(presses)
+    else:
+        test = presses
     if not test.measured and isinstance(fitted.noise, NoiseModel):
         return simulated_errors(fitted.predict, test, fitted.noise, seed)
 
-    # Measured presses: the estimates of the cross-validation are used, because the network was trained on the presses.
+    # If a network was trained on its own test presses, the estimates of the cross-validation are used.
     if presses is None and fitted.cross_validated is not None:
         contact, std, _ = fitted.cross_validated
     else:
@@ -201,7 +204,7 @@ def _detected_faults(
     Returns:
         Fractions for a gain that is wrong by 20 % and for a dead electrode; empty if there are no presses.
     """
-    if not len(presses):
+    if not len(presses):  # for example, if no force is near 1 N
         return {}
     charge = presses.noisy(noise, seed)
     n_electrode = charge.shape[1]

@@ -86,7 +86,7 @@ def check_graph(
     ordinary, extreme = _golden_charges(exact, presses, noise)
     _check_finite_outputs(session, n_electrode=presses.charge.shape[1])
     _compare(session, exact, extreme, floors, tolerance_factor=EXTREME_FACTOR)
-    repeated_rows = np.arange(N_COMPARED) % len(presses)
+    repeated_rows = np.arange(N_COMPARED) % len(presses)  # after the last press, the first one follows again
     noisy = presses[repeated_rows].noisy(noise, seed=3).astype(np.float32)
     _compare(session, exact, noisy, floors, tolerance_factor=1.0)
     return np.concatenate([ordinary, extreme])
@@ -108,7 +108,7 @@ def _golden_charges(exact: OutputFunction, presses: LabelledPresses, noise: Nois
         Charges of presses, shape (n, n_electrode), and extreme charges, shape (m, n_electrode), pC.
     """
     _, std, *_ = exact(presses.charge)
-    position_std = std[:, 0] + std[:, 1]
+    position_std = std[:, 0] + std[:, 1]  # a measure of the uncertainty of x and y
     well_determined = presses[np.flatnonzero(position_std <= np.median(position_std))]
 
     # Half of the charges belong to presses without noise, and a quarter to every second of these presses with noise.
@@ -118,7 +118,8 @@ def _golden_charges(exact: OutputFunction, presses: LabelledPresses, noise: Nois
     press_charge = np.concatenate([chosen.charge, every_second.noisy(noise, seed=2)])
 
     # The last quarter has charges from 0.001 to 1000 times those of the presses, zero charges and negative charges.
-    extreme_charge = every_second.charge * np.geomspace(1e-3, 1e3, len(every_second))[:, None]
+    factor = np.geomspace(1e-3, 1e3, len(every_second))
+    extreme_charge = every_second.charge * factor[:, None]  # one factor for all charges of a press
     extreme_charge[0] = 0.0
     extreme_charge[1] = -extreme_charge[1]
     return press_charge.astype(np.float32), extreme_charge.astype(np.float32)

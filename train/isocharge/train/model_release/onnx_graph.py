@@ -124,9 +124,10 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     # The part `contact_std` is itself an output, so it needs no further node.
     force, _ = build.split(build.add("Exp", logarithms), {"force": 1, "contact_std": 3})
     build.add("Concat", position, force, to="contact", axis=1)
-    for angles in optional_angles:
+    for angles in optional_angles:  # one tensor, or none if the network has no correlations
         cosines = build.add("Cos", angles)
         build.add("MatMul", cosines, build.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
+    # The length of the misfit vector is the inverse hyperbolic sine of the misfit over its unit.
     compressed_misfit = build.add("ReduceL2", misfit_vector, axes=[1], keepdims=1)
     build.add("Mul", build.add("Sinh", compressed_misfit), build.constant(MISFIT_UNIT), to="misfit")
 
@@ -199,13 +200,13 @@ def _make_model(
         **attributes: Further arguments of `onnx.helper.make_model`.
     """
 
-    def tensors(widths: Mapping[str, int]) -> list[onnx.ValueInfoProto]:
-        """Return the declarations of float32 tensors with these widths."""
+    def declare(widths: Mapping[str, int]) -> list[onnx.ValueInfoProto]:
+        """Return the declarations of float32 tensors [n, width], whose widths are given by the name of the tensor."""
         return [
             helper.make_tensor_value_info(tensor, TensorProto.FLOAT, ["n", width]) for tensor, width in widths.items()
         ]
 
-    graph = helper.make_graph(build.nodes, name, tensors({INPUT: n_electrode}), tensors(outputs), build.constants)
+    graph = helper.make_graph(build.nodes, name, declare({INPUT: n_electrode}), declare(outputs), build.constants)
     opset = helper.make_opsetid("", OPSET)
     return helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, **attributes)
 
@@ -283,6 +284,7 @@ def _activation_of(operators: Sequence[str], where: str) -> Activation:
         where: Beginning of the error message.
     """
     activation_of_operator = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
+    # The operator `Gemm` is a linear layer. Without any, the search begins at the end and finds no activation.
     first_layer = operators.index("Gemm") if "Gemm" in operators else len(operators)
     following = operators[first_layer + 1 : first_layer + 2]  # one operator, or none at the end of the graph
     if not following or following[0] not in activation_of_operator:
@@ -301,7 +303,7 @@ def _constants_in_order(graph: onnx.GraphProto, where: str) -> Iterator[Array]:
     constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
     for node in graph.node:
         for name in node.input:
-            if name not in constants:
+            if name not in constants:  # the result of another node, or the charges
                 continue
             if not np.isfinite(constants[name]).all():
                 _refuse(where, f"node {node.op_type} {list(node.output)}: expected finite constants")

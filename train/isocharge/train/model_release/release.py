@@ -361,7 +361,7 @@ def _yield_force(fitted: Fitted) -> float | None:
         return None
     force_range = fitted.domain.force_range
     min_force, max_force = force_range
-    yield_force = max_force
+    yield_force = max_force  # stays at this value if the film does not yield
     for notation in fitted.probes:
         probe = parse_probe(notation)
         try:

@@ -188,7 +188,9 @@ class DatasetEvaluation:
         case = self.case
         settings = self.settings
         forward_maps = case.forward_maps(range_factor=1.0, accuracy=settings.accuracy, executor=executor)
-        clean = simulate_presses(self._test_maps(forward_maps, executor), case.test_sweep())
+        # The test presses come from other solves than the limits, except in a quick report.
+        test_maps = self._test_maps(forward_maps, executor)
+        clean = simulate_presses(test_maps, case.test_sweep())
         noisy_charge = clean.noisy(case.noise, case.seed + TEST_NOISE_SEED)
         test = replace(clean, charge=noisy_charge)
 

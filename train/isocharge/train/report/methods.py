@@ -145,7 +145,7 @@ def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callabl
         # `predict` expects a batch, so each press becomes a batch of one press, shape (1, n_input).
         calls = [partial(regressor.predict, press_input[None]) for press_input in inputs]
     cyclic_calls = cycle(calls)
-    return lambda: next(cyclic_calls)()
+    return lambda: next(cyclic_calls)()  # take the call of the next press, and make it
 
 
 def _batch_contender(method: ComparedMethod, test: LabelledPresses, batch_size: int) -> Contender:

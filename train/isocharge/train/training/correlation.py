@@ -127,7 +127,8 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
     """Fit the linear layer that computes the angles a, b and c.
 
     The inputs are whitened for the fit. The returned layer includes this whitening. The minimised function is
-    `correlation_loss` plus a penalty on the squared weights.
+    `correlation_loss` plus a penalty on the squared weights. The first step of the L-BFGS method has a length of about
+    1, so the variables of the minimisation are the bias and the weights in units of `FIRST_STEP`.
 
     Args:
         inputs: Inputs of the layer, shape (n, k).
@@ -136,7 +137,8 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
     Returns:
         Layer from the inputs to the angles: weight, shape (k, 3), and bias, shape (3,).
     """
-    mean, matrix = whitening(inputs[::WHITENING_STRIDE], MIN_RELATIVE_STD)
+    whitening_inputs = inputs[::WHITENING_STRIDE]
+    mean, matrix = whitening(whitening_inputs, MIN_RELATIVE_STD)
     white_inputs = np.ascontiguousarray((inputs - mean) @ matrix, dtype=np.float32)
     clipped_deviation = np.clip(deviation, -MAX_DEVIATION, MAX_DEVIATION)
     targets = np.ascontiguousarray(clipped_deviation.T, dtype=np.float32)  # shape (3, n)
@@ -175,6 +177,8 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Arr
     The search ends if the gradient is below the tolerance, or after `MAX_ITERATIONS`. If it ends because the line
     searches of all starts have failed, a warning is logged.
 
+    The position is given in units of `FIRST_STEP`, so its gradient is `FIRST_STEP` times that of the loss.
+
     Args:
         loss: Function that returns the loss and its gradient at a position.
         start: Position at which the search starts, shape (n,).
@@ -182,7 +186,8 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Arr
     Returns:
         Position at which the search ended, shape (n,).
     """
-    tolerance = FIRST_STEP * GRADIENT_TOLERANCE  # the loss is a function of the position in units of FIRST_STEP
+    tolerance = FIRST_STEP * GRADIENT_TOLERANCE
+    # With ftol = 0, a small change of the loss does not end the search.
     options = {"ftol": 0.0, "gtol": tolerance, "maxcor": N_UPDATES}
     position = start
     remaining_iterations = MAX_ITERATIONS

@@ -308,7 +308,7 @@ def _train_members(
             structs.replace(config, steps=steps),
         )
         named_stage = replace(stage, name=f"contact-{fold_index + 1}-{steps}")
-        patience = max(steps // 2, 1)
+        patience = max(steps // 2, 1)  # end after half of the steps without a better score
         descent = Descent(named_stage, config.learning_rate, patience, config.seed + fold_index)
         descent.run(run)
         return descent
@@ -419,12 +419,13 @@ def _distillation_stage(
         validation_loss = divergence(slice(n_train, None)).item()
         return validation_loss, f"{validation_loss:.4f} from the mean of {len(members)} networks"
 
+    steps = max(config.contact_step_count(network.n_electrode) // 2, 1)
     return TrainingStage(
         "contact",
         network.contact,
         loss,
         score,
-        max(config.contact_step_count(network.n_electrode) // 2, 1),
+        steps,
         slow_parameters=(network.contact.skip.weight,),
     )
 
@@ -446,8 +447,10 @@ def _misfit_examples(
         Charges, pC, and residuals in standard deviations of the noise, shape (2, n, n_electrode).
     """
     rng = np.random.default_rng(config.seed)
+    # The level of a charge is the charge on a scale on which the noise has the standard deviation 1.
     planes = LocalPlanes.through(domain.to_unit(presses.contact), noise.level(presses.charge))
-    chosen_rows = rng.integers(len(presses), size=config.misfit_charge_count(presses.charge.shape[1]))
+    n_electrode = presses.charge.shape[1]
+    chosen_rows = rng.integers(len(presses), size=config.misfit_charge_count(n_electrode))
     _, charge = draw_charges(rng, presses.charge[chosen_rows], presses.charge, noise)
     residual = planes.residuals(noise.level(charge))
     return np.stack([charge, residual])

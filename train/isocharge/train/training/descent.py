@@ -268,6 +268,9 @@ def tensors_from_bytes(data: bytes) -> Any:
 def _relative_rate(progress: float) -> float:
     """Return the learning rate relative to its largest value.
 
+    During the warm-up, the rate rises from `INITIAL_RATE` to 1 along half a period of a cosine. After the warm-up, it
+    falls to 0 along another half period.
+
     Args:
         progress: Number of completed steps relative to the number of all steps.
     """

@@ -204,8 +204,10 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
 
         def train_misfit() -> OutsidePresses | None:
             """Train the misfit perceptron, and return the film outside the working area if it is simulated."""
+            outside = None
             film_presses = whole_film.result() if whole_film is not None else None
-            outside = film_presses.beyond(split.domain.radius) if film_presses is not None else None
+            if film_presses is not None:
+                outside = film_presses.beyond(split.domain.radius)
             all_examples = examples.with_outside(inner_examples, outside)
             train_perceptron(misfit_stage(network, all_examples, training), network.misfit_vector, config, run)
             return outside
@@ -242,6 +244,7 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
     previous_count = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
+        # `fork_rng` restores the random state after the block; without devices, only that of the CPU.
         with threadpool_limits(count), torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             yield
@@ -308,6 +311,7 @@ def contact_stage(
     warm_up_steps = round(WARM_UP_FRACTION * steps)
     charge = as_tensor(train.charge)
     target = as_tensor(domain.to_unit(train.contact))
+    # Measured charges have noise of their own.
     validation_charge = as_tensor(validation.charge if validation.measured else validation.noisy(noise, config.seed))
     validation_target = as_tensor(domain.to_unit(validation.contact))
     batch = min(config.batch, len(charge))
@@ -322,16 +326,16 @@ def contact_stage(
         charges.
         """
         rows = torch.randint(len(charge), (batch,), generator=random)
-        noisy = with_fresh_noise(charge[rows], noise, random)
+        noisy_batch = with_fresh_noise(charge[rows], noise, random)
         contact = target[rows]
-        mean, log_std, angles = network.posterior_with_angles(noisy)
+        mean, log_std, angles = network.posterior_with_angles(noisy_batch)
         is_warm_up = step < warm_up_steps
         if teacher is None:
             if is_warm_up:
                 return warm_up_loss(mean, log_std, contact)
             posterior_loss = weighted_likelihood_loss(mean, log_std, contact)
         else:
-            teacher_mean, teacher_log_std = teacher.posterior(noisy, domain)
+            teacher_mean, teacher_log_std = teacher.posterior(noisy_batch, domain)
             if is_warm_up:
                 return warm_up_loss(mean, log_std, teacher_mean)
             posterior_loss = distillation_loss(mean, log_std, teacher_mean, teacher_log_std)

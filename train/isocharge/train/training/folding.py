@@ -45,6 +45,7 @@ def fold(
     first_bias = first.bias - mean @ first_weight
     skip = matrix @ joined.skip @ units.weight
     last_weight = joined.last.weight @ units.weight
+    # The skip layer has no bias, so its part - mean @ skip becomes part of the bias of the last layer.
     last_bias = joined.last.bias @ units.weight + units.bias - mean @ skip
     return replace(
         joined,

@@ -119,7 +119,8 @@ class MisfitExamples:
         )
         outside_examples = self._saved_or_drawn("misfit-outside", draw)
 
-        # Arrays of examples have the shape (2, n, n_electrode). The second axis is shuffled for the validation.
+        # Arrays of examples have the shape (2, n, n_electrode). The second axis is shuffled, because the last examples
+        # are used for validation.
         examples = np.concatenate([inner_examples[:, n_outside:], outside_examples], axis=1)
         return np.random.default_rng(seed).permutation(examples, axis=1)
 

@@ -237,6 +237,7 @@ class InverseNetwork(nn.Module):
         log_contact = unit_mean * self.scale + self.centre
         log_contact_std = torch.exp(unit_log_std) * self.scale
 
+        # The standard deviation of ln F is that of F relative to F.
         force = torch.exp(log_contact[:, 2:])  # shape (n, 1)
         contact = torch.cat([log_contact[:, :2], force], dim=1)
         contact_std = torch.cat([log_contact_std[:, :2], log_contact_std[:, 2:] * force], dim=1)

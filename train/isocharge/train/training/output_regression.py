@@ -84,15 +84,8 @@ def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent: Array, c
         return targets
 
     def std_targets(outputs: Array) -> Array:
-        """Return the present outputs with standard deviations that are changed by one scoring step.
-
-        The step changes the logarithm of a standard deviation by half of (error / standard deviation)^2 - 1.
-        """
-        relative_error = np.abs(outputs[:, MEAN] - log_contact) * np.exp(-relative_log_std(outputs))
-        limited_error = np.minimum(relative_error, MAX_ERROR)
-        targets = outputs.copy()
-        targets[:, LOG_STD] += 0.5 * (limited_error**2 - 1.0)
-        return targets
+        """Return the present outputs with standard deviations that are changed by one scoring step."""
+        return _scoring_step(outputs, log_contact, MAX_ERROR, expected_square=1.0)
 
     # The last layer is fitted first to the contacts, and then in several scoring steps to the standard deviations.
     contact_regression = Regression(contact_targets, EXACT_RIDGE)
@@ -101,12 +94,31 @@ def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent: Array, c
     return replace(network, layers=layers)
 
 
+def _scoring_step(outputs: Array, log_contact: Array, largest_error: float, expected_square: float) -> Array:
+    """Return the outputs of a network with standard deviations that are changed by one step of Fisher's scoring.
+
+    The step adds (e^2 / expected_square - 1) / 2 to the logarithm of a standard deviation. Here e is the error divided
+    by the standard deviation, and is limited to `largest_error`.
+
+    Args:
+        outputs: Outputs of the last layer, shape (n, n_answer).
+        log_contact: True contacts (x, y, ln F), shape (n, 3), mm and logarithm of N.
+        largest_error: Largest error that the step distinguishes, in standard deviations.
+        expected_square: Mean of e^2 if the standard deviations are right.
+    """
+    relative_error = np.abs(outputs[:, MEAN] - log_contact) * np.exp(-relative_log_std(outputs))
+    limited_error = np.minimum(relative_error, largest_error)
+    changed = outputs.copy()
+    changed[:, LOG_STD] += 0.5 * (limited_error**2 / expected_square - 1.0)
+    return changed
+
+
 def _linear_fit(inputs: Array, outputs: Array) -> Layer[Array]:
     """Return the linear layer that computes outputs from inputs with the smallest sum of squared errors.
 
     Args:
         inputs: Inputs, shape (n, n_input).
-        outputs: Shape (n, n_output).
+        outputs: Outputs to be computed, shape (n, n_output).
     """
     design = np.column_stack([inputs, np.ones(len(inputs))])  # the column of ones is for the bias
     coefficients, *_ = np.linalg.lstsq(design, outputs)
@@ -140,16 +152,8 @@ def fit_std(network: FoldedNetwork, charge: Array, contact: Array) -> FoldedNetw
     limited_mean_square = square_within + CORE_ERROR**2 * (1.0 - probability_within)
 
     def std_targets(outputs: Array) -> Array:
-        """Return the present outputs with standard deviations that are changed by one scoring step.
-
-        The step changes the logarithm of a standard deviation by half of q - 1. Here q is the squared limited error
-        over its mean for a normal distribution.
-        """
-        relative_error = np.abs(outputs[:, MEAN] - log_contact) * np.exp(-relative_log_std(outputs))
-        limited_error = np.minimum(relative_error, CORE_ERROR)
-        targets = outputs.copy()
-        targets[:, LOG_STD] += 0.5 * (limited_error**2 / limited_mean_square - 1.0)
-        return targets
+        """Return the present outputs with standard deviations that are changed by one scoring step."""
+        return _scoring_step(outputs, log_contact, CORE_ERROR, expected_square=limited_mean_square)
 
     features = network.features.evaluate(charge)
     regressions = [Regression(std_targets, CORE_RIDGE) for _ in range(N_CORE_STEPS)]
@@ -171,6 +175,7 @@ def add_variance(network: FoldedNetwork, charge: Array, variance: Array) -> Fold
         """Return the outputs with the logarithms of the larger standard deviations."""
         relative_increase = variance * np.exp(-2.0 * relative_log_std(outputs))  # added over present variance
         targets = outputs.copy()
+        # ln sqrt(present + added variance) = ln(present std) + ln(1 + relative increase) / 2
         targets[:, LOG_STD] += 0.5 * np.log1p(relative_increase)
         return targets
 
@@ -209,7 +214,7 @@ def refit_last_layer(
         outputs = design @ weights
         change = regression.target(outputs) - outputs
         right_side = design.T @ change
-        changed_columns = np.flatnonzero(change.any(axis=0))
+        changed_columns = np.flatnonzero(change.any(axis=0))  # outputs that are already equal to their targets remain
         for column in changed_columns:
             # Solve the normal equations for the fitted weights of this output. The other weights remain zero.
             rows = np.flatnonzero(is_fitted[:, column])

@@ -102,7 +102,7 @@ def _update(
     if gradient.ndim > 1:
         state["row_moment"].lerp_(gradient @ gradient.mT, 1.0 - square_decay)
         state["column_moment"].lerp_(gradient.mT @ gradient, 1.0 - square_decay)
-        if state["step"] % BASIS_PERIOD == 1:
+        if state["step"] % BASIS_PERIOD == 1:  # at the first step, and then once in a period
             _update_basis(state)
 
     # Moving averages of the gradient, and of its squared entries in the eigenbasis

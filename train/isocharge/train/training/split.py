@@ -109,5 +109,6 @@ def _split_presses(
     else:
         remaining, test = split_by_position(presses, training.hold_out, training.seed)
     validation_share = VALIDATION_FRACTION * training.hold_out
+    # Another seed makes this choice independent of that of the test.
     train, validation = split_by_position(remaining, validation_share, training.seed + 1)
     return train, validation, test
