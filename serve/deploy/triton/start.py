@@ -15,35 +15,38 @@ from pathlib import Path
 HERE = Path(__file__).parent
 
 
-def backends(pytriton: Path) -> Path:
-    """Create a folder with the two backends that Triton needs, and return its path.
+def create_backends_folder(pytriton: Path) -> Path:
+    """Create a folder with the two backends that Triton needs, and return its path. An older folder is replaced.
 
-    The folder contains the Python backend of the wheel, the stub that starts the Python of this environment, and the
-    backend `onnxruntime` that is beside this script.
+    The folder contains the Python backend of the wheel, the stub program that runs the backend in the Python version of
+    this environment, and the backend `onnxruntime` that is beside this script.
 
     Args:
         pytriton: Folder of the installed package `pytriton`.
     """
     folder = Path(sys.prefix) / "triton-backends"
     shutil.rmtree(folder, ignore_errors=True)
-    shutil.copytree(pytriton / "tritonserver/backends/python", folder / "python")  # Triton does not follow links
-    stub = pytriton / "tritonserver/python_backend_stubs" / "{}.{}".format(*sys.version_info)
-    shutil.copy2(stub / "triton_python_backend_stub", folder / "python")
+    # The files are copied, because Triton does not follow links.
+    shutil.copytree(pytriton / "tritonserver/backends/python", folder / "python")
+    python_version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    stub = pytriton / "tritonserver/python_backend_stubs" / python_version / "triton_python_backend_stub"
+    shutil.copy2(stub, folder / "python")
     shutil.copytree(HERE / "onnxruntime", folder / "onnxruntime")
     return folder
 
 
 def server_command(pytriton: Path, options: argparse.Namespace) -> list[str]:
-    """Return the command that starts Triton.
+    """Create the folder of backends, and return the command that starts Triton with these backends.
 
     Args:
         pytriton: Folder of the installed package `pytriton`.
-        options: Options of the command line.
+        options: Options of the command line: models, host, port, and grpc_port, which is None for no gRPC.
     """
+    backends_folder = create_backends_folder(pytriton)
     command = [
         str(pytriton / "tritonserver/bin/tritonserver"),
         f"--model-repository={options.models.resolve()}",
-        f"--backend-directory={backends(pytriton)}",
+        f"--backend-directory={backends_folder}",
         f"--http-address={options.host}",
         f"--http-port={options.port}",
         "--allow-metrics=false",
@@ -67,24 +70,25 @@ def server_environment(pytriton: Path) -> dict[str, str]:
         "PYTHONPATH": pytriton.parent,
     }
     environment = dict(os.environ)
-    for name, folder in first_folders.items():
-        others = os.environ.get(name)
-        environment[name] = f"{folder}:{others}" if others else str(folder)
+    for name, first_folder in first_folders.items():
+        present_folders = os.environ.get(name)  # separated by colons
+        environment[name] = f"{first_folder}:{present_folders}" if present_folders else str(first_folder)
     return environment
 
 
 def main() -> None:
-    """Replace this process by Triton."""
+    """Parse the command line, and replace this process by Triton."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", type=Path, help="folder of models: NAME/config.pbtxt, NAME/VERSION/model.onnx")
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=8000, help="port of HTTP")
     parser.add_argument("--grpc-port", type=int, help="port of gRPC (default: no gRPC)")
     options = parser.parse_args()
+
     package = importlib.util.find_spec("pytriton")
     if package is None or package.origin is None:
         sys.exit("this needs pytriton: pip install nvidia-pytriton onnxruntime, in an environment of its own")
-    pytriton = Path(package.origin).parent
+    pytriton = Path(package.origin).parent  # the origin is the file __init__.py in the folder of the package
     command = server_command(pytriton, options)
     os.execve(command[0], command, server_environment(pytriton))
 

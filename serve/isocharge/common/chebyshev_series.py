@@ -40,9 +40,13 @@ class Series:
         evaluated_chunks = []
         for chunk in np.array_split(coordinates, n_chunk):
             position_terms, force_terms = chebyshev_terms(chunk, degree=n_y - 1, force_degree=n_force - 1)
-            # (points, n_term) @ (n_term, n_force * 4 * n_electrode)
-            force_coefficients = (position_terms @ self._term_coefficients).reshape(len(chunk), n_force, -1)
-            # (points, 1, n_force) @ (points, n_force, 4 * n_electrode)
+
+            # Sum over the terms in x and y: (points, n_term) @ (n_term, n_force * 4 * n_electrode). The factor 4 stands
+            # for the value and its three derivatives.
+            force_coefficients = position_terms @ self._term_coefficients
+            force_coefficients = force_coefficients.reshape(len(chunk), n_force, 4 * n_electrode)
+
+            # Sum over the terms in the force: (points, 1, n_force) @ (points, n_force, 4 * n_electrode).
             evaluated = force_terms[:, None, :] @ force_coefficients
             evaluated_chunks.append(evaluated[:, 0, :])
         return np.concatenate(evaluated_chunks).reshape(len(coordinates), 4, n_electrode)

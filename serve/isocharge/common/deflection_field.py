@@ -103,8 +103,12 @@ def _is_close(given: object, value: float) -> bool:
 def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, rings: Array, angles: int) -> Complexes:
     """Compute the points of a deflection field for a probe on the x axis.
 
-    Rings around the origin are mapped to rings around the probe by the disk automorphism z -> (z + c) / (1 + c z). The
-    shift c is chosen so that a circle around the origin becomes the edge of the probe.
+    Rings around the origin are mapped to rings around the probe by the disk automorphism
+
+        z -> (z + c) / (1 + c z),  c = tanh((atanh(p + r) + atanh(p - r)) / 2),
+
+    where p is the distance of the probe from the centre and r is its radius, both in film radii. With this shift c, a
+    circle around the origin becomes the edge of the probe.
 
     Args:
         radius_mm: Radius of the film, mm.

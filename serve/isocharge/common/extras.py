@@ -25,10 +25,10 @@ def require(*extras: str) -> Iterator[None]:
     """Raise an error that names the install command if an import inside this context finds no package of the extras.
 
     Args:
-        extras: Names of the extras in pyproject.toml.
+        extras: Names of the extras in pyproject.toml. `PACKAGES` contains the packages of each extra.
 
     Raises:
-        MissingExtra: If a package of the extras is not installed. Any other failed import is not changed.
+        MissingExtra: If a package of the extras is not installed. The error of any other failed import is not changed.
 
     Example:
         >>> with require("simulate"):
@@ -36,9 +36,11 @@ def require(*extras: str) -> Iterator[None]:
     """
     try:
         yield
-    except (ModuleNotFoundError, MissingExtra) as error:
-        package = (error.name or "").partition(".")[0]  # the package of the missing module
-        if not any(package in PACKAGES[extra] for extra in extras):
+    except (ModuleNotFoundError, MissingExtra) as error:  # a `require` inside the block raises MissingExtra
+        missing_module = error.name or ""
+        package = missing_module.partition(".")[0]
+        is_package_of_extras = any(package in PACKAGES[extra] for extra in extras)
+        if not is_package_of_extras:
             raise
         raise MissingExtra(
             f"this needs the package {package!r}, which is not installed; pip install 'isocharge[{','.join(extras)}]'",

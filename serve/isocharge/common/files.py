@@ -119,7 +119,7 @@ def write_whole(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         temporary.replace(path)
     finally:
-        temporary.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)  # the file only exists under this name if an error occurred
 
 
 class AtomicWriter:
@@ -138,7 +138,7 @@ class AtomicWriter:
         refuse_existing(path)
         with as_output_errors(path):
             self._descriptor = os.open(path, WRITE_FLAGS, 0o666)
-        self._size = 0
+        self._size = 0  # number of bytes that complete calls of `write` have written
 
     def write(self, data: bytes) -> int:
         """Append data to the file. If an OSError is raised, the file is unchanged.
@@ -189,10 +189,10 @@ def new_file(path: Path) -> Iterator[Path]:
     try:
         with as_output_errors(path):
             yield temporary
-            sync_folder(temporary)
+            flush_to_disk(temporary)
             refuse_existing(path)  # another process may have created it in the meantime
             temporary.rename(path)
-            sync_folder(path.parent)
+            flush_to_disk(path.parent)
     finally:
         # Neither a folder nor a file has this name any more, unless an error occurred.
         shutil.rmtree(temporary, ignore_errors=True)  # if it is a folder
@@ -214,13 +214,13 @@ def new_folder(path: Path) -> Iterator[Path]:
         OutputExists: If `path` exists already, or another process creates it in the meantime.
         OutputError: If the folder cannot be written.
     """
-    missing = [parent for parent in path.parents if not parent.exists()]
+    missing_parents = [parent for parent in path.parents if not parent.exists()]
     try:
         with new_file(path) as temporary:
             temporary.mkdir(parents=True)
             yield temporary
     finally:
-        remove_empty(missing)
+        remove_empty(missing_parents)  # after an error they are empty; otherwise they contain the new folder
 
 
 def _temporary_path(path: Path) -> Path:
@@ -254,15 +254,16 @@ def remove_empty(folders: Iterable[Path]) -> None:
             folder.rmdir()
 
 
-def sync_folder(folder: Path) -> None:
+def flush_to_disk(path: Path) -> None:
     """Flush a folder or a file to disk, so that renames or contents survive a power failure.
 
     The function does nothing on Windows, where a folder cannot be opened.
     """
-    if not hasattr(os, "O_DIRECTORY"):
+    is_windows = not hasattr(os, "O_DIRECTORY")
+    if is_windows:
         return
-    handle = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(handle)
+        os.fsync(descriptor)
     finally:
-        os.close(handle)
+        os.close(descriptor)

@@ -19,7 +19,7 @@ def plain_values(value: object) -> object:
     become None.
     """
     if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
+        value = value.tolist()  # a list for an array, and a Python number for a NumPy number
     if isinstance(value, dict):
         return {str(key): plain_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

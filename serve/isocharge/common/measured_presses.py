@@ -191,9 +191,11 @@ class MeasuredPresses:
 
         A column of temperatures is omitted if it would be empty for every press.
         """
-        columns = dict(zip(CONTACT, self.contact.T, strict=True))
+        columns = dict(zip(CONTACT, self.contact.T, strict=True))  # x_mm, y_mm and force_N
         columns |= dict(zip(self.electrodes, self.charge_pC.T, strict=True))
-        columns |= dict(zip(UNCERTAINTY, (self.position_std_mm, self.force_std), strict=True))
+        columns |= {"position_std_mm": self.position_std_mm, "force_std": self.force_std}
+
+        # The comparisons with None are only needed by type checkers.
         if self.temperature_C is not None and self.knows_temperature:
             columns[TEMPERATURE] = self.temperature_C
         if self.film_temperature_C is not None and self.knows_film_temperature:
@@ -202,29 +204,30 @@ class MeasuredPresses:
 
     def _check_shapes(self) -> None:
         """Raise PressError if an array does not have one row for each press, or one charge for each electrode."""
-        count = len(self.lines)
+        press_count = len(self.lines)
         expected_shapes: dict[str, tuple[int, ...]] = {
-            "contact": (count, len(CONTACT)),
-            "charge_pC": (count, len(self.electrodes)),
-            "position_std_mm": (count,),
-            "force_std": (count,),
+            "contact": (press_count, len(CONTACT)),
+            "charge_pC": (press_count, len(self.electrodes)),
+            "position_std_mm": (press_count,),
+            "force_std": (press_count,),
         }
         if self.temperature_C is not None:
-            expected_shapes[TEMPERATURE] = (count,)
+            expected_shapes["temperature_C"] = (press_count,)
         if self.film_temperature_C is not None:
-            expected_shapes[FILM_TEMPERATURE] = (count,)
+            expected_shapes["film_temperature_C"] = (press_count,)
         for name, shape in expected_shapes.items():
-            given = getattr(self, name).shape
-            if given != shape:
-                raise PressError(f"{name}: expected an array of shape {shape}, got {given}")
+            given_shape = getattr(self, name).shape
+            if given_shape != shape:
+                raise PressError(f"{name}: expected an array of shape {shape}, got {given_shape}")
 
     def _check_values(self) -> None:
         """Raise PressError if a number is not allowed, if only one of x and y is given, or if no charge is given."""
+        # The columns have the same rules as in a file, except that all standard deviations must be known.
         rules = PRESS_RULES | dict.fromkeys(self.electrodes, CHARGE_RULE)
         for name in UNCERTAINTY:
             rules[name] = replace(rules[name], may_be_empty=False)
         columns = NumberColumns(self.columns, np.array(self.lines, dtype=np.intp), self.row_noun)
-        columns.check(rules, "", PressError)
+        columns.check(rules, where="", error=PressError)  # the caller knows the file, if there is one
 
         if self.knows_film_temperature and not self.knows_temperature:
             raise PressError(
@@ -277,41 +280,44 @@ def read_presses(
         if not 0.0 < std <= PRESS_RULES[name].maximum:
             raise PressError(f"{name}: expected {PRESS_RULES[name].description}, got {std:g}")
 
-    # Read the columns of the file that are electrodes or have another meaning for a press.
+    # Read the columns of the file that are electrodes or have another meaning for a press (`PRESS_RULES`).
     expected_electrodes = "the electrodes' names" if electrodes is None else f"the electrodes {tuple(electrodes)}"
     expected_header = f"a header with {', '.join(CONTACT)} and {expected_electrodes} (charges in pC)"
     names_with_meaning = (*(electrodes or ()), *PRESS_RULES)
     with open_table(path, names_with_meaning, PressError, expected_header) as table:
-        names = _electrode_columns(table) if electrodes is None else tuple(electrodes)
+        electrode_names = _electrode_columns(table) if electrodes is None else tuple(electrodes)
         with error_prefix(f"{path}: ", PressError):
-            _check_electrodes(names)
-        chosen = table.choose_columns(dict.fromkeys(names, CHARGE_RULE), PRESS_RULES)
-        columns = table.read(chosen, MAX_ROWS)
-        ignored = tuple(name for name in table.header if name not in chosen)
-    count = len(columns.row_numbers)
-    if not count:
+            _check_electrodes(electrode_names)
+        chosen_rules = table.choose_columns(dict.fromkeys(electrode_names, CHARGE_RULE), optional=PRESS_RULES)
+        columns = table.read(chosen_rules, MAX_ROWS)
+        ignored_names = tuple(name for name in table.header if name not in chosen_rules)
+    press_count = len(columns.row_numbers)
+    if press_count == 0:
         raise PressError(f"{path}: expected one press or more below the header, got none")
 
     # Columns that the file does not have become NaN. Missing standard deviations get their default values.
-    absent_column = np.full(count, np.nan)
-    values = {name: columns.values.get(name, absent_column) for name in (*names, *PRESS_RULES)}
+    absent_column = np.full(press_count, np.nan)
+    values = {name: columns.values.get(name, absent_column) for name in (*electrode_names, *PRESS_RULES)}
     for name, std in default_stds.items():
         values[name] = np.where(np.isnan(values[name]), std, values[name])
-    temperature_C = values[TEMPERATURE]
-    film_temperature_C = values[FILM_TEMPERATURE]
     with error_prefix(f"{path}, ", PressError):
         return MeasuredPresses(
             contact=np.column_stack([values[name] for name in CONTACT]),
-            charge_pC=np.column_stack([values[name] for name in names]),
+            charge_pC=np.column_stack([values[name] for name in electrode_names]),
             position_std_mm=values["position_std_mm"],
             force_std=values["force_std"],
-            electrodes=names,
+            electrodes=electrode_names,
             lines=tuple(columns.row_numbers.tolist()),
-            ignored=ignored,
-            temperature_C=None if np.isnan(temperature_C).all() else temperature_C,
+            ignored=ignored_names,
+            temperature_C=_none_if_unknown(values[TEMPERATURE]),
             row_noun=columns.row_noun,
-            film_temperature_C=None if np.isnan(film_temperature_C).all() else film_temperature_C,
+            film_temperature_C=_none_if_unknown(values[FILM_TEMPERATURE]),
         )
+
+
+def _none_if_unknown(temperature_C: Array) -> Array | None:
+    """Return a column of temperatures, shape (n,), degrees Celsius, or None if all temperatures are NaN."""
+    return None if np.isnan(temperature_C).all() else temperature_C
 
 
 def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
@@ -343,19 +349,19 @@ def read_press_list(path: Path) -> Array:
     """
     path = Path(path)
     with open_table(path, CONTACT, PressError, f"a header with {', '.join(CONTACT)}") as table:
-        chosen = table.choose_columns({name: PRESS_RULES[name] for name in CONTACT})
-        columns = table.read(chosen, MAX_ROWS)
-    count = len(columns.row_numbers)
-    if not count:
+        rules = table.choose_columns({name: PRESS_RULES[name] for name in CONTACT})
+        columns = table.read(rules, MAX_ROWS)
+    press_count = len(columns.row_numbers)
+    if press_count == 0:
         raise PressError(f"{path}: expected one press or more below the header, got none")
     contact = np.column_stack([columns.values[name] for name in CONTACT])
     with error_prefix(f"{path}, ", PressError):
         # The object is created only because it checks the contacts. Its other values are arbitrary valid values.
         MeasuredPresses(
             contact=contact,
-            charge_pC=np.zeros((count, 1)),
-            position_std_mm=np.ones(count),
-            force_std=np.ones(count),
+            charge_pC=np.zeros((press_count, 1)),
+            position_std_mm=np.ones(press_count),
+            force_std=np.ones(press_count),
             electrodes=("charge",),
             lines=tuple(columns.row_numbers.tolist()),
             row_noun=columns.row_noun,
@@ -385,27 +391,27 @@ def presses_text(presses: MeasuredPresses) -> str:
     return csv_text(presses.columns)
 
 
-def row_words(rows: Sequence[int], row_noun: str, most: int = 10) -> str:
+def row_words(rows: Sequence[int], row_noun: str, max_listed: int = 10) -> str:
     """Return the lines or rows of presses in a file as text for a message, as in "line 3" or "rows 3, 4 and 12 more".
 
     Args:
         rows: Numbers of the presses in their file.
         row_noun: What the numbers count, such as "line", "row" or "press".
-        most: Largest number of presses that are listed. The message only counts the others.
+        max_listed: Largest number of presses that are listed. The message only counts the others.
     """
     plural = f"{row_noun}es" if row_noun.endswith("s") else f"{row_noun}s"
     noun = row_noun if len(rows) == 1 else plural
-    listed = ", ".join(map(str, rows[:most]))
-    if len(rows) <= most:
+    listed = ", ".join(map(str, rows[:max_listed]))
+    if len(rows) <= max_listed:
         return f"{noun} {listed}"
-    return f"{noun} {listed} and {len(rows) - most} more"
+    return f"{noun} {listed} and {len(rows) - max_listed} more"
 
 
 def _check_electrodes(electrodes: Collection[str]) -> None:
     """Raise PressError if names of electrodes cannot be the names of columns in a file of presses."""
     are_different = len(set(electrodes)) == len(electrodes)
-    are_named = all(name != "" for name in electrodes)
-    if not (electrodes and are_different and are_named):
+    has_empty_name = any(name == "" for name in electrodes)
+    if not electrodes or not are_different or has_empty_name:
         raise PressError(f"electrodes: expected one name or more, all different, none empty, got {shown(electrodes)}")
     if len(electrodes) > MAX_ELECTRODES:
         raise PressError(f"electrodes: expected at most {MAX_ELECTRODES} names, got {len(electrodes):,}")

@@ -79,9 +79,12 @@ def npz_arrays(data: bytes, names: Iterable[str] | None = None) -> dict[str, np.
         missing = [name for name in selected if name not in entries]
         if missing:
             raise ValueError(f"the array {missing[0]!r} is missing")
-        total_bytes = sum(entries[name].file_size for name in selected)  # sizes that the archive declares
-        if total_bytes > MAX_UNPACKED_BYTES:
+
+        # These are the sizes that the archive declares. `_decompress` checks that no entry is longer.
+        unpacked_bytes = sum(entries[name].file_size for name in selected)
+        if unpacked_bytes > MAX_UNPACKED_BYTES:
             raise ValueError(f"the arrays unpack to more than {MAX_UNPACKED_BYTES} bytes")
+
         arrays = {}
         for name in selected:
             if entries[name].compress_type == zipfile.ZIP_LZMA:
@@ -104,19 +107,22 @@ def finite_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int |
     if name not in arrays:
         raise ValueError(f"the array {name!r} is missing")
     array = arrays[name]
-    if array.dtype.kind not in "fiu":
+    if array.dtype.kind not in "fiu":  # floating-point numbers, signed and unsigned integers
         raise ValueError(f"{name}: expected real numbers, got an array of {array.dtype}")
-    has_expected_dimensions = array.ndim == len(shape)
-    has_expected_shape = has_expected_dimensions and all(
-        length > 0 and expected in (None, length) for length, expected in zip(array.shape, shape, strict=True)
-    )
-    if not has_expected_shape:
+    if not _has_shape(array, shape):
         lengths = ", ".join("n" if length is None else str(length) for length in shape)
         raise ValueError(f"{name}: expected an array of shape ({lengths}), got {array.shape}")
     values = array.astype(np.float64)
     if not np.isfinite(values).all():
         raise ValueError(f"{name}: expected finite numbers, got {values[~np.isfinite(values)][0]}")
     return values
+
+
+def _has_shape(array: np.ndarray, shape: tuple[int | None, ...]) -> bool:
+    """Return whether an array has the given shape, in which None stands for any length of at least one."""
+    if array.ndim != len(shape):
+        return False
+    return all(length > 0 and expected in (None, length) for length, expected in zip(array.shape, shape, strict=True))
 
 
 def finite_number(arrays: Mapping[str, np.ndarray], name: str) -> float:
@@ -137,9 +143,10 @@ def text_item(arrays: Mapping[str, np.ndarray], name: str) -> str:
     if name not in arrays:
         raise ValueError(f"the array {name!r} is missing")
     array = arrays[name]
-    if array.dtype.kind != "U" or array.ndim != 0:
+    is_text = array.dtype.kind == "U"  # Unicode
+    if not is_text or array.ndim != 0:
         raise ValueError(f"{name}: expected a text, got an array of {array.dtype} with the shape {array.shape}")
-    return str(array[()])
+    return str(array.item())
 
 
 def _checked_entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
@@ -154,10 +161,11 @@ def _checked_entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     entries: dict[str, zipfile.ZipInfo] = {}
     for info in infos:
         name = info.filename.removesuffix(".npy")
+        short_name = name[:100]  # for messages, because the name comes from an untrusted source
         if name in entries:
-            raise ValueError(f"the array {name[:100]!r} is there twice")
+            raise ValueError(f"the array {short_name!r} is there twice")
         if info.compress_type not in COMPRESSION_METHODS:
-            raise ValueError(f"the array {name[:100]!r} has the compression method {info.compress_type}")
+            raise ValueError(f"the array {short_name!r} has the compression method {info.compress_type}")
         entries[name] = info
     return entries
 
@@ -213,6 +221,7 @@ def _parse_npy(content: bytearray, name: str) -> np.ndarray:
     Raises:
         ValueError: If the version is not supported, the array has Python objects, or its shape does not fit the bytes.
     """
+    # Read the header, which contains the shape, the order of the axes in memory, and the type of the numbers.
     header = io.BytesIO(content[: MAX_HEADER_CHARACTERS + PREAMBLE_BYTES])
     version = np.lib.format.read_magic(header)
     if version == (1, 0):
@@ -223,14 +232,16 @@ def _parse_npy(content: bytearray, name: str) -> np.ndarray:
         raise ValueError(f"{name}: version {version} of the npy format is not supported")
     if dtype.hasobject:
         raise ValueError(f"{name}: expected numbers or text, got Python objects")
+
+    # Check that the numbers after the header fill the shape.
     header_bytes = header.tell()
     number_bytes = len(content) - header_bytes
-    size = math.prod(shape)
-    has_negative_length = any(length < 0 for length in shape)
-    if has_negative_length or size * dtype.itemsize != number_bytes:
+    number_count = math.prod(shape)
+    has_negative_length = any(length < 0 for length in shape)  # two negative lengths have a positive product
+    if has_negative_length or number_count * dtype.itemsize != number_bytes:
         raise ValueError(f"{name}: the shape {shape} of {dtype} does not fit {number_bytes} bytes")
 
-    if size == 0:  # `frombuffer` refuses an empty buffer
+    if number_count == 0:  # `frombuffer` refuses an empty buffer
         return np.empty(shape, dtype)
-    array = np.frombuffer(content, dtype=dtype, count=size, offset=header_bytes)
+    array = np.frombuffer(content, dtype=dtype, count=number_count, offset=header_bytes)
     return array.reshape(shape, order="F" if is_fortran else "C")

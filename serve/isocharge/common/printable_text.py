@@ -57,6 +57,6 @@ def _escape(character: str) -> str:
     """Return the escape sequence of a character in JSON. A character beyond U+FFFF has two sequences, as in UTF-16."""
     if character in SHORT_ESCAPES:
         return SHORT_ESCAPES[character]
-    utf16 = character.encode("utf-16-be", "surrogatepass")
-    code_units = (utf16[position : position + 2] for position in range(0, len(utf16), 2))
+    utf16 = character.encode("utf-16-be", "surrogatepass")  # a single surrogate is accepted, too
+    code_units = (utf16[position : position + 2] for position in range(0, len(utf16), 2))  # two bytes each
     return "".join(f"\\u{code_unit.hex()}" for code_unit in code_units)

@@ -74,7 +74,7 @@ def second_thread() -> Iterator[Executor]:
         except BaseException:
             is_stopped.set()
             executor.shutdown(wait=False, cancel_futures=True)
-            raise
+            raise  # the end of the `with` block then waits for the running call
 
 
 def track(items: Iterable[Item], title: str, total: int | None = None) -> Iterator[Item]:

@@ -27,12 +27,12 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, OutputExists, SolveError, TrainingError, cut
 from isocharge.common.files import (
     as_output_errors,
+    flush_to_disk,
     new_folder,
     read_whole,
     refuse_existing,
     remove_empty,
     sha256_of,
-    sync_folder,
     write_whole,
 )
 from isocharge.common.structs import read_json
@@ -87,7 +87,7 @@ class ResumableRun:
             The content; None if the part is not finished. If the part is damaged, a warning is logged and the result
             is None.
         """
-        # The file with the checksum is written last. A part without this file is not finished.
+        # The file with the checksum is written after the part. A part without this file is not finished.
         try:
             checksum = read_whole(self._parts / f"{name}.sha256").decode()
         except (OSError, UnicodeDecodeError):
@@ -127,8 +127,8 @@ class ResumableRun:
         with output_errors(self.target):
             for folder in (self._parts, self.data):
                 folder.mkdir(exist_ok=True)
-                for incomplete in folder.glob(".*.draft"):
-                    incomplete.unlink()
+                for incomplete_file in folder.glob(".*.draft"):  # the temporary names of `write_whole`
+                    incomplete_file.unlink()
 
     def publish(self) -> None:
         """Rename the folder `data` to the target, and remove the draft.
@@ -136,11 +136,11 @@ class ResumableRun:
         The folders are flushed to disk, so that the data and the renaming survive a power failure.
         """
         with output_errors(self.target):
-            sync_folder(self.data)
+            flush_to_disk(self.data)
             refuse_existing(self.target)
             self.data.rename(self.target)
             with suppress(OSError):  # an error here does not matter, because the target is complete
-                sync_folder(self.target.parent)
+                flush_to_disk(self.target.parent)
         self.remove()
 
     def remove(self) -> None:
@@ -163,42 +163,45 @@ class _StoringExecutor(Executor):
         If an earlier run has stored the result, the result is loaded. Otherwise the other executor computes the task.
         If there is no other executor, the task is computed before this method returns. The result is then stored.
         """
-        part = f"{self._name}-{self._submitted:04d}.npy"  # parts are numbered in the order of submission
+        part_name = f"{self._name}-{self._submitted:04d}.npy"  # parts are numbered in the order of submission
         self._submitted += 1
-        stored: Future[Any] = Future()  # is done when the result is stored
-        loaded = self._run.load(part, _decode_array)
-        if loaded is not None:
-            stored.set_result(loaded)
+        stored_future: Future[Any] = Future()  # is done when the result is stored
+        loaded_result = self._run.load(part_name, _decode_array)
+        if loaded_result is not None:
+            stored_future.set_result(loaded_result)
         elif self._executor is None:
             result = function(*args, **kwargs)
-            self._run.save(part, _encode_array(result))
-            stored.set_result(result)
+            self._run.save(part_name, _encode_array(result))
+            stored_future.set_result(result)
         else:
-            computed = self._executor.submit(function, *args, **kwargs)
-            computed.add_done_callback(lambda _: self._store(part, computed, stored))
+            task_future = self._executor.submit(function, *args, **kwargs)
+            task_future.add_done_callback(lambda _: self._store(part_name, task_future, stored_future))
             # If the caller cancels the future that it holds, the computation is cancelled as well.
-            stored.add_done_callback(lambda _: computed.cancel())
-        return stored
+            stored_future.add_done_callback(lambda _: task_future.cancel())
+        return stored_future
 
-    def _store(self, part: str, computed: Future[Any], stored: Future[Any]) -> None:
+    def _store(self, part_name: str, task_future: Future[Any], stored_future: Future[Any]) -> None:
         """Store the result of a task, and set it as the result of the future that `submit` returned.
 
         Args:
-            part: Name of the part in which the result is stored.
-            computed: Future of the task, which is done or cancelled.
-            stored: Future that `submit` has returned. It gets the result, or the error of the task or of the storing.
+            part_name: Name of the part in which the result is stored.
+            task_future: Future of the task, which is done or cancelled.
+            stored_future: Future that `submit` has returned. It gets the result, or the error of the task or of the
+                storing.
         """
-        if computed.cancelled():
-            stored.cancel()
-        is_cancelled = not stored.set_running_or_notify_cancel()  # also if the caller has cancelled it
+        if task_future.cancelled():
+            stored_future.cancel()
+
+        # The caller may also have cancelled the future. From this call on, it can no longer be cancelled.
+        is_cancelled = not stored_future.set_running_or_notify_cancel()
         if is_cancelled:
             return
         try:
-            result = computed.result()
-            self._run.save(part, _encode_array(result))
-            stored.set_result(result)
+            result = task_future.result()
+            self._run.save(part_name, _encode_array(result))
+            stored_future.set_result(result)
         except BaseException as error:  # the error is raised where the result is requested
-            stored.set_exception(error)
+            stored_future.set_exception(error)
 
 
 def _decode_array(data: bytes) -> Array:
@@ -262,8 +265,9 @@ def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fa
 def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
     """Begin or resume a run whose block writes the target itself, for example as a single file.
 
-    The draft is removed when the block ends without an error. After an error, the draft is kept for the next run,
-    unless no part is finished or the same error would occur again.
+    The finished parts of the run are stored in a folder beside the target, which is called the draft. The draft is
+    removed when the block ends without an error. After an error, the draft is kept for the next run, unless no part is
+    finished or the same error would occur again.
 
     Args:
         target: File or folder that the run writes.
@@ -279,7 +283,7 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
     """
     refuse_finished(target)
     draft = ResumableRun(target)
-    parents = [parent for parent in target.parents if not parent.exists()]
+    missing_parents = [parent for parent in target.parents if not parent.exists()]
     try:
         identity_as_saved = json.loads(json.dumps(identity))  # with lists in place of tuples, as in the saved file
         with _claim(draft, identity_as_saved, fresh):
@@ -293,7 +297,7 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
                     draft.remove()
                 raise
     finally:
-        remove_empty(parents)
+        remove_empty(missing_parents)  # they were created for the draft, and are empty if it was removed
 
 
 @contextmanager
@@ -308,12 +312,14 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
         fresh: Whether an existing draft is removed first.
     """
     folder = draft.folder
-    if fresh and (folder / "run.json").is_file():
-        with locked(folder / "lock"):
+    is_draft = (folder / "run.json").is_file()  # any other folder is never removed
+    if fresh and is_draft:
+        with locked(folder / "lock"):  # refuses a draft that another process is using
             draft.remove()
     is_new = not folder.exists()
     try:
-        if is_new:  # the folder appears with both files at once, even if the process is killed in between
+        if is_new:
+            # The folder appears with both files at once, even if the process is killed in between.
             with new_folder(folder) as temporary:
                 (temporary / "lock").touch()
                 write_whole(temporary / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
@@ -341,18 +347,22 @@ def locked(path: Path) -> Iterator[None]:
     Raises:
         OutputExists: If another process has locked the folder.
     """
-    folder = path if path.is_dir() else path.parent
-    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT)
+    if path.is_dir():
+        folder = path
+        descriptor = os.open(path, os.O_RDONLY)
+    else:
+        folder = path.parent
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT)
     try:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises an error at once if it is locked
         except BlockingIOError as error:
             raise OutputExists(
                 f"another process is at work in {folder}; wait for it, or choose another output"
             ) from error
         yield
     finally:
-        os.close(handle)
+        os.close(descriptor)  # also unlocks the folder
 
 
 def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
@@ -371,6 +381,7 @@ def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
         raise OutputExists(
             f"{folder} is in the way: it holds no run.json that can be read; choose another output or remove it"
         ) from error
+    # The comparison of texts also distinguishes 1, 1.0 and true, which are equal in Python.
     if json.dumps(saved, sort_keys=True) != json.dumps(identity, sort_keys=True):
         differences = "; ".join(_differences(saved, identity))
         raise OutputExists(
@@ -382,6 +393,8 @@ def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
 def _differences(saved: Any, current: Any, name: str = "") -> Iterator[str]:
     """Yield descriptions of the settings in which two runs differ.
 
+    Only the innermost settings that differ are described. A setting that one of the runs does not have counts as None.
+
     Args:
         saved: Settings of the unfinished run, or a part of them.
         current: Settings of the present run, or the same part of them.
@@ -390,6 +403,7 @@ def _differences(saved: Any, current: Any, name: str = "") -> Iterator[str]:
     if isinstance(saved, dict) and isinstance(current, dict):
         for key in sorted(saved.keys() | current.keys()):
             if saved.get(key) != current.get(key):
-                yield from _differences(saved.get(key), current.get(key), f"{name}.{key}" if name else key)
+                inner_name = f"{name}.{key}" if name else key
+                yield from _differences(saved.get(key), current.get(key), inner_name)
     else:
         yield f"{name or 'run.json'} is {cut(str(saved))} there, {cut(str(current))} here"

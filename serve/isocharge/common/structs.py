@@ -129,9 +129,9 @@ def parse_toml(text: str, where: str, error: type[InputError], kind: type[T]) ->
         text: The text.
         where: Name of the file, with which the error message begins.
         error: Class of the error if the text is wrong.
-        kind: Type of the content.
+        kind: Type to which the content is converted.
     """
-    if _DEEP_KEY.search(text):
+    if _DEEP_KEY.search(text):  # parsing such a key needs much memory
         raise error(f"{where}: not a TOML file: a key of more than 32 parts")
     try:
         content = tomllib.loads(text)
@@ -147,14 +147,14 @@ def parse_json(text: str | bytes, where: str, error: type[InputError], kind: typ
         text: The text.
         where: Name of the file, with which the error message begins; empty if there is none.
         error: Class of the error if the text is wrong.
-        kind: Type of the content.
+        kind: Type to which the content is converted.
     """
     try:
         return msgspec.json.decode(text, type=kind)
     except (ValueError, RecursionError) as decoding_error:
         cause = decoding_error
 
-    # Either the text is not JSON, or it is JSON with a content of another type.
+    # Either the text is not JSON, or it is JSON with a content of another type. Decoding without a type shows which.
     try:
         content = msgspec.json.decode(text)
     except (ValueError, RecursionError):
@@ -197,19 +197,20 @@ def _mistakes(value: object, expected_type: Any, path: str) -> Iterator[str]:
         expected_type: Expected type.
         path: Names of the keys that lead to the value, such as "film.radius_mm".
     """
-    members = list(_union_members(expected_type))
+    members = list(_union_members(expected_type))  # only the type itself, if it is no union
     yield from _mistakes_in_tag(value, members, path)
     for member in members:
         yield from _mistakes_in_parts(value, member, path)
 
-    # A mistake in the whole value. If the check of a struct has raised the error, its exception is the cause.
+    # A mistake in the whole value. If the check of a struct has raised the error, its exception is the cause. A
+    # `WrongKey` without a message means that the key is missing.
     try:
         msgspec.convert(value, expected_type)
     except msgspec.ValidationError as error:
         cause = error.__cause__
         if isinstance(cause, WrongKey):
-            name = _join(path, cause.key)
-            yield f"{name}: {cause}" if str(cause) else f"key {name!r} is missing"
+            key_path = _join(path, cause.key)
+            yield f"{key_path}: {cause}" if str(cause) else f"key {key_path!r} is missing"
         elif cause is not None:
             yield f"{_prefix(path)}{cause}"
         else:
@@ -239,20 +240,25 @@ def _mistakes_in_tag(value: object, members: list[Any], path: str) -> Iterator[s
         path: Names of the keys that lead to the value.
     """
     structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
-    configs_with_tag = [struct.__struct_config__ for struct in structs if struct.__struct_config__.tag is not None]
+    configs = [struct.__struct_config__ for struct in structs]
+    configs_with_tag = [config for config in configs if config.tag is not None]
     if not configs_with_tag or not isinstance(value, Mapping):
         return
-    tags = [config.tag for config in configs_with_tag]
+    allowed_tags = [config.tag for config in configs_with_tag]
     tag_key = str(configs_with_tag[0].tag_field)  # all structs of a union have the same tag key
     if tag_key not in value:
-        if len(tags) > 1:
+        if len(allowed_tags) > 1:
             yield f"key {_join(path, tag_key)!r} is missing"
-    elif value[tag_key] is not None and value[tag_key] not in tags:
-        yield f"{_join(path, tag_key)}: expected {_one_of(tags)}, got {shown(value[tag_key])}"
+        return
+    tag = value[tag_key]
+    if tag is not None and tag not in allowed_tags:
+        yield f"{_join(path, tag_key)}: expected {_one_of(allowed_tags)}, got {shown(tag)}"
 
 
 def _mistakes_in_parts(value: object, expected_type: Any, path: str) -> Iterator[str]:
     """Yield mistakes in the values of a table or in the items of a list.
+
+    The function yields nothing for any other value, and for a value of another kind than the expected type.
 
     Args:
         value: Value from TOML or JSON.
@@ -266,10 +272,11 @@ def _mistakes_in_parts(value: object, expected_type: Any, path: str) -> Iterator
         for key, item in value.items():
             yield from _mistakes(item, item_type, _join(path, key))
     elif isinstance(value, list | tuple) and get_origin(expected_type) in (list, tuple):
+        # `list[T]` and `tuple[T, ...]` have one type for all items, and other tuples have one type for each item.
         item_types = [item_type for item_type in get_args(expected_type) if item_type is not Ellipsis]
         if len(item_types) == 1:
-            item_types = item_types * len(value)  # all items have the same type
-        if len(item_types) == len(value):
+            item_types = item_types * len(value)
+        if len(item_types) == len(value):  # a wrong length is a mistake in the whole value, which `_mistakes` reports
             for index, item in enumerate(value[:MAX_EXAMINED_ITEMS]):
                 yield from _mistakes(item, item_types[index], f"{path}[{index}]")
 
@@ -285,14 +292,17 @@ def _mistakes_in_keys(table: Mapping[str, Any], struct: type[Struct], path: str)
         path: Path to the table, such as "film"; empty for the whole file.
     """
     config = struct.__struct_config__
-    if config.tag is not None and table.get(str(config.tag_field)) != config.tag:
-        return
+    if config.tag is not None:
+        selected_tag = table.get(str(config.tag_field))
+        if selected_tag != config.tag:
+            return
 
     types_of_fields = get_type_hints(struct, include_extras=True)
     fields = msgspec.structs.fields(struct)
-    known_keys = [field.encode_name for field in fields]
+    known_keys = [field.encode_name for field in fields]  # the keys of the file, which may differ from the attributes
     if config.tag_field:
         known_keys.insert(0, config.tag_field)
+
     if config.forbid_unknown_fields:
         for key in table:
             if key not in known_keys:
@@ -315,25 +325,26 @@ def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
         known: The known keys.
     """
     known_keys = list(known)
-    known_list = cut(", ".join(known_keys))
-    similar = difflib.get_close_matches(cut(key), known_keys, n=1)
-    if similar:
-        return f"unknown key {shown(name)}; did you mean {similar[0]!r}? Known are {known_list}"
-    return f"unknown key {shown(name)}; known are {known_list}"
+    known_text = cut(", ".join(known_keys))
+    similar_keys = difflib.get_close_matches(cut(key), known_keys, n=1)
+    if similar_keys:
+        return f"unknown key {shown(name)}; did you mean {similar_keys[0]!r}? Known are {known_text}"
+    return f"unknown key {shown(name)}; known are {known_text}"
 
 
-def _union_members(kind: Any) -> Iterator[Any]:
+def _union_members(expected_type: Any) -> Iterator[Any]:
     """Yield the members of a union without their annotations.
 
-    If the type is not a union, the function yields the type itself.
+    If the type is not a union, the function yields the type itself, also without its annotations.
     """
-    if get_origin(kind) is Annotated:
-        yield from _union_members(get_args(kind)[0])
-    elif get_origin(kind) in (Union, UnionType):
-        for member in get_args(kind):
+    if get_origin(expected_type) is Annotated:
+        type_without_annotations = get_args(expected_type)[0]
+        yield from _union_members(type_without_annotations)
+    elif get_origin(expected_type) in (Union, UnionType):
+        for member in get_args(expected_type):
             yield from _union_members(member)
     else:
-        yield kind
+        yield expected_type
 
 
 def _join(path: str, key: str) -> str:
@@ -341,15 +352,19 @@ def _join(path: str, key: str) -> str:
     return cut(f"{path}.{key}" if path else str(key))
 
 
-def _describe_type(kind: inspect.Type) -> str:
-    """Return a description of the values of a type for error messages.
+def _describe_type(value_type: inspect.Type) -> str:
+    """Return a description of the values of a type for error messages, such as "a list of 2 numbers".
 
     A description in the annotation of the type takes precedence. Types without a case of their own, such as tables, are
     described by their noun.
+
+    Args:
+        value_type: The type, as `msgspec.inspect.type_info` returns it.
     """
-    match kind:
-        case inspect.Metadata(type=inner, extra_json_schema=extra):
-            return (extra or {}).get("description") or _describe_type(inner)
+    match value_type:
+        case inspect.Metadata(type=annotated_type, extra_json_schema=annotation):
+            description_in_annotation = (annotation or {}).get("description")
+            return description_in_annotation or _describe_type(annotated_type)
         case inspect.FloatType(gt=above, ge=minimum, le=maximum):
             return _describe_number("number", above, minimum, maximum)
         case inspect.IntType(gt=above, ge=minimum, le=maximum):
@@ -362,15 +377,15 @@ def _describe_type(kind: inspect.Type) -> str:
             return _one_of(values)
         case inspect.EnumType(cls=cls):
             return _one_of(member.value for member in cls)
-        case inspect.UnionType(types=types):
-            descriptions = [_describe_type(item) for item in types if not isinstance(item, inspect.NoneType)]
-            return " or ".join(dict.fromkeys(descriptions))
-        case inspect.TupleType(item_types=items):
-            return f"a list of {len(items)} {_noun(items[0])}s"
-        case inspect.CollectionType(item_type=item, min_length=min_length):
-            description = f"a list of {_noun(item)}s"
-            return f"{description}, {min_length} or more" if min_length else description
-    return f"a {_noun(kind)}"
+        case inspect.UnionType(types=members):
+            descriptions = [_describe_type(member) for member in members if not isinstance(member, inspect.NoneType)]
+            return " or ".join(dict.fromkeys(descriptions))  # each description once
+        case inspect.TupleType(item_types=item_types):
+            return f"a list of {len(item_types)} {_noun(item_types[0])}s"  # all items are of the same kind
+        case inspect.CollectionType(item_type=item_type, min_length=min_length):
+            list_description = f"a list of {_noun(item_type)}s"
+            return f"{list_description}, {min_length} or more" if min_length else list_description
+    return f"a {_noun(value_type)}"
 
 
 _NOUNS: tuple[tuple[Any, str], ...] = (
@@ -383,11 +398,12 @@ _NOUNS: tuple[tuple[Any, str], ...] = (
 """Pairs of a type of msgspec and the noun for its values."""
 
 
-def _noun(kind: inspect.Type) -> str:
-    """Return the noun for the values of a type."""
-    type_without_metadata = kind.type if isinstance(kind, inspect.Metadata) else kind
-    for kinds, noun in _NOUNS:
-        if isinstance(type_without_metadata, kinds):
+def _noun(value_type: inspect.Type) -> str:
+    """Return the noun for the values of a type, such as "number"."""
+    if isinstance(value_type, inspect.Metadata):
+        value_type = value_type.type  # the type without its annotation
+    for types_with_noun, noun in _NOUNS:
+        if isinstance(value_type, types_with_noun):
             return noun
     return "value"
 
@@ -397,10 +413,10 @@ def _one_of(words: Iterable[object]) -> str:
 
 
 def _describe_number(noun: str, above: float | None, minimum: float | None, maximum: float | None) -> str:
-    """Return a description of numbers with bounds.
+    """Return a description of numbers with bounds, such as "a number from 0 to 1".
 
     Args:
-        noun: Noun for the numbers.
+        noun: Noun for the numbers: "number" or "whole number".
         above: Exclusive lower bound; None if there is none.
         minimum: Inclusive lower bound; None if there is none.
         maximum: Inclusive upper bound; None if there is none.
@@ -421,6 +437,8 @@ def _describe_number(noun: str, above: float | None, minimum: float | None, maxi
         return description if maximum is None else f"{description} to {_bound_text(maximum)}"
     if maximum is not None:
         return f"a {noun} of at most {_bound_text(maximum)}"
+
+    # There is no bound to mention. Only a number that is not whole can be infinite or NaN.
     return f"a {noun}" if noun == "whole number" else f"a finite {noun}"
 
 

@@ -28,10 +28,12 @@ def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
     """
     lines = []
     for text in comment:
-        lines += [f"# {printable(line)}".rstrip() for line in text.splitlines() or [""]]
+        comment_lines = text.splitlines() or [""]  # an empty text becomes an empty comment line
+        lines += [f"# {printable(line)}".rstrip() for line in comment_lines]
     if lines:
         lines.append("")
 
+    # Keys without a table must precede all tables, because TOML assigns later keys to the last table.
     lines += [_pair(key, value) for key, value in tables.items() if not isinstance(value, Mapping)]
 
     for name, table in tables.items():
@@ -39,7 +41,8 @@ def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
             lines.append("")
             lines.append(f"[{_key(name)}]")
             lines += [_pair(key, value) for key, value in table.items()]
-    return "\n".join(lines).lstrip("\n") + "\n"
+    content = "\n".join(lines).lstrip("\n")  # without the blank line before a table at the beginning
+    return content + "\n"
 
 
 def _pair(key: str, value: object) -> str:
@@ -56,7 +59,7 @@ def _value(value: object) -> str:
         return "{" + ", ".join(_pair(key, item) for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_value, value)) + "]"
-    if isinstance(value, bool):
+    if isinstance(value, bool):  # before the numbers, because bool is a subclass of int
         return "true" if value else "false"
     if isinstance(value, int | float):
         return repr(value)

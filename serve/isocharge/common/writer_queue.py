@@ -41,7 +41,7 @@ class WriterQueue(Generic[T]):
         self._write = write
         self._is_ready = is_ready
         self._waiting: deque[T] = deque()
-        self._change = threading.Condition()
+        self._change = threading.Condition()  # guards the attributes, and is notified when one of them changes
         self._taken = 0  # number of items that the thread has taken from the queue
         self._is_closed = False
         self._error: Exception | None = None
@@ -82,17 +82,17 @@ class WriterQueue(Generic[T]):
             Exception: The exception that `write` has raised in the thread, unless `put` has raised it already.
         """
         with self._change:
-            # Wait as long as the thread takes items from the queue or raises an error within the timeout.
+            # Wait as long as the thread takes the next item from the queue, or raises an error, within the timeout.
             while self._waiting and self._thread.is_alive():
-                has_changed = partial(self._has_changed, self._taken)
-                if not self._change.wait_for(has_changed, CLOSE_TIMEOUT_s):
+                is_writing = self._change.wait_for(partial(self._has_changed, self._taken), CLOSE_TIMEOUT_s)
+                if not is_writing:
                     break
             self.lost += len(self._waiting)
             self._waiting.clear()
             self._is_closed = True
             self._change.notify_all()
-        self._thread.join(CLOSE_TIMEOUT_s)  # the last item may be on its way
-        if self._thread.is_alive():
+        self._thread.join(CLOSE_TIMEOUT_s)
+        if self._thread.is_alive():  # the thread is still writing the last item that it took
             self.lost += 1
         self._raise_error()
 
@@ -120,16 +120,17 @@ class WriterQueue(Generic[T]):
     def _next(self) -> T | None:
         """Wait until the consumer accepts an item, and return the oldest item.
 
-        The result is None if the queue is closed and empty.
+        The result is None if the queue is closed and empty. An item is only taken when the consumer accepts it, so that
+        `put` can drop old items while the consumer is slow.
         """
-        while True:
-            with self._change:
-                self._change.wait_for(lambda: self._waiting or self._is_closed)
-            if not (self._is_ready() or self._is_closed):  # after `close`, items are written without this check
-                continue
-            with self._change:
-                if not self._waiting:
-                    return None
-                self._taken += 1
-                self._change.notify_all()
-                return self._waiting.popleft()
+        with self._change:
+            self._change.wait_for(lambda: self._waiting or self._is_closed)
+        # The lock is released meanwhile, because `is_ready` waits a short time. After `close`, all items are written.
+        while not (self._is_ready() or self._is_closed):
+            pass
+        with self._change:
+            if not self._waiting:  # only after `close`, because `put` never empties the queue
+                return None
+            self._taken += 1
+            self._change.notify_all()
+            return self._waiting.popleft()

@@ -81,6 +81,8 @@ class Timing(NamedTuple):
 def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = time.perf_counter_ns) -> list[Timing]:
     """Measure the duration of the calls of all contenders. In each round, every contender has one turn.
 
+    The first round warms up the processor and the caches, and is not counted.
+
     Args:
         contenders: The contenders.
         seconds: Total time, s. Contenders with long calls may take longer.
@@ -138,7 +140,7 @@ def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0) -> Si
 
 
 def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Contender]:
-    """Return the contenders that call the methods of a predictor, one for each method.
+    """Return the contenders that call the methods of a predictor: two for single presses, and one for each batch size.
 
     Args:
         predictor: The model.
@@ -153,10 +155,10 @@ def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Cont
         Contender("predict_into, float32 array", 1, lambda: predictor.predict_into(next_array(), out)),
         Contender("predict, list of numbers", 1, lambda: predictor.predict(next_list())),
     ]
-    for size in BATCH_SIZES:
-        if size <= len(charge_pC):
-            batch = charge_pC[:size]
-            contenders.append(Contender(f"predict_batch, {size}", size, partial(predictor.predict_batch, batch)))
+    for batch_size in BATCH_SIZES:
+        if batch_size <= len(charge_pC):
+            predict_batch = partial(predictor.predict_batch, charge_pC[:batch_size])
+            contenders.append(Contender(f"predict_batch, {batch_size}", batch_size, predict_batch))
     return contenders
 
 

@@ -21,18 +21,20 @@ class TritonPythonModel:
         return config
 
     def initialize(self, args):
-        """Open a session with one thread, because a press takes microseconds.
+        """Open an onnxruntime session for the model, with one thread, because a press takes microseconds.
 
         Args:
-            args: Repository, version and configuration of the model, as Triton passes them.
+            args: Folder (`model_repository`), version and configuration of the model, as Triton passes them.
         """
         options = ort.SessionOptions()
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # do not wait actively for work
         path = Path(args["model_repository"], args["model_version"], "model.onnx")
         self._session = ort.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-        (input_tensor,) = json.loads(args["model_config"])["input"]
+
+        model_config = json.loads(args["model_config"])
+        (input_tensor,) = model_config["input"]  # every model has exactly one input, the charges
         self._input_name = input_tensor["name"]
 
     def execute(self, requests):
@@ -40,12 +42,13 @@ class TritonPythonModel:
         return [self._respond(request) for request in requests]
 
     def _respond(self, request):
-        """Run the model, and return the requested outputs or the error as a response."""
+        """Run the model on the charges of a request, and return the requested outputs or the error as a response."""
         output_names = list(request.requested_output_names())
         try:
             charges = pb_utils.get_input_tensor_by_name(request, self._input_name).as_numpy()
             outputs = self._session.run(output_names, {self._input_name: charges})
         except Exception as error:  # onnxruntime's exceptions have no common base class of their own
             return pb_utils.InferenceResponse(error=pb_utils.TritonError(str(error)))
-        tensors = [pb_utils.Tensor(name, rows) for name, rows in zip(output_names, outputs, strict=True)]
+
+        tensors = [pb_utils.Tensor(name, values) for name, values in zip(output_names, outputs, strict=True)]
         return pb_utils.InferenceResponse(tensors)

@@ -63,17 +63,20 @@ def demo_command(
     Example: isocharge demo -o first-light
     """
     if playground is not None:
-        if any(option is not None for option in (output, seconds, sensor, config, live)):
+        other_options = (output, seconds, sensor, config, live)
+        if any(option is not None for option in other_options):
             raise InputError("expected --playground without another option, got another option with it")
         _write_playground(playground)
         return
     posix_modules()  # raises an error before anything is computed if there are no pseudo-terminals
+
+    # The modules of both demos are imported late, because they need extras that may not be installed.
     if live is None:
         with require("train"):
             from isocharge.cli.demo.full_demo import run_demo
         run_demo(output, seconds, config, sensor)
         return
-    address = page_address(live, None)
+    address = page_address(live, token=None)
     with require("simulate", "http"):
         from isocharge.cli.demo.live_film import show_live_film
 

@@ -98,7 +98,8 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
         with _step(
             "simulate", f"{sensor.name}, circle of 1 mm, 0.05 to 2 N, within {sweep.radius:.3g} mm", durations_s
         ):
-            (forward_map,) = solve_maps(sensor, (probe,), sweep)  # one map for each probe
+            # The forward map interpolates the charges of all presses. There is one map for each probe.
+            (forward_map,) = solve_maps(sensor, (probe,), sweep)
             dataset = read_dataset(write_sweep(draft / "presses", (forward_map,), sweep))
             say(
                 f"   {len(dataset.samples)} presses interpolated from {forward_map.solves} solves, relative error "
@@ -154,8 +155,8 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
         seconds: Duration, s.
 
     Returns:
-        Presses of all frames with a press, shape (n, 7), mm and N, with the columns of `FollowedPress`. Counts of the
-        stream.
+        The frames in which both the virtual sensor and the model have a contact, shape (n, 7), mm and N: number of the
+        press, true (x, y, F) and estimated (x, y, F), as in `FollowedPress`. Counts of the frames of the stream.
     """
     touch = TouchStream(predictor)
     frame_count = round(seconds * RATE_HZ)
@@ -168,7 +169,7 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
         all_records = (record for chunk in port for record in touch.feed(chunk))
         records = islice(all_records, frame_count)
         for frame_number, record in enumerate(track(records, "following", frame_count), start=1):
-            truth = sensor.truth(record.seq or 0)  # what the virtual sensor played in this frame
+            truth = sensor.truth(record.seq or 0)  # what the virtual sensor played in the frame of this number
             true_contact = (truth.x_mm, truth.y_mm, truth.force_N)
             contact = _contact_of(record)
 
@@ -231,14 +232,14 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], mode
 
     Args:
         tested: Test presses, true and estimated (x, y, F), shape (m, 6), mm and N.
-        followed: Frames of the live part, columns as in `FollowedPress`, shape (n, 7), mm and N.
-        durations_s: Duration of each step, s.
-        model_folder: Folder of the model in the folder of the results.
+        followed: Frames of the live part, shape (n, 7), mm and N: number of the press, true and estimated (x, y, F).
+        durations_s: Duration of each step by its name, s.
+        model_folder: Folder of the model, which is `models/NAME` in the folder of the results.
     """
     true_contact, estimated_contact = np.split(tested, 2, axis=1)  # each of shape (m, 3)
     errors = ContactErrorStatistics.of(estimated_contact, true_contact)
 
-    # Measure the latency of one kind of call, the prediction of a single press from a list of charges.
+    # Measure the latency of the second kind of call, the prediction of a single press from a list of charges.
     model = load_model(find_model(str(model_folder)))
     predictor = Predictor(model.folder)
     charges = press_charges(predictor, model.golden.charge_pC)
@@ -247,6 +248,7 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], mode
     (latency,) = take_turns([one_press_as_list], LATENCY_S)
 
     size_KiB = (model.folder / "model.onnx").stat().st_size / 1024
+    results_folder = model_folder.parent.parent
     rows = [
         ("position error, with noise", _position_words(tested)),
         ("position error, live", _position_words(followed)),
@@ -254,7 +256,7 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], mode
         ("model", f"{size_KiB:.0f} KiB, {model.metadata.label}"),
         ("one prediction", f"p50 {latency.p50_us:.1f} us, p99 {latency.p99_us:.1f} us"),
         ("seconds", ", ".join(f"{name} {duration:.1f}" for name, duration in durations_s.items())),
-        ("results in", str(model_folder.parent.parent)),
+        ("results in", str(results_folder)),
     ]
     return "\n" + "\n".join(f"{name:<32} {value}" for name, value in rows)
 
@@ -265,7 +267,7 @@ def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array
     Args:
         forward_map: Forward map of the film.
         equilibrium: The press whose deflection is drawn.
-        followed: Frames of the live part, columns as in `FollowedPress`, shape (n, 7), mm and N.
+        followed: Frames of the live part, shape (n, 7), mm and N: number of the press, true and estimated (x, y, F).
         tested: Test presses, true and estimated (x, y, F), shape (m, 6), mm and N.
         path: Path of the picture.
     """
@@ -299,17 +301,18 @@ def _draw_live_paths(axes: Any, forward_map: ForwardMap, followed: Array) -> Non
     Args:
         axes: Axes of matplotlib.
         forward_map: Forward map of the film, whose layout is drawn.
-        followed: Frames of the live part, columns as in `FollowedPress`, shape (n, 7), mm and N.
+        followed: Frames of the live part, shape (n, 7), mm and N: number of the press, true and estimated (x, y, F),
+            with the names of `FollowedPress`.
     """
-    column = dict(zip(FollowedPress._fields, followed.T, strict=True))
-    for press_number in np.unique(column["number"]):
-        in_press = column["number"] == press_number  # the frames of this press
-        true_path = (column["true_x_mm"][in_press], column["true_y_mm"][in_press])
-        estimated_path = (column["x_mm"][in_press], column["y_mm"][in_press])
+    columns = dict(zip(FollowedPress._fields, followed.T, strict=True))
+    for press_number in np.unique(columns["number"]):
+        is_in_press = columns["number"] == press_number  # mask of the frames of this press
+        true_path = (columns["true_x_mm"][is_in_press], columns["true_y_mm"][is_in_press])
+        estimated_path = (columns["x_mm"][is_in_press], columns["y_mm"][is_in_press])
         axes.plot(*true_path, color=PRESSED, lw=3.0, solid_capstyle="round")
         axes.plot(*estimated_path, color=FELT, lw=0.7)
 
-    # The legend contains only the two lines of the first press.
+    # Only the two lines of the first press get labels, so that the legend has two entries.
     true_line, estimated_line = axes.lines[:2]
     true_line.set_label("pressed")
     estimated_line.set_label("estimated")
@@ -328,11 +331,11 @@ def _draw_error_against_force(axes: Any, force: Array, error: Array) -> None:
     axes.loglog(force, error, ".", color=PRESSED, ms=2, alpha=0.5)
 
     # The percentiles are computed in 12 ranges of force, which have the same width on the logarithmic axis.
-    bin_edges = np.geomspace(force.min(), force.max(), 13)
+    bin_edges = np.geomspace(force.min(), force.max(), num=13)
     bin_centres = np.sqrt(bin_edges[:-1] * bin_edges[1:])  # geometric means of neighbouring edges
-    for percentile, style, label in ((50, "-", "median"), (95, "--", "95 %")):
-        errors = binned_statistic(force, error, partial(np.percentile, q=percentile), bin_edges).statistic
-        axes.plot(bin_centres, errors, style, color=FELT, label=label)
+    for percentile, line_style, label in ((50, "-", "median"), (95, "--", "95 %")):
+        bin_errors = binned_statistic(force, error, partial(np.percentile, q=percentile), bin_edges).statistic
+        axes.plot(bin_centres, bin_errors, line_style, color=FELT, label=label)
     axes.legend()
     axes.set(title="position error of test presses", xlabel="force, N", ylabel="error, mm", ylim=(2e-3, None))
     axes.grid(alpha=0.3, which="both")

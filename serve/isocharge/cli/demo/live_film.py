@@ -36,18 +36,28 @@ def show_live_film(address: Address, seconds: float | None, sensor_name: str | N
     live = RecordedStream(touch)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
-        link = stack.enter_context(live_page(address, None, sensor, predictor.metadata, find_model(sensor)))
+
+        # The page starts before the film is solved, so that the user can open it meanwhile.
+        metadata = predictor.metadata
+        link = stack.enter_context(
+            live_page(address, token=None, name=sensor, metadata=metadata, model=find_model(sensor))
+        )
         with shown_progress():
             radius_mm = played_radius_mm(sensor)
             forward_map = ForwardMap.build(load_sensor(sensor), Circle(1.0), radius_mm, DEFAULT_PLAYED_FORCE_RANGE)
+
         board = stack.enter_context(virtual_sensor(forward_map, "reference", SEED, RATE_HZ))
         port = stack.enter_context(Port(board.url))
-        # A recording that the page begins has every frame, and neither a device file nor a name of the film.
+
+        # Carry out the requests of the page. A recording that the page begins has every frame, and neither a device
+        # file nor a name of the film.
         header = RecordingHeader(policy="every", device={}, name="")
         stack.enter_context(answering(link, live, header))
+
         say("Ctrl-C stops")
         feed = PageFeed(link, touch, live)
-        for record in stack.enter_context(closing(live.follow(port))):
+        records = stack.enter_context(closing(live.follow(port)))
+        for record in records:
             feed.write(record)
             if seconds is not None and touch.counts.records > seconds * RATE_HZ:
                 break

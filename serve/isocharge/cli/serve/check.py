@@ -50,17 +50,24 @@ def check_command(
 
 
 def _text(check: PressCheck) -> Iterator[str]:
-    """Yield the lines of the report: presses, summary of the errors, statistical tests, verdict and notes."""
+    """Yield the lines of the report: presses, summary of the errors, statistical tests, verdict and notes.
+
+    The summary compares the errors with the errors that noise of the charges and the uncertainty of the rig cause. The
+    column `beyond` is the part of the errors that these two do not explain.
+    """
     yield from _press_lines(check)
     yield ""
     yield f"{check.model}, {check.compared} of {check.presses} presses"
     yield f"{'error':14}{'rms':>9}{'median':>9}{'max':>9}{'noise':>9}{'rig':>9}{'beyond':>9}"
     yield from _summary_line("position, mm", check.position_mm)
     yield from _summary_line("force, %", check.force_percent)
+
+    # Statistical tests of whether noise and rig explain the errors. Without positions or forces there are no errors.
     agreement = check.agreement
-    if agreement.degrees:
+    if agreement.degrees > 0:
+        reduced_chi_squared = agreement.chi_squared / agreement.degrees
         yield (
-            f"chi-squared per degree of freedom {agreement.chi_squared / agreement.degrees:.3g} ({agreement.degrees}), "
+            f"chi-squared per degree of freedom {reduced_chi_squared:.3g} ({agreement.degrees}), "
             f"p value {agreement.p_value:.2g}"
         )
     if check.position_mm is not None:
@@ -68,8 +75,9 @@ def _text(check: PressCheck) -> Iterator[str]:
         shift_y = agreement.shift_y
         yield f"shift ({shift_x.mean:.3f} +- {shift_x.std:.3f}, {shift_y.mean:.3f} +- {shift_y.std:.3f}) mm"
     if check.force_percent is not None:
-        relative_force = agreement.force
-        yield f"scale of the force {1.0 + relative_force.mean:.4f} +- {relative_force.std:.4f}"
+        relative_error = agreement.force  # common to all forces
+        yield f"scale of the force {1.0 + relative_error.mean:.4f} +- {relative_error.std:.4f}"
+
     yield ""
     yield check.verdict
     yield from (f"- {note}" for note in check.notes)
@@ -77,7 +85,8 @@ def _text(check: PressCheck) -> Iterator[str]:
 
 def _press_lines(check: PressCheck) -> Iterator[str]:
     """Yield a table of the presses with the largest errors, in the order of the file."""
-    chi_squared = np.nansum(check.errors.squared_ratio, axis=1)  # one value for each press
+    squared_ratio = check.errors.squared_ratio  # squared errors of x, y and F over their variances, shape (n, 3)
+    chi_squared = np.nansum(squared_ratio, axis=1)  # shape (n,)
     worst_presses = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
     if check.presses > MAX_ROWS:
         yield f"the {MAX_ROWS} worst of {check.presses} presses; --json has all"
@@ -96,7 +105,7 @@ def _press_line(row: dict[str, Any]) -> str:
         _number_cell(row["force_error_percent"], width=9, decimals=2),
     ]
     words = list(row["flags"])
-    if row["left_out"]:
+    if row["left_out"]:  # the reason why the press is left out
         words.append(row["left_out"])
     return f"{row['line']:>6}{''.join(numbers)}  {', '.join(words)}".rstrip()
 

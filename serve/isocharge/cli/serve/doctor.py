@@ -162,19 +162,21 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
         electrodes: Electrodes of the model; empty for any model.
 
     Raises:
-        PressCheckError: If a press does not come, or the presses do not tell the channels apart.
+        PressCheckError: If a press does not come, or the presses do not distinguish the channels.
     """
     device = device_from_table(examination.device, "board")
-    names = [channel.name for channel in examination.channels]
-    are_electrodes_named = set(electrodes) <= set(names)
+    channel_names = [channel.name for channel in examination.channels]
+    are_electrodes_named = set(electrodes) <= set(channel_names)
+
+    # Channel of each electrode, by the name of the electrode, as it is assumed before the check.
     if device.channels:
-        channels = dict(device.channels)
-    elif len(electrodes) == len(names) and not are_electrodes_named:
-        channels = dict(zip(electrodes, names, strict=True))  # the channels are assigned by their order
+        channel_of_electrode = dict(device.channels)
+    elif len(electrodes) == len(channel_names) and not are_electrodes_named:
+        channel_of_electrode = dict(zip(electrodes, channel_names, strict=True))  # by their order
     else:
-        channels = dict(zip(names, names, strict=True))  # each channel is the electrode of its name
+        channel_of_electrode = {name: name for name in channel_names}
     with Port(examination.url, baud=examination.baud, request=device.request) as port:
-        return check_electrodes(port, device, channels, say)
+        return check_electrodes(port, device, channel_of_electrode, say)
 
 
 def port_lines() -> Iterator[str]:
@@ -210,7 +212,7 @@ def _setting(key: str, text: str) -> Any:
     """Parse an option that describes the gain, and return one number or a number for each electrode.
 
     Args:
-        key: Key of the setting in a device file, such as `pc_per_unit`, from which the name of the option follows.
+        key: Key of the setting in a device file, such as `pC_per_unit`, from which the name of the option follows.
         text: Value of the option, such as `0.1` or `A=0.1,B=-0.1`.
 
     Raises:
@@ -220,8 +222,8 @@ def _setting(key: str, text: str) -> Any:
         if "=" not in text:
             return parse_number(text)
         pairs = (part.partition("=") for part in text.split(","))
-        return {name.strip(): parse_number(number.strip()) for name, _, number in pairs}
-    except ValueError as error:
+        return {electrode.strip(): parse_number(number.strip()) for electrode, _equals_sign, number in pairs}
+    except ValueError as error:  # from `parse_number`
         option = f"--{key.replace('_', '-').lower()}"
         raise InputError(f"{option}: expected a number like 0.0457, or A=0.0457,B=-0.0457, got {text!r}") from error
 
@@ -240,10 +242,11 @@ def _request(text: str | None, rate_Hz: float) -> Request | None:
     if text is None:
         return None
     try:
-        # `unicode_escape` decodes bytes of Latin-1. Characters outside of Latin-1 become escape sequences before, and
-        # the last step then refuses them, because they do not fit into one byte.
-        escaped = text.encode("latin-1", "backslashreplace")
-        data = escaped.decode("unicode_escape").encode("latin-1")
+        # The codec `unicode_escape` decodes escape sequences in bytes of Latin-1. Other characters first become escape
+        # sequences themselves. The last step refuses them, because they do not fit into one byte.
+        escaped_text = text.encode("latin-1", "backslashreplace")
+        unescaped_text = escaped_text.decode("unicode_escape")
+        data = unescaped_text.encode("latin-1")
     except (UnicodeDecodeError, UnicodeEncodeError) as error:
         raise InputError(rf"--request: expected a text like '?\n' or '\x01\x04', got {text!r}") from error
     if not data:
@@ -256,20 +259,21 @@ def _write(path: Path, examination: Examination, model: str) -> None:
 
     Args:
         path: The file.
-        examination: Result of the port check.
+        examination: Result of listening, which contains the description of the board.
         model: Model that is to be used.
 
     Raises:
-        InputError: If it cannot be written.
+        InputError: If the file cannot be written.
     """
     try:
         write_whole(path, device_text(examination).encode())
     except OSError as error:
         raise InputError(f"--write {path}: cannot be written ({error.strerror}); choose another path") from error
-    if not examination.works:
+    if not examination.works:  # settings that a touch needs are missing
         say(f"{path} written; it gives no touches yet: put in what is missing above")
         return
-    if "offset" in examination.device.get("gain", {}):
+    has_measured_offsets = "offset" in examination.device.get("gain", {})
+    if has_measured_offsets:
         say("the offsets are right only if nothing lay on the film; a steady weight cannot be noticed")
     command = join(["isocharge", "serve", "stream", model, "--port", examination.url, "--device", str(path)])
     say(f"{path} written; use it with: {command}")
@@ -279,8 +283,9 @@ def report_lines(examination: Examination) -> Iterator[str]:
     """Yield the lines of the report on a port: the frames, a table of the channels, and the missing settings.
 
     Args:
-        examination: Result of the port check.
+        examination: Result of listening on the port.
     """
+    # The frames.
     speed = f" at {examination.baud} baud" if has_speed(examination.url) else ""
     yield f"{examination.url}{speed}: {examination.format}"
     yield f"{examination.bytes_seen} bytes in {examination.seconds:.1f} s, {examination.rate_Hz:.1f} frames/s"
@@ -288,6 +293,8 @@ def report_lines(examination: Examination) -> Iterator[str]:
     yield _numbering_line(examination)
     if examination.unused:
         yield f"channels that no electrode uses: {printable(', '.join(examination.unused))}"
+
+    # The channels: a line if their unit is not pC, and a table.
     if examination.unit == "V":
         yield "the channels are volts, it seems, not pC"
     elif examination.unit != "pC":
@@ -298,7 +305,9 @@ def report_lines(examination: Examination) -> Iterator[str]:
     for channel in examination.channels:
         yield _channel_line(channel, examination.unit)
     if examination.held:
-        yield examination.held
+        yield examination.held  # a sentence about held presses
+
+    # The missing settings.
     yield "missing to get a touch:" if examination.missing else "missing to get a touch: nothing"
     for sentence in examination.missing:
         yield f"- {sentence}"
@@ -336,6 +345,7 @@ def _channel_line(channel: ChannelHealth, unit: str) -> str:
         channel: Health of the channel.
         unit: Unit of the channel: "pC", "counts" or "V".
     """
+    # The attributes are named after pC, but have the unit of the channel. The hum is that at 50 Hz and at 60 Hz.
     figures = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
     all_decimals = VOLT_DECIMALS if unit == "V" else DECIMALS
     cells = [f"{printable(channel.name):8.8s}"]

@@ -73,6 +73,7 @@ def http_command(
 
     Example: isocharge serve http --port 8000
     """
+    # Check the options that protect the server.
     token = given_token(token)
     address = Address(host, port, uds)
     # The gRPC server listens on the host even if the HTTP server listens on a Unix socket.
@@ -80,14 +81,17 @@ def http_command(
     check_exposure(most_exposed_address, has_token=token is not None)
     tls = given_tls(tls_cert, tls_key)
     secret = None if token is None else Token(token)
+    # Pages of other sites can neither send the token nor reach a Unix socket, so every host name is then accepted.
     browser_check = BrowserCheck(host, allow_host or (), any_host=secret is not None or uds is not None)
+
+    # Load the models, and serve them until Ctrl-C.
     with suppress(KeyboardInterrupt), _traffic(log, token) as traffic:
         store = open_model_store(models)
         for reason in store.refusals():
             _report(traffic, "warning", "refused", reason)
         handler = Handler(store, traffic=traffic, token=secret, browser_check=browser_check)
         server = HttpServer(handler, address, tls=tls)
-        with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:
+        with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:  # empty without gRPC
             labels = [loaded.metadata.label for loaded in store.loaded_versions()]
             _report(traffic, "info", "serving", ", ".join(labels))
             announce(server.url)
@@ -108,14 +112,14 @@ def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
         token: Token that the log must not contain.
     """
     if log is LogFormat.text:
-        yield Traffic()
+        yield Traffic()  # without a log of requests
         return
-    with WriterQueue(write_stderr) as lines:
-        request_log = RequestLog(lines.put, secret=token)
+    with WriterQueue(write_stderr) as line_queue:
+        request_log = RequestLog(line_queue.put, secret=token)
         logging.basicConfig(level=logging.WARNING, handlers=[request_log], force=True)
         logging.captureWarnings(True)
         traffic = Traffic(request_log)
-        traffic.lost_lines = lambda: lines.lost  # number of lines that the queue had to discard, for the metrics
+        traffic.lost_lines = lambda: line_queue.lost  # number of lines that the queue discarded, for the metrics
         yield traffic
 
 
@@ -125,8 +129,8 @@ def _report(traffic: Traffic, level: str, event: str, message: str) -> None:
     Args:
         traffic: Counters of the server, which have the log.
         level: Level of the event in the log.
-        event: Name of the event.
-        message: Description of the event.
+        event: Name of the event: "refused" for models that are not served, or "serving".
+        message: The reason for the refusal, or the names of the served models.
     """
     if traffic.log is not None:
         traffic.log.message(level, event, message)

@@ -79,7 +79,7 @@ def plot_command(
     with shown_progress():
         traces = traces_of(recording.records(PlottedRecord), str(file))
 
-    # Read the description of the film. The picture is drawn without what cannot be read.
+    # Read the description of the film. What cannot be read is omitted from the picture.
     sensor = None
     working_area = None
     try:
@@ -127,24 +127,29 @@ def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
     if first is None:
         raise RecordingError(f"{where}: expected at least one record, got none; replay or record it again")
     electrodes = tuple(first.charge_raw_pC or ())
+    names = [*NUMBERS, *(f"charge_pC.{name}" for name in electrodes), *MEANINGS]  # MEANINGS contains all flags
 
-    def row(record: Any) -> tuple[Any, ...]:
-        """Return the values of a record: its numbers, the charge of each electrode, and whether each flag is set.
-
-        Missing values are None.
-        """
-        numbers = [getattr(record, name) for name in NUMBERS]
-        charge_of_electrode = record.charge_pC or {}
-        charge_pC = [charge_of_electrode.get(name) for name in electrodes]
-        flags = [word in record.flags for word in MEANINGS]
-        return (*numbers, *charge_pC, *flags)
-
-    names = [*NUMBERS, *(f"charge_pC.{name}" for name in electrodes), *MEANINGS]
     all_records = chain([first], records)
     row_type = np.dtype((float, len(names)))  # None in a row becomes NaN
-    rows = np.fromiter(map(row, all_records), row_type)  # shape (n, n_column)
+    rows = np.fromiter((_record_values(record, electrodes) for record in all_records), row_type)  # shape (n, n_column)
     columns = dict(zip(names, rows.T, strict=True))
     return {name: column for name, column in columns.items() if name not in MEANINGS or column.any()}
+
+
+def _record_values(record: Any, electrodes: tuple[str, ...]) -> tuple[Any, ...]:
+    """Return the values of a record: its numbers, the charge of each electrode, and whether each flag is set.
+
+    Missing values are None.
+
+    Args:
+        record: A `PlottedRecord`.
+        electrodes: Names of the electrodes, in the order of the returned charges.
+    """
+    numbers = [getattr(record, name) for name in NUMBERS]
+    charge_of_electrode = record.charge_pC or {}
+    charge_pC = [charge_of_electrode.get(name) for name in electrodes]
+    flags = [word in record.flags for word in MEANINGS]
+    return (*numbers, *charge_pC, *flags)
 
 
 class _Groups(NamedTuple):
@@ -166,7 +171,8 @@ class _Groups(NamedTuple):
     def of(cls, time_s: Array, unit_s: float) -> "_Groups":
         """Divide consecutive records into at most `MAX_GROUPS` groups of equal size, and find the gaps between them.
 
-        A gap is a pause before a group that is much longer than the usual time between the starts of two groups.
+        A gap is a pause before a group that is much longer than the usual time between the starts of two groups. It is
+        at least `MIN_GAP_S`, and at least `MIN_GAP_GROUPS` times this usual time.
 
         Args:
             time_s: Times since the first record, shape (n,), s.
@@ -180,10 +186,11 @@ class _Groups(NamedTuple):
         last = np.append(start[1:], len(time_s)) - 1  # last record of each group
         start_s = time_s[start]
         end_s = time_s[last]
+
         usual_length_s = float(np.median(np.diff(start_s))) if len(start) > 1 else 0.0
         min_gap_s = max(MIN_GAP_S, MIN_GAP_GROUPS * usual_length_s)
-        gap_s = start_s[1:] - end_s[:-1]
-        after_gap = np.flatnonzero(gap_s > min_gap_s) + 1
+        pause_s = start_s[1:] - end_s[:-1]  # before the second group, the third group, and so on
+        after_gap = np.flatnonzero(pause_s > min_gap_s) + 1
         return cls(start, start_s / unit_s, end_s / unit_s, after_gap)
 
     def draw_band(self, axes: Any, lower: Array, upper: Array, **style: Any) -> None:
@@ -212,27 +219,15 @@ def recording_picture(
     start_s = traces["timestamp"][0]
     time_s = traces["timestamp"] - start_s
     duration_s = time_s[-1]
-    # The longest unit of time that suits the duration of the recording
-    unit_s, unit = next((unit_s, unit) for min_duration_s, unit_s, unit in TIME_UNITS if duration_s >= min_duration_s)
-    groups = _Groups.of(time_s, unit_s)
-    flag_words = [word for word in MEANINGS if word in traces]
+    unit_s, unit = _time_unit(duration_s)
 
-    # Right half: position, force, charges and flags over time, one above the other
     figure = new_figure(15.0, 8.6)
     film_figure, time_figure = cast(np.ndarray, figure.subfigures(1, 2, width_ratios=(1.0, 1.35)))
-    flag_height = 0.09 * max(1, len(flag_words)) + 0.05  # grows with the number of rows of flags
-    heights = (1.0, 0.8, 1.0, flag_height)
-    position_axes, force_axes, charge_axes, flag_axes = time_figure.subplots(4, 1, sharex=True, height_ratios=heights)
-    _draw_with_std(position_axes, groups, traces, "x_mm", COLOURS[0])
-    _draw_with_std(position_axes, groups, traces, "y_mm", COLOURS[1])
-    _draw_with_std(force_axes, groups, traces, "force_N", INK)
-    _draw_charges(charge_axes, groups, traces)
-    _draw_flags(flag_axes, groups, traces, flag_words)
-    _label_axes(position_axes, "position, mm; bands: 2 standard deviations")
-    _label_axes(force_axes, "force, N")
-    _label_axes(charge_axes, "touch charge, pC")
-    flag_axes.set_xlabel(f"time since {datetime.fromtimestamp(start_s, UTC):%Y-%m-%d %H:%M:%S} UTC, {unit}")
     figure.suptitle(f"{title}: {len(time_s)} records in {duration_s / unit_s:.4g} {unit}")
+
+    # Right half: position, force, charges and flags over time
+    time_label = f"time since {datetime.fromtimestamp(start_s, UTC):%Y-%m-%d %H:%M:%S} UTC, {unit}"
+    _draw_over_time(time_figure, _Groups.of(time_s, unit_s), traces, time_label)
 
     # Left half: the path of the contacts on the film
     film_axes = film_figure.subplots()
@@ -242,6 +237,40 @@ def recording_picture(
         draw_electrodes(film_axes, sensor)
     _draw_path(film_axes, traces, time_s / unit_s, f"time, {unit}")
     return figure
+
+
+def _time_unit(duration_s: float) -> tuple[float, str]:
+    """Return the length (s) and the symbol of the longest unit of time that suits the duration of a recording."""
+    for min_duration_s, unit_s, unit in TIME_UNITS:  # from the longest unit to the shortest
+        if duration_s >= min_duration_s:
+            return unit_s, unit
+    return 1.0, "s"  # the clock was set back during the recording
+
+
+def _draw_over_time(figure: Any, groups: _Groups, traces: dict[str, Array], time_label: str) -> None:
+    """Draw position, force, charges and flags over time, one above the other.
+
+    Args:
+        figure: The part of the figure of matplotlib for these axes.
+        groups: Groups of records, each of which is drawn as a single point.
+        traces: Columns of the records.
+        time_label: Label of the common time axis.
+    """
+    flag_words = [word for word in MEANINGS if word in traces]
+    flag_height = 0.09 * max(1, len(flag_words)) + 0.05  # grows with the number of rows of flags
+    heights = (1.0, 0.8, 1.0, flag_height)
+    position_axes, force_axes, charge_axes, flag_axes = figure.subplots(4, 1, sharex=True, height_ratios=heights)
+
+    _draw_with_std(position_axes, groups, traces, "x_mm", COLOURS[0])
+    _draw_with_std(position_axes, groups, traces, "y_mm", COLOURS[1])
+    _draw_with_std(force_axes, groups, traces, "force_N", INK)
+    _draw_charges(charge_axes, groups, traces)
+    _draw_flags(flag_axes, groups, traces, flag_words)
+
+    _label_axes(position_axes, "position, mm; bands: 2 standard deviations")
+    _label_axes(force_axes, "force, N")
+    _label_axes(charge_axes, "touch charge, pC")
+    flag_axes.set_xlabel(time_label)
 
 
 def _draw_with_std(axes: Any, groups: _Groups, traces: dict[str, Array], name: str, colour: str) -> None:
@@ -271,13 +300,14 @@ def _draw_flags(axes: Any, groups: _Groups, traces: dict[str, Array], words: lis
         traces: Columns of the records.
         words: The flags, from the lowest row to the highest.
     """
-    min_length = 2e-3 * max(float(groups.end_time[-1]), 1e-9)
+    total_time = max(float(groups.end_time[-1]), 1e-9)  # not zero, even if there is only one record
+    min_length = 2e-3 * total_time
     lengths = np.maximum(groups.end_time - groups.start_time, min_length)
     for row_height, word in enumerate(words):
         # The flag of a group is set if the flag is set in one of its records.
         is_set = np.maximum.reduceat(traces[word], groups.start) > 0.0
         starts_and_lengths = np.column_stack([groups.start_time[is_set], lengths[is_set]])
-        bottom_and_height = (row_height - 0.35, 0.7)
+        bottom_and_height = (row_height - 0.35, 0.7)  # centred on the tick of the row
         axes.broken_barh(starts_and_lengths, bottom_and_height, color=INK)
     axes.set(yticks=range(len(words)), yticklabels=words)
 
@@ -299,7 +329,8 @@ def _label_axes(axes: Any, label: str) -> None:
 def _draw_path(axes: Any, traces: dict[str, Array], time: Array, time_label: str) -> None:
     """Draw the path of the contacts on the film, true to scale.
 
-    Each press is a line. The colour of the dots shows the time, and their size shows the force.
+    Each press is a line with dots. The colour of the dots shows the time, and their size shows the force. If there are
+    too many records, only every n-th record is drawn.
 
     Args:
         axes: Axes of matplotlib.
@@ -336,10 +367,11 @@ def _draw_contacts(
         time: Time of each record, shape (n,), in the unit of the label.
         time_label: Label of the scale of colours.
     """
+    # The area of a dot increases with the force. The lower limit of the largest force only avoids a division by zero.
     force_N = np.clip(traces["force_N"][contacts], 0.0, None)
-    relative_force = force_N / max(float(force_N.max()), 1e-9)
-    size = 3.0 + 30.0 * relative_force
-    dots = axes.scatter(*position_mm[contacts].T, c=time[contacts], s=size, lw=0.0, alpha=0.8, zorder=4)
+    largest_force_N = max(float(force_N.max()), 1e-9)
+    dot_area = 3.0 + 30.0 * (force_N / largest_force_N)
+    dots = axes.scatter(*position_mm[contacts].T, c=time[contacts], s=dot_area, lw=0.0, alpha=0.8, zorder=4)
     axes.figure.colorbar(dots, ax=axes, shrink=0.6, label=time_label, location="bottom", pad=0.02)
 
     # An ellipse extends two standard deviations to each side, and is therefore four standard deviations wide.
@@ -362,7 +394,7 @@ def _draw_contacts(
         )
     )
 
-    # Crosses mark the contacts with at least one of the flags.
+    # Crosses mark the contacts with at least one of the flags. A flag that no record has is not in `traces`.
     is_doubtful = np.zeros(len(contacts), dtype=bool)
     for word in DOUBTFUL_FLAGS:
         if word in traces:

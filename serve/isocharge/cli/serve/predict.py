@@ -61,6 +61,7 @@ def _read_charges(file: str, electrodes: tuple[str, ...]) -> Array:
     if file != "-":
         return read_charge_file(Path(file), electrodes, say)
     try:
+        # In contrast to `sys.stdin`, this wrapper removes a byte order mark and does not convert line ends.
         text = TextIOWrapper(sys.stdin.buffer, encoding="utf-8-sig", newline="")
         try:
             return read_charges(bounded_lines(text), electrodes, "stdin", say)

@@ -55,14 +55,14 @@ def write_records(
         writers: Functions that write a record, which are called in their order.
         latencies: Collects the latency of each record, us.
     """
-    tare_pC = None
+    last_tare_pC = None
     for record in records:
         for write in writers:
             write(record)
-        if record.tare_pC != tare_pC:
-            tare_pC = record.tare_pC
-            if tare_pC is not None:
-                say("tared: " + ", ".join(f"{name} {charge:.2f} pC" for name, charge in tare_pC.items()))
+        if record.tare_pC != last_tare_pC:
+            last_tare_pC = record.tare_pC
+            if last_tare_pC is not None:  # it is None until the tare is measured
+                say("tared: " + ", ".join(f"{name} {charge:.2f} pC" for name, charge in last_tare_pC.items()))
         if record.latency_us is not None:
             latencies.append(record.latency_us)
 
@@ -105,14 +105,14 @@ def summary(touch: TouchStream, latencies: deque[float]) -> str:
         touch: The stream.
         latencies: Latencies of the latest records, us.
     """
-    totals = touch.totals()
-    counts = touch.counts
-    text = (
+    totals = touch.totals()  # numbers of frames and bytes
+    counts = touch.counts  # numbers of outages and of skipped frames
+    frames_text = (
         f"{totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated, {totals.restarts} restarts; "
         f"{totals.crc_errors} CRC errors, {totals.malformed} malformed, {totals.bytes_dropped} bytes dropped, "
         f"{totals.resyncs} resynchronisations; {counts.outages} reconnects, {counts.skipped} skipped"
     )
     if not latencies:
-        return text
+        return frames_text
     p50, p99 = np.percentile(latencies, (50, 99))
-    return f"{text}; last byte to record p50 {p50:.0f} us, p99 {p99:.0f} us"
+    return f"{frames_text}; last byte to record p50 {p50:.0f} us, p99 {p99:.0f} us"

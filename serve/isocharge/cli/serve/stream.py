@@ -2,6 +2,7 @@
 
 import signal
 from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from functools import partial
 from itertools import islice
@@ -45,6 +46,7 @@ from isocharge.common.errors import InputError, shown
 from isocharge.common.printable_text import is_printable
 from isocharge.serve import (
     Policy,
+    PredictionRecord,
     Predictor,
     RecordedClock,
     Recorder,
@@ -59,6 +61,8 @@ from isocharge.serve import (
 )
 from isocharge.serve.live.device import with_settings
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
+from isocharge.serve.outputs.targets import Outputs
+from isocharge.serve.viewer.link import ReaderEnd
 
 MAX_NAME_CHARACTERS = 100
 """Largest number of characters of a film's name."""
@@ -245,34 +249,56 @@ def replay_command(
     """
     address = None if live is None else page_address(live, token)
     tls = page_tls(live, tls_cert, tls_key)
+
+    # The model, the board and the name of the film are those of the recording, unless an option replaces them.
     recording = Recording(file)
-    clock = RecordedClock()
     folder = find_model(model, models) if model else find_labelled_model(recording.model, models)
     predictor = Predictor(folder)
     board = load_device(device) if device else device_from_table(recording.device, str(file))
-    path = TouchStream(predictor, board, policy=Policy(recording.policy), now_ns=clock, frame_id=recording.name or None)
+
+    # The function `play` yields the records. If the recording loads other models, `play` loads them, too, but not if
+    # the user has chosen one model for the whole recording.
+    clock = RecordedClock()
+    touch = TouchStream(
+        predictor, board, policy=Policy(recording.policy), now_ns=clock, frame_id=recording.name or None
+    )
     load = None if model else partial(_load_labelled, models=models)
-    played = partial(replay, recording, path, clock, real_time=real_time, load=load)
+    play = partial(replay, recording, touch, clock, real_time=real_time, load=load)
+
     latencies: deque[float] = deque(maxlen=LATENCIES)
-    with ExitStack() as stack:
-        stack.enter_context(until_stopped())
-        outputs = stack.enter_context(outputs_of(output, path, is_live=False))
-        writers: list[RecordWriter] = [outputs.write]
+    with until_stopped(), outputs_of(output, touch, is_live=False) as outputs:
         if address is None:
-            write_records(played(), writers, latencies)
+            write_records(play(), [outputs.write], latencies)
         else:
-            link = stack.enter_context(
-                live_page(address, token, file.name, predictor.metadata, folder, is_recording=True, tls=tls)
-            )
-            feed = PageFeed(link, path)
-            writers.append(feed.write)
-            write_records(played(on_marker=lambda marker: link.send_message(marker=[*marker])), writers, latencies)
-            outputs.close()  # now, because Ctrl-C, which is the only end of the page, would discard the files
-            link.send_message(is_complete=True)
-            while link.wait_for_request() is not None:  # until the page's process ends, or Ctrl-C
-                pass
-    say(summary(path, latencies))
+            page = live_page(address, token, file.name, predictor.metadata, folder, is_recording=True, tls=tls)
+            with page as link:
+                _play_on_page(play, link, PageFeed(link, touch), outputs, latencies)
+    say(summary(touch, latencies))
     if outputs.has_incomplete_file:
         incomplete = ", ".join(outputs.not_written)
         say(f"{incomplete}: not written, because the replay was stopped before its end")
         raise typer.Exit(1)
+
+
+def _play_on_page(
+    play: Callable[..., Iterator[PredictionRecord]],
+    link: ReaderEnd,
+    feed: PageFeed,
+    outputs: Outputs,
+    latencies: deque[float],
+) -> None:
+    """Write the records of a recording to the outputs and to its page, and keep the page open until Ctrl-C.
+
+    Args:
+        play: Function that yields the records. Its argument `on_marker` is called with each marker of the recording.
+        link: The reader's end of the link to the page.
+        feed: Sender of the records to the page.
+        outputs: The outputs, which are closed at the end of the recording.
+        latencies: Collects the latency of each record, us.
+    """
+    records = play(on_marker=lambda marker: link.send_message(marker=[*marker]))
+    write_records(records, [outputs.write, feed.write], latencies)
+    outputs.close()  # before Ctrl-C, which is the only end of the page and would discard the files
+    link.send_message(is_complete=True)
+    while link.wait_for_request() is not None:  # until the process of the page ends, or Ctrl-C
+        pass

@@ -174,7 +174,7 @@ def virtual_command(
 
 
 def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) -> tuple[Sensor, Probe]:
-    """Return the sensor and the probe as described. If there is a seed, vary both at random.
+    """Return the sensor and the probe as described, or, if there is a seed, a film and a probe that vary at random.
 
     Args:
         sensor_name: Name or file of the sensor.
@@ -213,11 +213,12 @@ def _frame_settings(frames: FrameFormat | None, board: BoardEncoder | None) -> d
     """Return the arguments of `VirtualSensor` that determine the frames.
 
     Args:
-        frames: Format of the frames, if there is no device file; None for the binary frame.
+        frames: Format of the frames, if there is no device file; None for the binary frame. A board has its own format.
         board: Board of the device file; None if there is none.
     """
     if board is not None:
         settings: dict[str, Any] = {"encode": board.encode}
+        # The sequence number and the device clock begin again at these values.
         settings["seq_modulus"] = board.seq_modulus
         settings["t_us_modulus"] = board.t_us_modulus
         if board.request is not None:

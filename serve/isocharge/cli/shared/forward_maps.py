@@ -75,16 +75,17 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
         return parse_radius_mm(text)
     radii = []
     for probe in probes:
-        area = working_area(map_to_search(sensor, probe, force), noise_model("reference"))
+        forward_map = map_to_search(sensor, probe, force)  # charges over the whole area that may be a working area
+        area = working_area(forward_map, noise_model("reference"))
         say(f"{probe.notation}: {area.summary}")
         radii.append(area.radius)
-    radius = min(radii)
-    if radius == 0.0:
+    shared_radius = min(radii)
+    if shared_radius == 0.0:
         raise InputError(
             "--radius auto: the charges determine the contact nowhere well enough; see 'isocharge simulate identify', "
             "or give a radius in mm"
         )
-    return radius
+    return shared_radius
 
 
 def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit: float = DEFAULT_STRESS_LIMIT) -> None:

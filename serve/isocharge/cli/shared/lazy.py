@@ -40,16 +40,18 @@ def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer
         commands: The commands by name.
     """
 
+    # Typer creates the group itself and accepts only a class. The class therefore contains the commands of this group.
     class LazyGroup(TyperGroup):
         """A group that stores only the names and the summaries of its commands."""
 
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
-            for name, command in commands.items():  # placeholders, which only have the summaries
-                self.add_command(TyperCommand(name, help=command.summary, short_help=command.summary))
+            for name, command in commands.items():
+                placeholder = TyperCommand(name, help=command.summary, short_help=command.summary)
+                self.add_command(placeholder)
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-            """Import the command that the arguments name."""
+            """Return the command that the arguments name. It is imported in place of its placeholder."""
             name, command, remaining_args = super().resolve_command(ctx, args)
             if name is not None and name in commands:
                 command = load_command(commands[name])
@@ -71,9 +73,12 @@ def load_command(command: LazyCommand) -> TyperCommand:
     Raises:
         MissingExtra: If the extra of the command is not installed.
     """
-    module, _, function = command.function_path.partition(":")
-    with require(command.extra) if command.extra else nullcontext():
-        command_function = getattr(import_module(module), function)
+    module_name, _, function_name = command.function_path.partition(":")
+    # A missing package of the extra raises MissingExtra, whose message names the install command.
+    import_context = require(command.extra) if command.extra else nullcontext()
+    with import_context:
+        command_function = getattr(import_module(module_name), function_name)
+
     # Typer makes a command only from an app. An app with a single function becomes one command without subcommands.
     single_command_app = typer.Typer(add_completion=False, rich_markup_mode=None)
     single_command_app.command(cls=OptionalValueCommand)(command_function)

@@ -143,7 +143,7 @@ def page_address(live: str, token: str | None) -> Address:
         InputError: If `live` has another form, or if other machines could see the page without a token.
     """
     host, colon, port = live.rpartition(":")
-    if not colon:
+    if not colon:  # only a port
         host = LOOPBACK
     # The length is checked before the conversion, because `int` refuses very long texts.
     is_short_number = port.isascii() and port.isdecimal() and len(port) <= len(str(MAX_PORT))
@@ -195,8 +195,9 @@ def live_page(
     # for the process, and also if the process cannot be started. Closing twice is harmless.
     with closing(reader), page_process(page) as url, closing(reader):
         if is_recording:
-            reader.enable_waiting()
-        say(f"{'replay' if is_recording else 'live'} page: {url}")
+            reader.enable_waiting()  # a slow page then delays the replay, instead of losing records
+        page_name = "replay page" if is_recording else "live page"
+        say(f"{page_name}: {url}")
         yield reader
 
 
@@ -226,7 +227,7 @@ class PageFeed:
         was_open = self._link.is_open
         self._link.send_sample(self._pack(record))
         self._timestamps_s.append(math.nan if record.timestamp is None else record.timestamp)
-        if was_open and not self._link.is_open:
+        if was_open and not self._link.is_open:  # sending has closed the link
             say("the process of the live page has ended; the stream goes on without it")
         now_s = time.monotonic()
         if now_s - self._last_state_s > STATE_INTERVAL_S:
@@ -258,31 +259,31 @@ class PageFeed:
 def answering(link: ReaderEnd, live: RecordedStream, header: RecordingHeader | None) -> Iterator[None]:
     """Carry out the requests of the page during the block, and show warnings of the package `serve` on the page.
 
-    A thread waits for the requests and carries them out.
+    A thread waits for the requests and carries them out. It ends when the link is closed.
 
     Args:
         link: The reader's end of the link to the page.
         live: The stream.
         header: Header of the recordings that the page begins. None refuses requests for recordings.
     """
-
-    def answer_requests() -> None:
-        """Carry out requests until the link is closed, and show each error on the page."""
-        while (request := link.wait_for_request()) is not None:
-            try:
-                _carry_out(request, link, live, header)
-            except IsochargeError as error:
-                _show_note(link, str(error))
-
     handler = logging.Handler()
     handler.emit = lambda record: _show_note(link, record.getMessage())  # type: ignore[method-assign]
     logger = logging.getLogger("isocharge.serve")
     logger.addHandler(handler)
-    threading.Thread(target=answer_requests, name="page requests", daemon=True).start()
+    threading.Thread(target=_answer_requests, args=(link, live, header), name="page requests", daemon=True).start()
     try:
         yield
     finally:
         logger.removeHandler(handler)
+
+
+def _answer_requests(link: ReaderEnd, live: RecordedStream, header: RecordingHeader | None) -> None:
+    """Carry out requests of the page until the link is closed, and show each error on the page."""
+    while (request := link.wait_for_request()) is not None:
+        try:
+            _carry_out(request, link, live, header)
+        except IsochargeError as error:
+            _show_note(link, str(error))
 
 
 def _carry_out(request: LiveRequest, link: ReaderEnd, live: RecordedStream, header: RecordingHeader | None) -> None:
@@ -302,16 +303,21 @@ def _carry_out(request: LiveRequest, link: ReaderEnd, live: RecordedStream, head
             marker = recording.Marker(time.time(), text)
             live.request_marker(marker)
             link.send_message(marker=[*marker])
-        case Record(on=is_on):
+        case Record(on=begins):
             if header is None:
                 raise InputError("the command that runs the stream records it already (--record)")
-            label = live.predictor.metadata.label
-            path = Path(f"{label.replace('/', '-')}-{time.strftime('%Y%m%d-%H%M%S')}.rec")
-            live.request_recording(Recorder(path, label, *header) if is_on else None)
-            link.send_message(recording=f"{path.name}, which waits for data" if is_on else None)
+            if begins:
+                model_label = live.predictor.metadata.label
+                path = Path(f"{model_label.replace('/', '-')}-{time.strftime('%Y%m%d-%H%M%S')}.rec")
+                recorder = Recorder(path, model_label, header.policy, header.device, header.name)
+                live.request_recording(recorder)
+                link.send_message(recording=f"{path.name}, which waits for data")
+            else:
+                live.request_recording(None)  # ends the recording
+                link.send_message(recording=None)
         case Tare():
             live.request_tare()
-        case Back():
+        case Back():  # back to the film as it was calibrated
             live.request_film_reset()
 
 

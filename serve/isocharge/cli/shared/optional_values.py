@@ -38,6 +38,8 @@ OPTIONAL_VALUES = {"--live": OptionalValue(DEFAULT_LIVE_ADDRESS, is_address)}
 def insert_omitted_values(words: Sequence[str]) -> list[str]:
     """Insert the default values of options whose value is omitted.
 
+    An option has a value if the next word of the command line is suitable as its value (`OPTIONAL_VALUES`).
+
     Args:
         words: The command line. Words after `--` are arguments and remain as they are.
 

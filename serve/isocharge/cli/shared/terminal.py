@@ -62,7 +62,8 @@ def open_closed_streams() -> None:
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # gets the lowest free file descriptor, which is `descriptor`
 
-    # Python sets the stream object to None if its file descriptor was closed when the interpreter started.
+    # Python sets the stream object to None if its file descriptor was closed when the interpreter started. The new
+    # objects must not close the descriptors when they are destroyed.
     if sys.stdin is None:
         sys.stdin = open(STDIN_DESCRIPTOR, closefd=False)  # noqa: SIM115
     if sys.stdout is None:
@@ -161,7 +162,7 @@ def until_stopped() -> Iterator[None]:
     previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
-    except KeyboardInterrupt:
+    except KeyboardInterrupt:  # Ctrl-C or SIGTERM
         pass
     except BrokenPipeError:  # no program reads stdout any more
         discard_output(STDOUT_DESCRIPTOR)
@@ -361,6 +362,7 @@ def _progress_bars() -> Iterator[Listener]:
             shown_note = printable(note)
             if shown_title not in bar_of_title:
                 bar_of_title[shown_title] = bars.add_task(shown_title, total=total, note=shown_note)
+
             bar = bar_of_title[shown_title]
             has_restarted = done < bars.tasks[bar].completed
             if has_restarted:

@@ -110,13 +110,20 @@ def measure_function(amplifier: Amplifier, rate_Hz: float) -> Callable[..., Any]
         kelvin of the film. The first call creates the state of the amplifier, with its drift and its noise, which the
         following calls continue.
     """
-    running_amplifier: Callable[..., Any] | None = None
+    return _RunningAmplifier(amplifier, rate_Hz).measure
 
-    def measure(charge_pC: Any, rng: Any, charge_pC_per_K: Any = None) -> Any:
-        """Return the measured charges of the next frames."""
-        nonlocal running_amplifier
-        if running_amplifier is None:
-            running_amplifier = amplifier.start(charge_pC.shape[1], rate_Hz, rng)
-        return running_amplifier(charge_pC, charge_pC_per_K)
 
-    return measure
+class _RunningAmplifier:
+    """An amplifier that continues its drift and its noise from call to call."""
+
+    def __init__(self, amplifier: Amplifier, rate_Hz: float) -> None:
+        """Store the amplifier, which is started by the first call of `measure`."""
+        self._amplifier = amplifier
+        self._rate_Hz = rate_Hz
+        self._measurement: Callable[..., Any] | None = None
+
+    def measure(self, charge_pC: Any, rng: Any, charge_pC_per_K: Any = None) -> Any:
+        """Return the measured charges of the next frames; see `measure_function` for the arguments."""
+        if self._measurement is None:
+            self._measurement = self._amplifier.start(charge_pC.shape[1], self._rate_Hz, rng)
+        return self._measurement(charge_pC, charge_pC_per_K)

@@ -63,9 +63,10 @@ class CsvTable(NumberTable):
             error: If the file is empty, is not CSV text in UTF-8, or has too many columns.
         """
         self._rows = _numbered_rows(lines, names, where, error)
-        _, header = next(self._rows, (0, None))
-        if header is None:
+        first_row = next(self._rows, None)
+        if first_row is None:
             raise error(f"{where}: empty; expected {expected}")
+        _line_number, header = first_row
         if any("\0" in name for name in header):
             # The high byte of an ASCII letter is zero. It is the first byte in UTF-16BE, and the second in UTF-16LE.
             encoding = "UTF-16BE" if header[0].startswith("\0") else "UTF-16LE"
@@ -85,10 +86,9 @@ class CsvTable(NumberTable):
         Raises:
             error: If there are too many rows, or a cell is not a finite number.
         """
-        positions = {name: self.header.index(name) for name in rules}
-        # Arrays of 64-bit integers and floats need less memory than lists. The numbers of all rows follow each other.
-        line_numbers = array("q")
-        numbers = array("d")
+        positions = {name: self.header.index(name) for name in rules}  # index of each column in a row
+        line_numbers = array("q")  # 64-bit integers, which need less memory than a list
+        numbers = array("d")  # 64-bit floats: the numbers of the first row, then those of the second row, and so on
         for line_number, cells in self._rows:
             if len(line_numbers) == max_rows:
                 self._refuse_row_count(max_rows)
@@ -99,8 +99,8 @@ class CsvTable(NumberTable):
                 if number is None:
                     self._refuse_cell(line_number, name, rules[name], cells[position])
                 numbers.append(number)
-        matrix = np.array(numbers, dtype=np.float64).reshape(len(line_numbers), len(positions))
-        values = dict(zip(positions, matrix.T, strict=True))
+        rows = np.array(numbers, dtype=np.float64).reshape(len(line_numbers), len(positions))
+        values = dict(zip(positions, rows.T, strict=True))
         return NumberColumns(values, np.array(line_numbers, dtype=np.intp), self.row_noun)
 
     def _check_cell_count(self, line_number: int, cells: list[str]) -> None:
@@ -135,8 +135,9 @@ def csv_text(columns: Mapping[str, Array]) -> str:
     """Return columns of shape (n,) as CSV text with all digits. NaN becomes an empty cell."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    for row in np.column_stack([*columns.values()]).tolist():
+    writer.writerow(columns)  # the names
+    rows = np.column_stack(list(columns.values()))  # shape (n, n_column)
+    for row in rows.tolist():
         writer.writerow("" if math.isnan(value) else repr(value) for value in row)
     return text.getvalue()
 
@@ -216,16 +217,19 @@ def _decoding_advice(cause: UnicodeDecodeError, lines_before: int) -> str:
     If the file begins like a file of another known format, the message names this format instead.
 
     Args:
-        cause: The error, which contains the piece of the file that was being decoded.
+        cause: The error, which contains the piece of the file that was being decoded, and the position of the wrong
+            byte in this piece.
         lines_before: Number of lines before this piece.
     """
+    piece = cause.object
     is_first_piece = lines_before == 0
-    other_format = _other_format(cause.object) if is_first_piece else None
+    other_format = _other_format(piece) if is_first_piece else None
     if other_format:
         return f": {other_format}"
-    lines_in_piece = cause.object[: cause.start].count(b"\n")
+    line_number = lines_before + piece[: cause.start].count(b"\n") + 1
+    wrong_byte = piece[cause.start]
     return (
-        f", line {lines_before + lines_in_piece + 1}: the byte 0x{cause.object[cause.start]:02x} is not text in UTF-8: "
+        f", line {line_number}: the byte 0x{wrong_byte:02x} is not text in UTF-8: "
         "save the file as UTF-8; if it is Windows or Latin-1 text, as with: iconv -f WINDOWS-1252 -t UTF-8 FILE > "
         "NEW.csv"
     )

@@ -53,9 +53,9 @@ def header_advice(columns: Iterable[str], absent: Mapping[str, ColumnMeaning]) -
         columns: Columns of the file that have no other meaning.
         absent: Meanings of the missing columns, by name.
     """
-    remaining = dict(absent)
+    remaining = dict(absent)  # missing columns that no column resembles yet
     for column in columns:
-        if len(column) > MAX_COLUMN_CHARACTERS:
+        if len(column) > MAX_COLUMN_CHARACTERS:  # not the name of a quantity
             continue
         for name, meaning in remaining.items():
             advice = _advice(column, name, meaning)
@@ -87,8 +87,8 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
 
     # The column consists of words only, such as "force applied".
     words = _words(column)
-    has_only_known_words = words <= meaning.words | GENERAL_WORDS
-    if _is_named(words, meaning) and has_only_known_words:
+    other_words = words - meaning.words - GENERAL_WORDS  # general words, such as "position", do not change the meaning
+    if _is_named(words, meaning) and not other_words:
         return advice_to_rename
 
     # The column consists of a label and a unit, such as "force (N)" or "force_N".
@@ -98,10 +98,11 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
     label, bracketed_unit, last_word = match.groups()
     unit = bracketed_unit or last_word
     is_named = _is_named(_words(label), meaning)
-    is_recognised_by_unit = meaning.is_known_by_unit and bracketed_unit
+    is_recognised_by_unit = meaning.is_known_by_unit and bracketed_unit is not None
     if unit == meaning.unit and (is_named or is_recognised_by_unit):
         return advice_to_rename
-    if unit in OTHER_UNITS.get(meaning.unit, ()) and is_named:
+    convertible_units = OTHER_UNITS.get(meaning.unit, ())
+    if unit in convertible_units and is_named:
         return f"column {shown(column)} is in {unit}: convert it to {meaning.unit} and rename it to {shown(name)}"
     return ""
 

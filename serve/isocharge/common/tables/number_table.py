@@ -91,11 +91,12 @@ class NumberColumns:
         Raises:
             error: If a value breaks a rule. The message names the first such row, the column, the rule and the value.
         """
-        violations = [rules[name].violations(column) for name, column in self.values.items()]
-        rows_and_columns = np.argwhere(np.column_stack(violations))  # ordered by rows
-        if not rows_and_columns.size:
+        masks = [rules[name].violations(column) for name, column in self.values.items()]
+        is_violation = np.column_stack(masks)  # shape (n, n_column)
+        violations = np.argwhere(is_violation)  # row and column of each violation, ordered by rows
+        if not violations.size:
             return
-        row, column_index = rows_and_columns[0]  # the first violation in the first row that has one
+        row, column_index = violations[0]
         name = list(self.values)[column_index]
         value = _value_text(float(self.values[name][row]))
         raise error(
@@ -161,19 +162,22 @@ class NumberTable(ABC):
             error: If a required column is missing, if the name of a column is similar to that of an absent optional
                 column, or if the file has one of the columns twice. The message states which column to rename.
         """
-        allowed = {**required, **(optional or {})}
-        chosen = {name: rule for name, rule in allowed.items() if name in self.header or name in required}
-        other_columns = [name for name in self.header if name not in chosen]
-        missing = [name for name in chosen if name not in self.header]
-        if missing:
-            absent = {name: rule.meaning for name, rule in allowed.items() if name not in self.header}
-            advice = header_advice(other_columns, absent)
-            self._refuse_header("; ".join([f"missing: {_listed(missing)}", *islice(advice, MAX_LISTED_NAMES)]))
-        repeated = [name for name in chosen if self.header.count(name) > 1]
-        if repeated:
-            self._refuse_header(f"repeated: {_listed(repeated)}")
+        known_rules = {**required, **(optional or {})}
+        chosen_rules = {name: rule for name, rule in known_rules.items() if name in self.header or name in required}
+        other_columns = [name for name in self.header if name not in chosen_rules]
+
+        missing_names = [name for name in required if name not in self.header]
+        if missing_names:
+            # A missing column may be in the file under another name.
+            absent = {name: rule.meaning for name, rule in known_rules.items() if name not in self.header}
+            advice = islice(header_advice(other_columns, absent), MAX_LISTED_NAMES)
+            self._refuse_header("; ".join([f"missing: {_listed(missing_names)}", *advice]))
+
+        repeated_names = [name for name in chosen_rules if self.header.count(name) > 1]
+        if repeated_names:
+            self._refuse_header(f"repeated: {_listed(repeated_names)}")
         self.refuse_similar_names(other_columns, optional or {})
-        return chosen
+        return chosen_rules
 
     def refuse_similar_names(self, columns: Iterable[str], optional: Mapping[str, ColumnRule]) -> None:
         """Raise `error` if the names of columns are similar to those of optional columns that the file does not have.

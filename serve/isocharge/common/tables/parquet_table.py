@@ -110,7 +110,7 @@ class ParquetTable(NumberTable):
         with _pyarrow_errors_converted(self.where, self.error):
             numbers = self._decode(self._leaf_index(field.name), name)
         if is_integer(field.type):
-            self._check_integers(numbers, name)
+            self._refuse_rounded_integers(numbers, name)
         return numbers
 
     def _decode(self, index: int, name: str) -> Array:
@@ -120,17 +120,17 @@ class ParquetTable(NumberTable):
             index: Index under which Parquet stores the column.
             name: Name of the column, for error messages.
         """
-        row_count = self._metadata.num_rows
+        row_count = self._metadata.num_rows  # number that the metadata declare
         numbers = np.empty(row_count)
-        row = 0
-        groups = list(range(self._metadata.num_row_groups))
-        for batch in self._parquet.reader.iter_batches(ROWS_PER_BATCH, groups, [index], use_threads=False):
-            next_row = row + batch.num_rows
-            if next_row > row_count:  # more rows than the metadata declare, which the check below reports
+        decoded_rows = 0
+        all_groups = list(range(self._metadata.num_row_groups))
+        for batch in self._parquet.reader.iter_batches(ROWS_PER_BATCH, all_groups, [index], use_threads=False):
+            batch_end = decoded_rows + batch.num_rows
+            if batch_end > row_count:  # the file has more rows than the metadata declare
                 break
-            numbers[row:next_row] = _as_float64(batch.column(0))
-            row = next_row
-        if row != row_count:
+            numbers[decoded_rows:batch_end] = _as_float64(batch.column(0))  # the only column of the batch
+            decoded_rows = batch_end
+        if decoded_rows != row_count:
             raise self.error(
                 f"{self.where}, column {shown(name)}: expected {row_count:,} rows as in the metadata of the file, got "
                 "another number; the file is damaged, write it again"
@@ -138,7 +138,10 @@ class ParquetTable(NumberTable):
         return numbers
 
     def _leaf_index(self, field_name: str) -> int:
-        """Return the index under which Parquet stores a column that is not nested."""
+        """Return the index under which Parquet stores a column that is not nested.
+
+        Nested columns have several indices, so that the index differs from the position of the column in the header.
+        """
         schema = self._parquet.schema
         indices = [index for index in range(len(schema)) if schema.column(index).path == field_name]
         if len(indices) != 1:
@@ -148,8 +151,8 @@ class ParquetTable(NumberTable):
             )
         return indices[0]
 
-    def _check_integers(self, numbers: Array, name: str) -> None:
-        """Refuse integers that float64 may have rounded."""
+    def _refuse_rounded_integers(self, numbers: Array, name: str) -> None:
+        """Raise `error` if a column has integers that the conversion to float64 may have rounded."""
         inexact_rows = np.flatnonzero(np.abs(numbers) >= FIRST_INEXACT_INTEGER)
         if inexact_rows.size:
             row = inexact_rows[0]
@@ -169,10 +172,11 @@ def parquet_bytes(columns: Mapping[str, Array]) -> bytes:
     import pyarrow
     from pyarrow.parquet import write_table
 
-    table = pyarrow.table({name: pyarrow.array(values, from_pandas=True) for name, values in columns.items()})
-    data = io.BytesIO()
-    write_table(table, data)
-    return data.getvalue()
+    # The option `from_pandas` converts NaN to null.
+    arrow_columns = {name: pyarrow.array(values, from_pandas=True) for name, values in columns.items()}
+    file = io.BytesIO()
+    write_table(pyarrow.table(arrow_columns), file)
+    return file.getvalue()
 
 
 def require_pyarrow() -> None:
@@ -242,5 +246,6 @@ def _as_float64(column: "ArrowArray") -> Array:
 
     if pyarrow.types.is_decimal(column.type):
         column = column.cast(pyarrow.string())  # the conversion from text rounds to the nearest number
-    numbers: Any = column.cast(pyarrow.float64(), safe=False).to_numpy(zero_copy_only=False)
+    float_column = column.cast(pyarrow.float64(), safe=False)  # integers may be rounded
+    numbers: Any = float_column.to_numpy(zero_copy_only=False)  # a column with nulls must be copied
     return np.asarray(numbers, dtype=np.float64)

@@ -33,12 +33,12 @@ def open_table(path: Path, names: Collection[str], error: type[InputError], expe
     """
     if is_parquet(path):
         require_pyarrow()
-        with _os_errors_converted(path, error, "a Parquet file of presses"), open_regular(path) as data:
-            yield ParquetTable(data, names, str(path), error, expected)
+        with _os_errors_converted(path, error, "a Parquet file of presses"), open_regular(path) as file:
+            yield ParquetTable(file, names, str(path), error, expected)
     else:
         with (
             _os_errors_converted(path, error, "a CSV file of presses"),
-            path.open(encoding="utf-8-sig", newline="") as text,
+            path.open(encoding="utf-8-sig", newline="") as text,  # the CSV reader interprets the line ends itself
         ):
             yield CsvTable(bounded_lines(text), names, str(path), error, expected)
 

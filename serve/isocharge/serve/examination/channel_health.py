@@ -67,16 +67,19 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
     usable_pC = charge_pC[is_usable]
     usable_times_s = times_s[is_usable]
 
+    # In a short time, a hum cannot be distinguished from a drift. At a low frame rate, it cannot be sampled.
     hum_frequencies_Hz: list[float] = []
     if usable_times_s[-1] > SHORTEST_S:
         hum_frequencies_Hz = [hum_Hz for hum_Hz in MAINS_HZ if rate_Hz > SAMPLES_PER_PERIOD * hum_Hz]
     fit = _fit_drift_and_hum(usable_pC, usable_times_s, hum_frequencies_Hz)
+    hum_50_Hz_pC = fit.hum_amplitudes_pC.get(50.0)  # None if the hum of this frequency was not fitted
+    hum_60_Hz_pC = fit.hum_amplitudes_pC.get(60.0)
     return ChannelHealth(
         name,
         offset_pC=float(usable_pC.mean()),
         noise_pC=float(fit.residual_pC.std()),
         drift_pC_per_s=fit.slope_pC_per_s,
-        hum_pC=(fit.hum_amplitudes_pC.get(50.0), fit.hum_amplitudes_pC.get(60.0)),
+        hum_pC=(hum_50_Hz_pC, hum_60_Hz_pC),
         span_pC=float(np.ptp(usable_pC)),
         unusable=unusable,
     )
@@ -103,6 +106,9 @@ def _fit_drift_and_hum(charge_pC: Array, times_s: Array, hum_frequencies_Hz: Seq
         charge_pC: Values, shape (n,), pC.
         times_s: Times of the values, shape (n,), s.
         hum_frequencies_Hz: Frequencies of the hum, Hz; empty if only the line is fitted.
+
+    Returns:
+        Slope of the line, amplitude of the hum at each frequency, and residuals.
     """
     # The columns are a constant, a slope, and a cosine and a sine for each frequency of the hum.
     columns = [np.ones_like(times_s), times_s]
@@ -112,10 +118,12 @@ def _fit_drift_and_hum(charge_pC: Array, times_s: Array, hum_frequencies_Hz: Seq
     design_matrix = np.column_stack(columns)
     coefficients = np.linalg.lstsq(design_matrix, charge_pC, rcond=None)[0]
 
+    # The coefficients of the hum alternate: a cosine and a sine for each frequency.
     _constant, slope_pC_per_s, *hum_coefficients = coefficients.tolist()
     cosines_pC = hum_coefficients[0::2]
     sines_pC = hum_coefficients[1::2]
     amplitudes_pC = {}
     for hum_Hz, cosine_pC, sine_pC in zip(hum_frequencies_Hz, cosines_pC, sines_pC, strict=True):
         amplitudes_pC[hum_Hz] = math.hypot(cosine_pC, sine_pC)
-    return _DriftAndHum(slope_pC_per_s, amplitudes_pC, charge_pC - design_matrix @ coefficients)
+    residual_pC = charge_pC - design_matrix @ coefficients
+    return _DriftAndHum(slope_pC_per_s, amplitudes_pC, residual_pC)

@@ -24,12 +24,14 @@ LINES_TO_FILL_IN = {
 def device_text(examination: Examination) -> str:
     """Return the device file of a board as TOML text.
 
-    The section `[gain]` comes last. If the channels are not in pC, the section ends with comments for the conversion to
-    pC, which the user completes.
+    The file begins with comments that describe the board. The section `[gain]` comes last. If the channels are not in
+    pC, the section ends with comments for the conversion to pC, which the user completes.
     """
+    head_comments = (*HEAD, *_description(examination))
     other_sections = {key: value for key, value in examination.device.items() if key != "gain"}
-    text = to_toml(other_sections, (*HEAD, *_description(examination)))
+    text = to_toml(other_sections, head_comments)
 
+    # The heading of the section is also needed if the section consists only of comments.
     gain = examination.device.get("gain")
     lines_to_fill_in = LINES_TO_FILL_IN.get(examination.unit, ())
     if gain is not None:

@@ -71,30 +71,31 @@ class ElectrodeCheck:
         for electrode, channel in self.found.items():
             yield f"press near {electrode}: channel {printable(channel)} answers most strongly"
         yield _order_sentence(self.expected, self.found)
-        if 0 < len(self.inverted) < len(self.found):
+        # If all channels are inverted, only the sign convention of the board differs, which is no mistake.
+        is_part_inverted = 0 < len(self.inverted) < len(self.found)
+        if is_part_inverted:
             names = printable(", ".join(self.inverted))
             yield f"channel {names} falls under a press and the others rise: check the signs of the gain"
 
 
-def _order_sentence(expected: Mapping[str, str], found: Mapping[str, str]) -> str:
+def _order_sentence(expected_channels: Mapping[str, str], found_channels: Mapping[str, str]) -> str:
     """Return a sentence that states whether the channels are swapped, turned, or in another order.
 
     The channels are turned if each channel is connected the same number of places too far around the film.
 
     Args:
-        expected: Channel of each electrode as it was assumed, by the names of the electrodes.
-        found: Channel of each electrode as the presses show it, by the names of the electrodes.
+        expected_channels: Channel of each electrode as it was assumed, by the names of the electrodes.
+        found_channels: Channel of each electrode as the presses show it, by the names of the electrodes.
     """
-    # For each electrode that was pressed, the electrode to which the answering channel was assumed to belong
-    electrodes = list(expected)
-    electrode_of_channel = {channel: electrode for electrode, channel in expected.items()}
-    assumed_electrodes = [electrode_of_channel[found[electrode]] for electrode in electrodes]
-    pairs = zip(electrodes, assumed_electrodes, strict=True)
-    wrong_electrodes = [electrode for electrode, assumed in pairs if electrode != assumed]
+    electrodes = list(expected_channels)
+    wrong_electrodes = [name for name in electrodes if found_channels[name] != expected_channels[name]]
     if not wrong_electrodes:
         return "every channel belongs to its electrode"
 
-    if len(electrodes) > 2:
+    # For each electrode that was pressed, the electrode to which the answering channel was assumed to belong
+    electrode_of_channel = {channel: electrode for electrode, channel in expected_channels.items()}
+    assumed_electrodes = [electrode_of_channel[found_channels[electrode]] for electrode in electrodes]
+    if len(electrodes) > 2:  # two channels that are turned are also swapped, which is the simpler description
         for places in range(1, len(electrodes)):
             # This is the order of the electrodes if every channel is connected `places` electrodes too far.
             turned_electrodes = electrodes[places:] + electrodes[:places]
@@ -135,14 +136,16 @@ def check_electrodes(
     changes = np.array(measured_changes)  # shape (electrodes, channels)
 
     # A channel is inverted if its value falls under the press near its own electrode.
-    found = {}
-    inverted = []
+    found_channels = {}
+    inverted_channels = []
     for row, column in enumerate(assign_channels(changes, electrodes)):
         channel = channel_names[column]
-        found[electrodes[row]] = channel
+        found_channels[electrodes[row]] = channel
         if changes[row, column] < 0.0:
-            inverted.append(channel)
-    return ElectrodeCheck(dict(channels), found, changes, tuple(inverted))
+            inverted_channels.append(channel)
+    return ElectrodeCheck(
+        expected=dict(channels), found=found_channels, changes=changes, inverted=tuple(inverted_channels)
+    )
 
 
 def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
@@ -168,8 +171,8 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
 
     columns = [int(column) for column in np.argmax(normalised, axis=1)]
     for row, column in enumerate(columns):
-        other_channels = np.delete(normalised[row], column)
-        if other_channels.size and normalised[row, column] < MIN_ADVANTAGE * other_channels.max():
+        other_changes = np.delete(normalised[row], column)  # empty if there is only one channel
+        if other_changes.size and normalised[row, column] < MIN_ADVANTAGE * other_changes.max():
             raise PressCheckError(
                 f"the press near electrode {electrodes[row]} moves two channels alike; press closer to the electrode, "
                 "with a thinner probe, and try again"
@@ -254,14 +257,15 @@ class _Blocks:
             chunk = self._port.read(min(BLOCK_S, remaining_s))
             if chunk is not None:
                 rows += self._rows(chunk.data)
-        values = np.array(rows)
+        values = np.array(rows)  # shape (frames, channels)
+        # Coarse values may have no noise between consecutive frames. The noise is then one step of the values.
         noise = np.array([max(noise_of(column), resolution_of(column)) for column in values.T])
         return np.median(values, axis=0), noise
 
     def _rows(self, data: bytes) -> Iterator[list[float]]:
         """Yield the values of the channels in each frame that has a finite number for every channel."""
         for frame in self._parser.feed(data):
-            positions = [position_of(channel, frame) for channel in self._channels]
+            positions = [position_of(channel, frame) for channel in self._channels]  # None for a missing channel
             values = [frame.values[position] for position in positions if position is not None]
             has_all_channels = len(values) == len(positions)
             if has_all_channels and all(map(math.isfinite, values)):
@@ -271,8 +275,9 @@ class _Blocks:
 def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
     """Wait for a press that begins and ends, and return the largest change of each channel, shape (channels,).
 
-    The change is the difference between a block and the rest level. Until the press begins, the rest level is updated,
-    so that it follows a slow drift. The press ends when the change has become small again.
+    The values are averaged over blocks of time. The change is the difference between a block and the rest level. Until
+    the press begins, the rest level is updated, so that it follows a slow drift. The press ends when the change has
+    become small again.
 
     Args:
         blocks: Source of the averaged values.
@@ -287,7 +292,7 @@ def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
     largest_change = np.zeros_like(rest_level)
     is_pressed = False
     while (block := blocks.next_block(deadline_s)) is not None:
-        level, _ = block  # medians of the channels, and their noise
+        level, _block_noise = block  # the noise at rest is used instead, because a press changes the noise of a block
         change = level - rest_level
         if np.any(np.abs(change) > CHANGE_SIGMAS * noise):
             is_pressed = True
@@ -300,6 +305,8 @@ def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
             largest_change = change
         if change_size < RELEASED_SHARE * np.abs(largest_change).sum():
             return largest_change
+
+    # The time is over: either the press did not end, or it did not begin.
     if is_pressed:
         raise _restless_error(electrode, timeout_s)
     raise _missing_press_error(electrode, timeout_s)
@@ -331,6 +338,8 @@ def _wait_for_rest(blocks: _Blocks, electrode: str, deadline_s: float, timeout_s
         is_quiet = bool(np.all(variation <= 0.5 * CHANGE_SIGMAS * noise))
         if len(recent_blocks) == REST_BLOCKS and is_quiet:
             return levels.mean(axis=0), noise
+
+    # The time is over: either the channels were not quiet, or no frames came.
     if recent_blocks:
         raise _restless_error(electrode, timeout_s)
     raise _missing_press_error(electrode, timeout_s)

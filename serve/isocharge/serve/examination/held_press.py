@@ -69,7 +69,8 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     """Find a press that is held for at least `MIN_HELD_S`, and describe how its charge changes.
 
     The values are averaged over blocks of time. The press begins with the first large step between the blocks. The film
-    must be at rest before the press, and the step must be much larger than the usual change between blocks.
+    must be at rest before the press, and the step must be much larger than the usual change between blocks. All
+    channels are combined into one component, which is the projection of their values onto the direction of the step.
 
     Args:
         values: Values of the channels, shape (n, channels), in any unit.
@@ -78,27 +79,31 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     Returns:
         The press; None if there is none.
     """
+    min_duration_s = MIN_REST_S + SETTLE_S + MIN_HELD_S
     levels = _block_means(values, times_s)
-    if levels is None or len(levels) * BLOCK_S < MIN_REST_S + SETTLE_S + MIN_HELD_S:
+    if levels is None or len(levels) * BLOCK_S < min_duration_s:
         return None
-    step = _find_step(levels)
 
-    begin = step.rest_blocks + 1  # block in which the press begins
-    settled = begin + round(SETTLE_S / BLOCK_S)  # first block in which the force is constant
+    # Find the blocks in which the press begins, has a constant force, and ends.
+    step = _find_step(levels)
+    begin = step.rest_blocks + 1
+    settled = begin + round(SETTLE_S / BLOCK_S)
     end = _end_of_press(step.component, settled, step.size)
     has_rest = step.rest_blocks * BLOCK_S >= MIN_REST_S
     is_long = (end - settled) * BLOCK_S >= MIN_HELD_S
     if not (step.is_large and has_rest and is_long):
         return None
 
+    # Subtract the rest level from the component, and describe how the press changes while its force is constant.
     block_times_s = BLOCK_S * (np.arange(len(step.component)) + 0.5)  # middle of each block
     rest, drift_per_s = _extrapolate_rest(step.component, block_times_s, step.rest_blocks, step.size)
     press_size = step.component - rest
-    held_s = block_times_s[settled:end] - BLOCK_S * begin
+    begin_s = BLOCK_S * begin
+    held_s = block_times_s[settled:end] - begin_s
     description, sections = _describe(held_s, press_size[settled:end])
     if drift_per_s != 0.0:
         description, sections = _with_drift(description, sections, percent_per_s=100.0 * drift_per_s / step.size)
-    return HeldPress(BLOCK_S * begin, sections, description)
+    return HeldPress(begin_s, sections, description)
 
 
 class _Step(NamedTuple):
@@ -129,11 +134,13 @@ def _find_step(levels: Array) -> _Step:
     changes = levels[2:] - levels[:-2]  # shape (blocks - 2, channels)
     change_sizes = np.linalg.norm(changes, axis=1)
     is_step = change_sizes > 0.5 * change_sizes.max()
-    rest_blocks = int(np.argmax(is_step))  # position of the first True
-    size = float(change_sizes[rest_blocks])
-    direction = changes[rest_blocks] / max(size, SMALLEST_SIZE)
+    step_position = int(np.argmax(is_step))  # position of the first True
+    size = float(change_sizes[step_position])
     is_large = bool(size >= STEP_RATIO * np.median(change_sizes))
-    return _Step(rest_blocks, size, is_large, component=levels @ direction)
+
+    # Project the levels onto the direction of the step, a unit vector of shape (channels,).
+    direction = changes[step_position] / max(size, SMALLEST_SIZE)
+    return _Step(rest_blocks=step_position, size=size, is_large=is_large, component=levels @ direction)
 
 
 def _extrapolate_rest(
@@ -141,10 +148,12 @@ def _extrapolate_rest(
 ) -> tuple[Reals, float]:
     """Extrapolate the rest level before a press to the time of the press.
 
-    The rest level is constant, unless its slope is significant and large enough to affect the description.
+    A straight line is fitted to the blocks before the press. The rest level is constant, unless the slope of the line
+    is significant and large enough to affect the description.
 
     Args:
-        component: Mean of each block along the change of the press, shape (blocks,), any unit.
+        component: Mean of each block, projected onto the change of the channels by the press, shape (blocks,), any
+            unit.
         block_times_s: Middle of each block, shape (blocks,), s.
         rest_blocks: Number of blocks before the press.
         step_size: Change of the component when the press begins, in the unit of the component.
@@ -153,9 +162,11 @@ def _extrapolate_rest(
         The rest in each block, shape (blocks,), and its slope per second, which is 0 if the rest is constant.
     """
     rest_component = component[:rest_blocks]
-    (slope, level), covariance = np.polyfit(block_times_s[:rest_blocks], rest_component, 1, cov=True)
+    rest_times_s = block_times_s[:rest_blocks]
+    (slope, level), covariance = np.polyfit(rest_times_s, rest_component, deg=1, cov=True)
     slope_std = np.sqrt(covariance[0, 0])
     is_significant = abs(slope) > DRIFT_SIGMAS * slope_std
+    # Within a held press, the drift would be mistaken for a change of the charge of the press.
     is_disturbing = abs(slope) * MIN_HELD_S > STEADY_SHARE * step_size
     if is_significant and is_disturbing:
         return level + slope * block_times_s, float(slope)
@@ -177,12 +188,13 @@ def _block_means(values: Array, times_s: Array) -> Array | None:
     if not np.isfinite(values).all():
         return None
     block_numbers = (times_s / BLOCK_S).astype(int)  # number of the block of each value
-    counts = np.bincount(block_numbers)[:-1]  # number of values in each block
+    counts = np.bincount(block_numbers)[:-1]  # number of values in each block, without the last block
     if not counts.all():
         return None
-    channel_sums = [np.bincount(block_numbers, weights=column)[:-1] for column in values.T]
-    sums = np.stack(channel_sums, axis=1)  # shape (blocks, channels)
-    return np.asarray(sums / counts[:, None])
+    sums = np.zeros((len(counts), values.shape[1]))  # shape (blocks, channels)
+    for channel, channel_values in enumerate(values.T):
+        sums[:, channel] = np.bincount(block_numbers, weights=channel_values)[:-1]
+    return np.asarray(sums / counts[:, np.newaxis])
 
 
 def _end_of_press(component: Array, settled: int, step_size: float) -> int:
@@ -192,15 +204,16 @@ def _end_of_press(component: Array, settled: int, step_size: float) -> int:
     the press is held to the end, and the result is the number of blocks.
 
     Args:
-        component: Mean of each block along the change of the press, shape (blocks,).
+        component: Mean of each block, projected onto the change of the channels by the press, shape (blocks,).
         settled: First block in which the force is constant.
         step_size: Change of the component when the press begins.
     """
-    changes = component[settled + 2 :] - component[settled:-2]  # from each block to the second block after it
-    releases = np.flatnonzero(changes < -RELEASE_SHARE * step_size)  # counted from the block `settled`
-    if releases.size == 0:
+    held_component = component[settled:]
+    changes = held_component[2:] - held_component[:-2]  # from each block to the second block after it
+    release_positions = np.flatnonzero(changes < -RELEASE_SHARE * step_size)
+    if release_positions.size == 0:
         return len(component)
-    return settled + int(releases[0])
+    return settled + int(release_positions[0])
 
 
 def _with_drift(
@@ -208,19 +221,25 @@ def _with_drift(
 ) -> tuple[str, dict[str, dict[str, float]]]:
     """Add a drift of the rest level to the description and to the sections of a press.
 
+    The drift is removed by a section `[leak]` whose time constant is so large that it corrects no leak. If the press
+    leaks as well, `[leak]` already has the time constant of the press, and the measurement must be repeated.
+
     Args:
         description: Description of the press.
-        sections: Sections for a device file.
+        sections: Sections for a device file, as tables by name.
         percent_per_s: Drift of the rest in percent of the press per second.
+
+    Returns:
+        The completed description, and the completed sections.
     """
-    has_leak = "leak" in sections  # the press leaks as well, so that [leak] cannot be chosen for the drift
-    if has_leak:
+    if "leak" in sections:
         remedy = "leave the board alone until the rest stands still, and measure again"
+        completed_sections = sections
     else:
         remedy = f"[leak] tau_s = {LEARNING_TAU_s:g} in a device file lets the drift be learned at rest and taken off"
+        completed_sections = {"leak": {"tau_s": LEARNING_TAU_s}, **sections}
     sentence = f"the rest drifts, by {percent_per_s:.2g} % of the press in a second; {description}; {remedy}"
-    default_sections = {"leak": {"tau_s": LEARNING_TAU_s}}
-    return sentence, default_sections | sections
+    return sentence, completed_sections
 
 
 def _describe(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, float]]]:
@@ -233,7 +252,7 @@ def _describe(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, floa
         size: Size of the press at these times, shape (n,), any unit.
 
     Returns:
-        A sentence, and sections for a device file.
+        A sentence, and sections for a device file, as tables by name; empty if no setting is needed or known.
     """
     first_size = size[:END_BLOCKS].mean()
     last_size = size[-END_BLOCKS:].mean()
@@ -241,8 +260,9 @@ def _describe(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, floa
     if abs(lost_share) < STEADY_SHARE:
         return f"a held press keeps its charge for {held_s[-1]:.0f} s", {}
 
-    positive_size = np.maximum(size, 1e-9)  # the logarithm is fitted
-    law = law_of_fading(list(zip(held_s.tolist(), positive_size.tolist(), strict=True)))
+    positive_size = np.maximum(size, 1e-9)  # the law is fitted to the logarithm of the size
+    times_and_sizes = list(zip(held_s.tolist(), positive_size.tolist(), strict=True))
+    law = law_of_fading(times_and_sizes)
     if law.tau_s is not None:
         return f"a held press leaks: {law.settings} in a device file undoes it", law.sections
     if law.creep is not None:

@@ -82,11 +82,11 @@ class McapFile:
         self._electrodes = electrodes
         self._encoding = encoding
         self._now = now
-        self._flushed = 0.0
+        self._flush_time_s = 0.0  # time of the latest flush on the clock `now`
         self._lock = threading.Lock()
 
     def __enter__(self) -> Self:
-        """Create the file.
+        """Create the file, and write its beginning and the three channels, one for each topic.
 
         Raises:
             OutputExists: If the file exists already.
@@ -94,7 +94,7 @@ class McapFile:
         """
         self._file = AtomicWriter(self.path)
         self._writer = Writer(self._file)  # type: ignore[arg-type]  # it uses only write, tell and flush
-        self._flushed = self._now()
+        self._flush_time_s = self._now()
         with as_output_errors(self.path):
             self._writer.start(profile="ros2", library="isocharge")
             self._channels = {
@@ -115,7 +115,7 @@ class McapFile:
                 self._writer.finish()  # type: ignore[no-untyped-call]
 
     def write(self, record: PredictionRecord) -> None:
-        """Write a record.
+        """Write a record, its wrench if the force is known, and its pose if something touches.
 
         Raises:
             InputError: If a time stamp of ROS 2 cannot express the time of the record.
@@ -125,16 +125,19 @@ class McapFile:
         time_ns = time_of(values)
         json_text = record.to_json()
         is_json = self._encoding is RecordEncoding.json
+        record_message = json_text.encode() if is_json else string_message(json_text)
         messages = {
-            RECORD_TOPIC: json_text.encode() if is_json else string_message(json_text),
+            RECORD_TOPIC: record_message,
             WRENCH_TOPIC: wrench_stamped(values, time_ns),
             POSE_TOPIC: pose_stamped(values, time_ns),
         }
         with self._lock:
-            self._add(messages, time_ns)
+            self._add_messages(messages, time_ns)
 
-    def _add(self, messages: dict[str, bytes | None], time_ns: int) -> None:
-        """Add the messages of one record, and write the file to the disk from time to time.
+    def _add_messages(self, messages: dict[str, bytes | None], time_ns: int) -> None:
+        """Add the messages of one record, and flush the writer every `FLUSH_INTERVAL_S` seconds.
+
+        The caller must hold the lock.
 
         Args:
             messages: Message for each topic; None if the record has no message for the topic.
@@ -145,14 +148,18 @@ class McapFile:
             if data is not None:
                 self._writer.add_message(self._channels[topic], time_ns, data, publish_time=time_ns, sequence=sequence)
         self.records += 1
-        if self._now() - self._flushed >= FLUSH_INTERVAL_S:
+        if self._now() - self._flush_time_s >= FLUSH_INTERVAL_S:
             self._writer.flush()  # type: ignore[no-untyped-call]
-            self._flushed = self._now()
+            self._flush_time_s = self._now()
 
     def _record_channel(self) -> int:
-        """Register the channel of the records, and return its identifier."""
+        """Register the channel of the records in the file, and return its identifier.
+
+        The records are ROS 2 texts or, with their JSON schema, JSON.
+        """
         if self._encoding is RecordEncoding.ros2:
             return self._ros_channel(RECORD_TOPIC, STRING, STRING_DEFINITION)
+
         schema_text = json.dumps(record_schema(self._electrodes)).encode()
         schema_id = self._writer.register_schema(SCHEMA_NAME, "jsonschema", schema_text)
         return self._writer.register_channel(RECORD_TOPIC, "json", schema_id)

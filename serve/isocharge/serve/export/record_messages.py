@@ -103,59 +103,75 @@ def contact_of(record: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def wrench_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
-    """Return the load of a record as a WrenchStamped, in N and N m.
+    """Return the load of the probe on the film as a ROS 2 message WrenchStamped, in N and N m.
+
+    A press of force F at (x, y) has the force (0, 0, -F) and the torque (-y F, x F, 0) about the origin.
 
     Args:
-        record: Values of the record by name.
+        record: Values of the prediction record by name.
         time_ns: Time of the record, ns.
 
     Returns:
         The message, with zeros out of contact; None if the force is unknown.
     """
-    contact = contact_of(record)
-    force_N = contact["force_N"]
+    values = contact_of(record)  # a tracked contact replaces the contact of the frame
+    force_N = values["force_N"]
     if force_N is None:
         return None
-    x_m = 1e-3 * (contact["x_mm"] or 0.0)
-    y_m = 1e-3 * (contact["y_mm"] or 0.0)
-    # The press acts along -z at (x, y, 0). The subtractions from 0.0 avoid negative zeros.
+    # Out of contact, there is no position. The force is 0, so any position gives the torque 0.
+    x_m = 1e-3 * (values["x_mm"] or 0.0)
+    y_m = 1e-3 * (values["y_mm"] or 0.0)
+    # Subtracting from 0.0 gives 0.0 where a minus sign would give -0.0.
     force = (0.0, 0.0, 0.0 - force_N)
     torque = (0.0 - y_m * force_N, x_m * force_N, 0.0)
-    return _stamped(contact["frame_id"], time_ns, (*force, *torque))
+    return _stamped(values["frame_id"], time_ns, (*force, *torque))
 
 
 def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
-    """Return the position of a record as a PoseWithCovarianceStamped, in m, m^2 and rad^2.
+    """Return the position of a record as a ROS 2 message PoseWithCovarianceStamped, in m, m^2 and rad^2.
 
     Args:
-        record: Values of the record by name.
+        record: Values of the prediction record by name.
         time_ns: Time of the record, ns.
 
     Returns:
         The message; None if nothing touches.
     """
-    contact = contact_of(record)
-    x_mm = contact["x_mm"]
-    y_mm = contact["y_mm"]
-    x_std_mm = contact["x_std_mm"]
-    y_std_mm = contact["y_std_mm"]
+    values = contact_of(record)  # a tracked contact replaces the contact of the frame
+    x_mm = values["x_mm"]
+    y_mm = values["y_mm"]
+    x_std_mm = values["x_std_mm"]
+    y_std_mm = values["y_std_mm"]
     if None in (x_mm, y_mm, x_std_mm, y_std_mm):
         return None
-    xy_correlation = contact.get("xy_correlation") or 0.0  # a record of an earlier version has none
-    x_std_m = 1e-3 * x_std_mm
-    y_std_m = 1e-3 * y_std_mm
-    rotation_variances = [ROTATION_VARIANCE_rad2] * 3
-    # The matrix has 6 rows and 6 columns for x, y, z and the rotations about these axes. It is stored row by row.
+    xy_correlation = values.get("xy_correlation") or 0.0  # a record of an earlier version has none
+    position = (1e-3 * x_mm, 1e-3 * y_mm, 0.0)
+    no_rotation = (0.0, 0.0, 0.0, 1.0)  # a quaternion (x, y, z, w)
+    covariance = _pose_covariance(1e-3 * x_std_mm, 1e-3 * y_std_mm, xy_correlation)
+    return _stamped(values["frame_id"], time_ns, (*position, *no_rotation, *covariance))
+
+
+def _pose_covariance(x_std_m: float, y_std_m: float, xy_correlation: float) -> list[float]:
+    """Return the covariance matrix of a pose, row by row, m^2 and rad^2.
+
+    The matrix has 6 rows and 6 columns: x, y, z and the rotations about these axes. Only x and y are correlated.
+
+    Args:
+        x_std_m: Standard deviation of x, m.
+        y_std_m: Standard deviation of y, m.
+        xy_correlation: Correlation of the errors of x and y, dimensionless.
+    """
     covariance = [0.0] * 36
     diagonal = slice(0, 36, 7)
-    x_with_y = 1
-    y_with_x = 6
+    rotation_variances = [ROTATION_VARIANCE_rad2] * 3
     covariance[diagonal] = [x_std_m**2, y_std_m**2, DEFLECTION_STD_m**2, *rotation_variances]
-    covariance[x_with_y] = x_std_m * y_std_m * xy_correlation
-    covariance[y_with_x] = covariance[x_with_y]
-    position = (1e-3 * x_mm, 1e-3 * y_mm, 0.0)
-    orientation = (0.0, 0.0, 0.0, 1.0)
-    return _stamped(contact["frame_id"], time_ns, (*position, *orientation, *covariance))
+
+    x_with_y = 1  # row 0, column 1
+    y_with_x = 6  # row 1, column 0
+    xy_covariance = x_std_m * y_std_m * xy_correlation
+    covariance[x_with_y] = xy_covariance
+    covariance[y_with_x] = xy_covariance
+    return covariance
 
 
 def string_message(text: str) -> bytes:

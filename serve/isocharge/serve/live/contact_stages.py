@@ -142,7 +142,9 @@ class FilmStage(ContactStage):
         charge_pC = frame.reading.charge_pC
         if frame.contact is not None and charge_pC is not None:
             frame.contact, frame.model_charge_pC = self.follower.follow_contact(frame.contact, charge_pC)
-        frame.film = self.follower.film
+        frame.film = self.follower.film  # the estimate with which this contact was corrected
+
+        # Only after that, the estimate may change.
         self.follower.observe_frame(charge_pC, frame.contact, frame.flags, frame.clock_s)
         self._model.predictor = self.follower.predictor
         if frame.contact is not None and self.follower.is_lost:
@@ -164,20 +166,24 @@ class TrackingStage(ContactStage):
     def __init__(self, tracker: Tracker, predictor: Predictor, *, is_film_followed: bool) -> None:
         """Set the model of a tracker. The tracker keeps its present contact.
 
+        On some films, several contacts cause the same charges. A mixture of Gaussian components tracks these contacts.
+        It needs the file `charges.npz` beside the model, which describes the charges of every contact.
+
         Args:
             tracker: The tracker with its state.
             predictor: The loaded model.
-            is_film_followed: Whether the film is followed. If so, the file of charges is not used, because it describes
-                the calibrated film and not the current film.
+            is_film_followed: Whether the film is followed. If so, no mixture is used, because the file of charges
+                describes the calibrated film and not the current film.
 
         Raises:
             ModelError: If the file of charges of the model is damaged.
         """
         mixture = None
-        self._mixture_validity = predictor.validity
         if not is_film_followed:
-            mixture = contact_mixture(predictor)
+            mixture = contact_mixture(predictor)  # None if the model has no such file
+        self._mixture_validity = predictor.validity
         if mixture is not None:
+            # The contacts of the mixture are valid in the area for which the file describes charges.
             self._mixture_validity = replace(predictor.validity, corners_mm=mixture.charges.corners_mm)
         self._tracker = tracker
         self._tracker.mixture = mixture
@@ -185,15 +191,17 @@ class TrackingStage(ContactStage):
     def step(self, frame: ContactFrame) -> None:
         """Update the tracker with the contact of the frame, and add the tracked contact and its event to the frame.
 
-        If a mixture follows the contact, the contact of the mixture replaces the contact of the model.
+        If a mixture of several possible contacts tracks the touch, its most probable contact replaces the contact of
+        the model, and the flags are determined for the new contact.
         """
         tracker = self._tracker
         reading = frame.reading
         tracked, event = tracker.update(frame.contact, frame.clock_s, frame.flags, reading.charge_pC)
-        if tracked is None and event is None and tracker.other is None:
+        other = tracker.other  # another contact that also explains the charges, if there is one
+        if tracked is None and event is None and other is None:
             frame.tracking = NO_TRACKING
         else:
-            frame.tracking = Tracking(tracked, event, tracker.other)
+            frame.tracking = Tracking(tracked, event, other)
         if tracker.mixture_contact is not None:
             frame.contact = tracker.mixture_contact
             frame.flags = reading.flags + self._mixture_validity.flags(frame.contact)
@@ -249,8 +257,9 @@ class ChargeScaleStage(ContactStage):
     def _shift(self, frame: ContactFrame, contact: Contact) -> tuple[float, float, float] | None:
         """Return the changes of x and y (mm) and of the force (N) that one standard deviation of the scale causes.
 
-        For a contact of the mixture, only the force is assumed to depend on the scale. The largest exponent is used for
-        this dependence.
+        The changes are computed from a second prediction with slightly larger charges. This is not possible for a
+        contact of the mixture, which the model does not predict. For such a contact, only the force is assumed to
+        depend on the scale: F is proportional to scale^p with the largest exponent p, so that dF = p F d(scale).
 
         Args:
             frame: The frame.
@@ -259,16 +268,17 @@ class ChargeScaleStage(ContactStage):
         Returns:
             The changes; None if the scale is known exactly.
         """
-        charge_scale_std = frame.reading.charge_scale_std
-        charge_pC = frame.model_charge_pC
+        charge_scale_std = frame.reading.charge_scale_std  # relative standard deviation of the scale
         if frame.is_mixture_contact:
             return 0.0, 0.0, LARGEST_FORCE_EXPONENT * charge_scale_std * contact.force_N
+        charge_pC = frame.model_charge_pC
         if charge_scale_std <= 0.0 or charge_pC is None:
             return None
         predictor = self._model.predictor
         if predictor is not self._sensitivity_predictor:  # the sensitivity was computed with another model
             self.reset()
         scaled_pC = charge_pC * (1.0 + CHARGE_SCALE_STEP)
+        # The second prediction is only made if the contact has moved since the previous one.
         return self._sensitivity.shift(contact, charge_scale_std, lambda: predictor.predict(scaled_pC))
 
 
@@ -308,7 +318,8 @@ class TouchOffsetStage(ContactStage):
     def step(self, frame: ContactFrame) -> None:
         """Add the error of the common offset to the standard deviations of the contact and of the tracked contact.
 
-        The contact of a mixture is not changed.
+        The error is computed from a second prediction with charges that are shifted by an offset. A contact of the
+        mixture is not changed, because the model does not predict it.
         """
         charge_pC = frame.model_charge_pC
         contact = frame.contact
@@ -318,6 +329,7 @@ class TouchOffsetStage(ContactStage):
         if predictor is not self._sensitivity_predictor:  # the sensitivity was computed with another model
             self.reset()
         shifted_pC = charge_pC + TOUCH_OFFSET_STEP_pC * self._warming_ratio
+        # The second prediction is only made if the contact has moved since the previous one.
         shift = self._sensitivity.shift(contact, self._rule.std_pC, lambda: predictor.predict(shifted_pC))
         _add_error(frame, contact, shift)
 

@@ -78,19 +78,23 @@ class Gain(Rule, frozen=True, kw_only=True):
         Raises:
             WrongKey: For the first key that is missing or wrong.
         """
-        if self.V_per_unit is not None and self.pC_per_unit is not None:
+        has_voltage = self.V_per_unit is not None
+        has_capacitance = self.feedback_pF is not None
+        if has_voltage and self.pC_per_unit is not None:
             raise WrongKey("V_per_unit", "either pC_per_unit, or V_per_unit and feedback_pF", self.V_per_unit)
-        if self.V_per_unit is None and self.feedback_pF is not None:
+        if has_capacitance and not has_voltage:
             raise WrongKey(
                 "feedback_pF", "no capacitance beside pC_per_unit: it belongs to V_per_unit", self.feedback_pF
             )
-        if self.V_per_unit is not None and self.feedback_pF is None:
+        if has_voltage and not has_capacitance:
             raise WrongKey("feedback_pF")
+
+        # `per_unit` is the setting that is given: V_per_unit or pC_per_unit.
         if self.per_unit is None:
             raise WrongKey("pC_per_unit")
         numbers = self.per_unit.values() if isinstance(self.per_unit, dict) else [self.per_unit]
         if 0.0 in numbers:
-            key = "pC_per_unit" if self.V_per_unit is None else "V_per_unit"
+            key = "V_per_unit" if has_voltage else "pC_per_unit"
             raise WrongKey(key, "a finite number that is not 0, or one for each electrode", self.per_unit)
 
     @property
@@ -198,7 +202,10 @@ class Device(DeviceSections, frozen=True):
         return self.frames.parser()
 
     def chain(self, electrodes: tuple[str, ...]) -> Chain:
-        """Return the settings of the signal chain.
+        """Return the settings of the signal chain, with one value for each electrode where the electrodes may differ.
+
+        A section that the device file does not have leaves its settings at None, except for [leak], which then has its
+        defaults.
 
         Args:
             electrodes: Names of the electrodes of the model, in the order of the charges.
@@ -249,6 +256,7 @@ class Device(DeviceSections, frozen=True):
         Raises:
             DeviceError: If all charges are 0, or the setting is for other electrodes.
         """
+        # The section [common_mode] states the charge that each electrode collects if the film warms by 1 K.
         setting = None if self.common_mode is None else self.common_mode.pC_per_K
         charge_pC_per_K = self._for_each_electrode("common_mode.pC_per_K", setting, electrodes)
         if charge_pC_per_K is None:
@@ -333,11 +341,12 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     """
     frames = table.get("frames")
     complete_table = dict(table)
-    if isinstance(frames, Mapping):
+    if isinstance(frames, Mapping):  # `convert` reports an error if it is anything else
         complete_table["frames"] = {"format": "auto", **frames}
-    sections: dict[str, Any] = structs.asdict(convert(complete_table, DeviceSections, where, DeviceError))
+    converted_sections = convert(complete_table, DeviceSections, where, DeviceError)
+    sections: dict[str, Any] = structs.asdict(converted_sections)
     for name, section in sections.items():
-        is_switched_off = isinstance(section, Rule) and not section.on
+        is_switched_off = isinstance(section, Rule) and not section.on  # the section has the setting `on = false`
         if is_switched_off:
             sections[name] = None
     return Device(**sections, table=table, where=where)

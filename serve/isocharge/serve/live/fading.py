@@ -54,11 +54,14 @@ class Fading(NamedTuple):
     def sections(self) -> dict[str, dict[str, float]]:
         """Sections of a device file that correct the decrease, with values of two digits.
 
-        The result is empty if no section corrects it.
+        The section [leak] corrects a leak with the time constant `tau_s`. The section [memory] corrects creep. The
+        result is empty if no section corrects the decrease.
         """
         if self.tau_s is not None:
             return {"leak": {"tau_s": _two_digits(self.tau_s)}}
-        if self.creep is None or not self.creep < MAX_CREEP:
+        if self.creep is None:
+            return {}
+        if self.creep >= MAX_CREEP:  # the section [memory] refuses so large a creep
             return {}
         settings = {"creep": _two_digits(self.creep)}
         if self.thermoelastic:
@@ -104,11 +107,13 @@ class LineFit(NamedTuple):
 def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
     """Determine the law by which the charges of a press with a constant force decrease.
 
-    Three laws are fitted and compared by their residuals. With a leak, ln Q falls linearly with time. With creep, ln Q
-    falls linearly with the logarithm of time. The third law is creep with a thermoelastic step.
+    Three laws are fitted to the mean magnitude Q of the charges, and compared by their squared residuals. With a leak,
+    ln Q falls linearly with time. With creep, ln Q falls linearly with the logarithm of time. The third law is creep
+    with a thermoelastic step, which decays exponentially.
 
     Args:
-        sizes: Times since the touch, s, and mean magnitudes of the charges at these times, positive, pC.
+        sizes: Pairs (t, Q) of a time since the touch, s, and the mean magnitude of the charges at this time, positive,
+            pC.
 
     Returns:
         The law with its parameters. The parameters have their defaults if there are too few times, if the charges do
@@ -120,9 +125,10 @@ def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
     log_size = np.log(size_pC)
     leak_fit = _fit_line(held_s, log_size)
     creep_fit = _fit_line(np.log(held_s), log_size)
-    if max(leak_fit.slope, creep_fit.slope) >= 0.0:
+    if max(leak_fit.slope, creep_fit.slope) >= 0.0:  # the charges do not decrease
         return Fading()
-    if creep_fit.squared_residual > MIN_RESIDUAL_RATIO * leak_fit.squared_residual:
+    is_leak_clearly_better = creep_fit.squared_residual > MIN_RESIDUAL_RATIO * leak_fit.squared_residual
+    if is_leak_clearly_better:
         return Fading(tau_s=-1.0 / leak_fit.slope)
 
     # Creep with a step is tested before creep alone, and is only reported if it fits clearly better than both lines.
@@ -130,7 +136,8 @@ def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
     creep_and_step = _fit_creep_and_step(held_s, size_pC, max_squared_residual)
     if creep_and_step is not None:
         return creep_and_step
-    if leak_fit.squared_residual > MIN_RESIDUAL_RATIO * creep_fit.squared_residual:
+    is_creep_clearly_better = leak_fit.squared_residual > MIN_RESIDUAL_RATIO * creep_fit.squared_residual
+    if is_creep_clearly_better:
         log_change_per_decade = creep_fit.slope * np.log(10.0)
         return Fading(creep=-float(np.expm1(log_change_per_decade)))
     return Fading()
@@ -138,6 +145,10 @@ def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
 
 def _fit_creep_and_step(held_s: Array, size_pC: Array, max_squared_residual: float) -> Fading | None:
     """Fit creep with a thermoelastic step: Q = level - creep * log10(t) + step * exp(-t / warmth_s).
+
+    The time constant warmth_s, with which the film takes the temperature of the air, has its default. The three other
+    parameters are then coefficients of a linear least-squares problem. They are physical if the shares creep / level
+    and step / level lie between 0 and 1.
 
     Args:
         held_s: Times since the touch, shape (n,), s.
@@ -167,10 +178,10 @@ def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
     """Return the end of a sentence that states the possible cause of a decrease and gives advice to the user.
 
     Args:
-        sizes: Times since the touch, s, and mean magnitudes of the charges at these times, positive, pC.
+        sizes: Pairs of a time since the touch, s, and the mean magnitude of the charges at this time, positive, pC.
     """
     law = law_of_fading(sizes)
-    if law.tau_s is not None:
+    if law.tau_s is not None:  # a leak
         return f"or the amplifier leaks: then put {law.settings} into a device file"
     if law.creep is not None:
         return (
@@ -182,6 +193,8 @@ def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
 
 def _fit_line(x: Array, y: Array) -> LineFit:
     """Fit a straight line to points by least squares.
+
+    The slope is sum((x - mean(x)) * (y - mean(y))) / sum((x - mean(x))^2). The line passes through the mean point.
 
     Args:
         x: First coordinates of the points, shape (n,).

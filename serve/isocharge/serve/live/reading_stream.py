@@ -83,15 +83,16 @@ class ChannelPicker:
         """
         if self._channels:
             return tuple(self._position(electrode, frame) for electrode in self._electrodes)
-        positions = {electrode_of(name): position for position, name in enumerate(frame.names)}
-        if set(self._electrodes) <= set(positions):
-            return tuple(positions[name] for name in self._electrodes)
+        position_of_electrode = {electrode_of(name): position for position, name in enumerate(frame.names)}
+        if position_of_electrode.keys() >= set(self._electrodes):
+            return tuple(position_of_electrode[electrode] for electrode in self._electrodes)
         if len(frame.values) == len(self._electrodes):
             return tuple(range(len(frame.values)))
+        example_keys = ", ".join(f'{electrode} = "..."' for electrode in self._electrodes)
         raise ChargeError(
             f"{self._reader} expects {len(self._electrodes)} charges {self._electrodes}, frame {frame.seq} has "
             f"{len(frame.values)} {channel_names(frame)}; choose the model of this sensor, or say in the device file "
-            "which is which: [channels] " + ", ".join(f'{name} = "..."' for name in self._electrodes)
+            f"which is which: [channels] {example_keys}"
         )
 
     def _position(self, electrode: str, frame: Frame) -> int:
@@ -117,8 +118,9 @@ class ChannelPicker:
 def check_channels(device: Device, electrodes: tuple[str, ...], reader: str) -> None:
     """Check without a frame that the device file assigns a channel to each electrode.
 
-    The channels of described frames are known, and are assigned as in a received frame. The channels of other frames
-    are not known. Each electrode then needs a key in the section `[channels]` if there is such a section.
+    If the device file describes the layout of the frames, their channels are known, and are assigned as in a received
+    frame. Otherwise the channels are not known before the first frame. Each electrode then needs a key in the section
+    `[channels]` if there is such a section.
 
     Args:
         device: Settings of the board.
@@ -130,7 +132,7 @@ def check_channels(device: Device, electrodes: tuple[str, ...], reader: str) -> 
     """
     if isinstance(device.frames, FrameLayout):
         picker = ChannelPicker(electrodes, device.channels, reader, device.where)
-        picker.positions(device.frames.frame_of_zeros())
+        picker.positions(device.frames.frame_of_zeros())  # raises an error if an electrode has no channel
         return
     missing = [name for name in electrodes if name not in device.channels]
     if device.channels and missing:
@@ -214,7 +216,8 @@ class ReadingStream:
             chain: Settings of the signal chain; by default those of the device.
             parser: Parser of the frames; by default that of the device.
             gaps: Counter of missing frame numbers.
-            misfit: Misfit of a model of the film. Only a signal chain that estimates warming needs it.
+            misfit: Function that returns how badly a model explains charges, in standard deviations of the noise. Only
+                a signal chain that estimates warming needs it.
             reader: Reader that expects these electrodes, for messages, such as "model three/1".
 
         Raises:
@@ -229,7 +232,7 @@ class ReadingStream:
         self._picker = ChannelPicker(electrodes, device.channels, reader, device.where)
         self._misfit = misfit
         self._chain = self._new_chain()
-        self._pending_flags: tuple[str, ...] = ()
+        self._pending_flags: tuple[str, ...] = ()  # flags that the next frame gets
 
     @property
     def warming_ratio(self) -> Array | float:
@@ -301,6 +304,7 @@ class ReadingStream:
                 flags=flags,
             )
         except TareError as error:
+            # If the film rests after all, the present values are the offsets of the board.
             value_of_electrode = dict(zip(self._electrodes, values.tolist(), strict=True))
             offsets = ", ".join(f"{name} = {value:.10g}" for name, value in value_of_electrode.items())
             setting = "[gain] offset = {" + offsets + "}"

@@ -119,7 +119,8 @@ class RecordedStream:
                     execute_request = self._requests.popleft()
                     execute_request()
 
-                # The lines of the records are added to the current chunk, which is written after its last record.
+                # The chunk is stored before its records, so that it is also recorded if the caller closes the generator
+                # at a `yield`. The lines of the records are added one by one.
                 lines: list[str] = []
                 self._current_chunk = (chunk, lines)
                 for record in self._stream.feed(chunk):
@@ -128,7 +129,7 @@ class RecordedStream:
                 self._record_chunk()
             self._stream.finish()
         finally:
-            self._record_chunk()
+            self._record_chunk()  # writes the present chunk after an interruption, and nothing otherwise
             self._end_recording()
 
     def _record_chunk(self) -> None:
@@ -143,20 +144,21 @@ class RecordedStream:
         The stream is restarted, so that the records of the recording depend only on the bytes in the recording. If the
         file cannot be created, an error is logged.
         """
-        if not self._next_recorder:  # a later request was executed instead of this one
+        if not self._next_recorder:  # an earlier call has already executed the latest request
             return
         self._end_recording()
         recorder = self._next_recorder.pop()
-        if recorder is not None:
-            try:
-                self.recorder = recorder.__enter__()
-            except IsochargeError as error:
-                log.error("no recording: %s", error)
-                return
-            self._stream.restart()
-            present_label = self.predictor.metadata.label
-            if recorder.model_label != present_label:  # the model has changed since the request
-                recorder.model(present_label)
+        if recorder is None:  # the request was only to end the recording
+            return
+        try:
+            self.recorder = recorder.__enter__()  # opens the file; `_end_recording` closes it
+        except IsochargeError as error:
+            log.error("no recording: %s", error)
+            return
+        self._stream.restart()
+        present_label = self.predictor.metadata.label
+        if recorder.model_label != present_label:  # the model has changed since the request
+            recorder.model(present_label)
 
     def _end_recording(self) -> None:
         """End the present recording. If this object has opened the recording, close it."""
@@ -246,7 +248,7 @@ def replay(
         RecordingError: If a line other than the last one is damaged.
         ModelError: If a model of the recording cannot be loaded.
     """
-    delay_s: float | None = None  # time from the first chunk in the recording to the first chunk of the replay
+    delay_s: float | None = None  # time by which the replay is later than the recording; None before the first chunk
     for event in recording.events():
         match event:
             case Marker():
@@ -254,7 +256,7 @@ def replay(
             case NewModel(label=label):
                 if load is not None:
                     stream.use(load(label))
-            case Back():
+            case Back():  # the followed film was reset to its calibration
                 stream.reset_film()
             case Event(chunk=None):  # a new tare was requested
                 clock.set(event)
@@ -266,7 +268,9 @@ def replay(
                 if real_time:
                     due_s = chunk.timestamp + delay_s
                     time.sleep(max(0.0, due_s - time.time()))
-                used_count = len(latencies_us)  # a recording has one latency for each record that was used
+                # The consumer of the records may have stopped before the last record of a chunk. The recording has one
+                # latency for each record that was used.
+                used_count = len(latencies_us)
                 for index, record in enumerate(stream.feed(chunk)):
                     if index < used_count:
                         yield record

@@ -147,7 +147,7 @@ class PressWatch:
     """Finds one steady press in each touch. An object belongs to one thread."""
 
     def __init__(self, electrodes: tuple[str, ...], rule: SteadyRule | None = None) -> None:
-        """Begin to wait for a tare.
+        """Begin to wait for a tare, which is the charge of the untouched film.
 
         Args:
             electrodes: Names of the electrodes, which appear in the reasons.
@@ -177,6 +177,9 @@ class PressWatch:
     def feed(self, timed: TimedReading) -> WatchResult:
         """Process the next reading, and return the state of the press.
 
+        The phases follow each other: `taring` until the charge of the untouched film has been measured, `waiting` for
+        a touch, `settling` until the press is steady or refused, and `lift` until the finger leaves the film.
+
         Args:
             timed: The reading with its time.
 
@@ -189,7 +192,7 @@ class PressWatch:
             self._rest.clear()
             return self._refuse(PORT_LOST, Phase.taring)
         if reading.charge_pC is None:  # there is no tare yet, or the frame is invalid
-            if TARE in reading.flags:
+            if TARE in reading.flags:  # the tare is being measured
                 self._phase = Phase.taring
             return WatchResult(self._phase)
         if not reading.contact:
@@ -213,7 +216,7 @@ class PressWatch:
             t_s: Time of the frame, s.
         """
         rule = self._rule
-        held_s = self._end_s - self._begin_s
+        held_s = self._end_s - self._begin_s  # duration of the previous press
         is_press_unfinished = self._phase is Phase.settling
         self._phase = Phase.waiting
 
@@ -293,8 +296,9 @@ class PressWatch:
     def _steady_press(self, reading: Reading) -> SteadyPress | None:
         """Return the press in the window if it is steady; otherwise store the reason and return None.
 
-        A window with a much larger scatter than earlier windows contains a sudden movement. The sizes of such windows
-        are not used to determine the law of a decrease, and their reasons are not stored.
+        A window is calm if it contains no sudden movement. Its scatter is then not much larger than that of the calmest
+        window so far. The mean charge of a calm window is stored, from which the law of a slow decrease is determined
+        later. If a window is not calm, its mean charge and its reason are not stored.
 
         Args:
             reading: The latest frame, which has the noise of the charges at rest.
@@ -306,8 +310,9 @@ class PressWatch:
         # The first window of a press contains its beginning, during which the force may still rise.
         is_after_first_window = press.held_s >= 2.0 * press.window_s
         if is_calm and is_after_first_window:
-            middle_s = press.held_s - 0.5 * press.window_s
-            self._sizes.append((middle_s, float(np.abs(press.charge_pC).mean())))
+            middle_s = press.held_s - 0.5 * press.window_s  # time from the touch to the middle of the window
+            mean_size_pC = float(np.abs(press.charge_pC).mean())
+            self._sizes.append((middle_s, mean_size_pC))
 
         noise_pC = np.zeros_like(press.charge_pC)
         if reading.tare is not None:
@@ -373,8 +378,10 @@ def unsteadiness(
         press: A window of the press.
         noise_pC: Standard deviation of each charge at rest, shape (n_electrode,), pC.
         electrodes: Names of the electrodes, which appear in the reason.
-        sizes: Time since the touch, s, and mean magnitude of the charges, pC, of each window so far.
+        sizes: Time since the touch, s, and mean magnitude of the charges, pC, of each window so far. They are used to
+            state the cause of a decrease.
     """
+    # The charges scatter because of the noise at rest, and because a hand varies its force.
     mean_size_pC = float(np.abs(press.charge_pC).mean())
     expected_scatter_pC = np.hypot(noise_pC, rule.relative_noise * mean_size_pC)
     relative_scatter = press.scatter_pC / expected_scatter_pC
@@ -394,10 +401,11 @@ def unsteadiness(
 def _drift_reason(press: SteadyPress, sizes: Sequence[tuple[float, float]]) -> str:
     """Return the reason for a drift of the charges, as a part of a sentence.
 
-    The force changes if all charges change in proportion; otherwise the position changes.
+    The force changes if all charges change in proportion, so that their relative slopes are equal. Otherwise the
+    position changes.
 
     Args:
-        press: A window of the press.
+        press: A window of the press. `drift_pC` is the change of each charge over the window.
         sizes: Time since the touch, s, and mean magnitude of the charges, pC, of each window so far.
     """
     charge_size_pC = np.maximum(np.abs(press.charge_pC), MIN_CHARGE_pC)

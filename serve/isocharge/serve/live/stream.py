@@ -163,7 +163,7 @@ class TouchStream:
         self._tracker = None
         if device.track is not None:
             self._tracker = Tracker(device.track)
-        self._before_restart = StreamTotals()
+        self._before_restart = StreamTotals()  # counts of the time before the latest `restart`
         self._policy = policy
         self._now_ns = now_ns
         self._given_name = frame_id
@@ -291,7 +291,9 @@ class TouchStream:
             self.counts.outages += 1
             self._discard_contact()
         frames = self._readings.frames(chunk)
-        skipped_flags: set[str] = set()  # flags of frames without a record; the lasting flags are passed on
+        # The policy `latest` gives a record only to the last frame of a chunk. The signal chain needs all frames. The
+        # flags of skipped frames are collected, because some of them also matter for the frame with the record.
+        skipped_flags: set[str] = set()
         for number, frame in enumerate(frames, start=1):
             timed = self._readings.advance(frame, chunk)
             is_last = number == len(frames)

@@ -75,7 +75,8 @@ class ChargeSeries:
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute the charges of contacts and their derivatives.
 
-        Outside the range of forces, ln Q is extrapolated linearly in ln F.
+        The series gives ln Q as a function of coordinates between -1 and 1, to which the contact is converted. Outside
+        the range of forces, ln Q is extrapolated linearly in ln F, with the slope at the end of the range.
 
         Args:
             contact: Contacts (x, y, ln F), shape (n, 3), with x and y in mm and F in N.
@@ -84,7 +85,7 @@ class ChargeSeries:
             Charges, shape (n, n_electrode), pC. Derivatives of the charges with respect to x and y (pC/mm) and ln F
             (pC), shape (n, n_electrode, 3).
         """
-        # The series is a function of coordinates between -1 and 1.
+        # Coordinates of the series
         min_log_force, max_log_force = np.log(self.force_N)
         centre = np.array([0.0, 0.0, 0.5 * (min_log_force + max_log_force)])
         scale = np.array([self.radius_mm, self.radius_mm, 0.5 * (max_log_force - min_log_force)])
@@ -94,14 +95,15 @@ class ChargeSeries:
         values = self.series.values(unit_contact)
         log_charge = values[:, 0]
         log_slopes = values[:, 1:]  # shape (n, 3, n_electrode)
-        log_force_slope = log_slopes[:, -1]
+        log_force_slope = log_slopes[:, -1]  # with respect to the coordinate of the force
 
-        unit_force = unit_contact[:, 2:]
+        unit_force = unit_contact[:, 2:]  # shape (n, 1)
         distance_from_range = unit_force - np.clip(unit_force, -1.0, 1.0)  # 0 within the range of forces
         charge_pC = np.exp(log_charge + distance_from_range * log_force_slope)
 
         # dQ = Q d(ln Q). The division by the scale converts the derivatives to the units of the contact.
-        jacobian = charge_pC[:, :, None] * log_slopes.swapaxes(1, 2) / scale
+        electrode_slopes = log_slopes.swapaxes(1, 2)  # shape (n, n_electrode, 3)
+        jacobian = charge_pC[:, :, None] * electrode_slopes / scale
         return charge_pC, jacobian
 
     def to_bytes(self) -> bytes:
@@ -134,7 +136,10 @@ def read_charges(version_folder: Path, n_electrode: int) -> ChargeSeries | None:
 
 
 def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> ChargeSeries:
-    """Create the series of the charges from the arrays of a file, and check it.
+    """Create the series of ln Q from the arrays of a file, and check it.
+
+    The charge Q of each electrode is given by a Chebyshev series in x, y and the logarithm of the force. The series has
+    degree + 1 coefficients along each of these axes.
 
     Args:
         arrays: Arrays of the file by name.
@@ -188,21 +193,23 @@ def read_contact_range(arrays: Mapping[str, np.ndarray]) -> tuple[float, tuple[f
 def _check_charges(charges: ChargeSeries) -> None:
     """Check the charges of some contacts.
 
-    The contacts lie on a circle with half of the radius, and have several forces.
+    The contacts lie on a circle with half of the radius of the series. Every contact of the circle has several forces.
 
     Raises:
         ValueError: If the charges overflow, or do not depend on the position or on the force.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, N_CHECKED_DIRECTIONS, endpoint=False)
-    log_forces = np.log(np.geomspace(*charges.force_N, N_CHECKED_FORCES))
     positions_mm = 0.5 * charges.radius_mm * np.column_stack([np.cos(angle), np.sin(angle)])
+    min_force_N, max_force_N = charges.force_N
+    log_forces = np.log(np.geomspace(min_force_N, max_force_N, N_CHECKED_FORCES))
     contacts = np.array([[x_mm, y_mm, log_force] for x_mm, y_mm in positions_mm for log_force in log_forces])
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # charges that overflow are reported below
         charge_pC, derivative = charges.linearised(contacts)
 
     is_finite = np.isfinite(charge_pC).all() and np.isfinite(derivative).all()
     if not (is_finite and (charge_pC > 0.0).all()):
         raise ValueError("series: expected charges that are finite and positive for every contact")
-    largest_slopes = np.abs(derivative).max(axis=(0, 1))  # with respect to x, y and ln F, shape (3,)
+    # The largest derivative of any contact and electrode with respect to x, y and ln F, shape (3,)
+    largest_slopes = np.abs(derivative).max(axis=(0, 1))
     if not (largest_slopes > 0.0).all():
         raise ValueError("series: expected charges that change with x, y and the force")

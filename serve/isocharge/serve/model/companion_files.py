@@ -16,7 +16,9 @@ log = logging.getLogger(__name__)
 
 
 def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
-    """Read a companion file from the folder of a `model.onnx`.
+    """Read a companion file from the folder of a `model.onnx`, and compare it with its checksum in `golden.json`.
+
+    A folder of an earlier version has no checksums of companion files. The file is then read without a comparison.
 
     Args:
         version_folder: The folder that holds `model.onnx`.
@@ -32,7 +34,9 @@ def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
     path = version_folder / name
     data = read_needed(path, ModelError, advice)
     golden_path = version_folder / "golden.json"
-    checksums = read_golden(golden_path).companion_sha256 if golden_path.exists() else None
+    checksums = None
+    if golden_path.exists():
+        checksums = read_golden(golden_path).companion_sha256
     if checksums is None:
         log.warning("%s: golden.json holds no checksum of this file; whether it fits model.onnx is not verified", path)
         return data

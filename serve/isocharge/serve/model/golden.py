@@ -46,9 +46,10 @@ REFERENCE_FORCE_N = 2.0
 def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
     """Return the floors of x and y, mm, and of the force, N, for the outputs `contact` and `contact_std` of a model.
 
-    The tolerance of an output is relative to the larger of its absolute value and its floor. The floors of the position
-    grow with the working area and with the position error of the model. The floor of the force grows with the largest
-    force.
+    When outputs are compared, their tolerance is relative to the larger of the absolute value and the floor of the
+    output. The floors of a small film are constants. For larger films, the floors of the position grow with the radius
+    of the working area, or with the position error of the model if this gives larger floors. The floor of the force
+    grows with the largest force.
     """
     x_floor_mm, y_floor_mm, force_floor_N = FLOORS["contact"]
     radius_mm = max(math.hypot(x_mm, y_mm) for x_mm, y_mm in metadata.working_area_mm)
@@ -100,7 +101,7 @@ class Golden:
 def make_golden(
     session: ort.InferenceSession, onnx_model: bytes, charge_pC: Singles, contact_floor: tuple[float, float, float]
 ) -> Golden:
-    """Compute the golden vectors of a new model.
+    """Compute the golden vectors of a new model, which are input charges with the outputs that the model must give.
 
     Args:
         session: Session of the model.
@@ -115,7 +116,7 @@ def make_golden(
     for name, rows in outputs.items():
         bad_rows = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if bad_rows.size:
-            row = bad_rows[0]
+            row = bad_rows[0]  # the message shows the first of them
             raise ModelError(
                 f"the new model: {name}: expected finite outputs, got {rows[row]} for the charges {charge_pC[row]} pC"
             )
@@ -141,7 +142,7 @@ def read_golden(path: Path) -> Golden:
         content = read_json(path, "golden vectors", ModelError, _GoldenFile)
     except ModelError as error:
         raise ModelError(f"{error}; the file is damaged: copy or export the model again") from error
-    # The correlations are an output of newer models only.
+    # An output that the model does not have, such as the correlations of an older model, is None in the file.
     present_outputs = [name for name in OUTPUTS if getattr(content.outputs, name) is not None]
     return Golden(
         sha256=content.sha256,
@@ -227,6 +228,7 @@ def check_outputs(golden: Golden, outputs: dict[str, Singles], where: str) -> No
     """
     for name, expected in golden.outputs.items():
         actual = outputs[name].astype(np.float64)
+        # Below its floor, a value has a constant tolerance, because a relative tolerance would approach 0.
         tolerance = golden.relative * np.maximum(np.abs(expected), golden.floors[name])
         with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 with a tolerance of 0 is reported as a difference
             ratio = np.abs(actual - expected) / tolerance  # shape (n, width)

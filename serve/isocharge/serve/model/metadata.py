@@ -171,8 +171,8 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
             raise WrongKey("sensor.name", "a text", sensor_name)
         if len(set(self.electrodes)) < len(self.electrodes):
             raise WrongKey("electrodes", "names that differ", self.electrodes)
-        displayed = {"electrodes": self.electrodes, "probes": self.probes, "sensor.name": (sensor_name,)}
-        for key, texts in displayed.items():
+        displayed_texts = {"electrodes": self.electrodes, "probes": self.probes, "sensor.name": (sensor_name,)}
+        for key, texts in displayed_texts.items():
             if not all(is_printable(text) for text in texts):
                 raise WrongKey(key, "printable characters", texts)
         min_force_N, max_force_N = self.force_range_N
@@ -180,6 +180,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
             raise WrongKey("force_range_N", "a smaller and a larger number", [min_force_N, max_force_N])
         noise_levels = {"white_pC": self.noise.white_pC, "gain": self.noise.gain}
         for key, level in noise_levels.items():
+            # A level is one number for all electrodes, or a tuple with one number for each electrode.
             if isinstance(level, tuple) and len(level) != len(self.electrodes):
                 raise WrongKey(f"noise.{key}", f"one number for each of {len(self.electrodes)} electrodes", level)
 
@@ -204,7 +205,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
 
     @classmethod
     def from_props(cls, props: Mapping[str, str], where: str) -> "ModelMetadata":
-        """Read ONNX `metadata_props`.
+        """Read ONNX `metadata_props`, a table of texts in the file of a model.
 
         Args:
             props: Value of each field as JSON. Other keys are ignored.
@@ -215,9 +216,9 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         """
         place = f"{where}: metadata"
         try:
-            # The version is read first, because other versions may have other keys.
             names = [name for name in cls.__struct_fields__ if name in props]
             values = {name: parse_json(props[name], f"{place}: {name}", ModelError, object) for name in names}
+            # The version is checked before the other keys, because other versions may have other keys.
             version = convert(values, _Version, place, ModelError).format_version
             if version == FORMAT_VERSION:
                 return convert(values, cls, place, ModelError)

@@ -63,7 +63,7 @@ def find_model(model: str | Path, models: Path | None = None) -> Path:
         candidates += [root / model for root in roots]
     candidates.append(Path(model))
     for candidate in candidates:
-        folder = _version_folder(candidate)
+        folder = _version_folder(candidate)  # None if there is no model at this place
         if folder is not None:
             return folder
     raise ModelError(_not_found_message(model, roots, is_path))
@@ -141,7 +141,9 @@ def _version_folder(path: Path) -> Path | None:
     if (path / "model.onnx").is_file():
         return path
     versions = _versions(path)
-    return path / str(max(versions)) if versions else None
+    if not versions:
+        return None
+    return path / str(max(versions))
 
 
 def version_folders(folder: Path) -> dict[int, Path]:
@@ -333,7 +335,7 @@ def write_model(
     companion_sha256 = {name: sha256_of(content) for name, content in companion_files.items()}
     golden = replace(golden_of_model, companion_sha256=companion_sha256)
 
-    # Write the version under a temporary name, which is changed only if a reader would accept the version.
+    # Write the version under a temporary name. `new_folder` renames it to `target` after the check has succeeded.
     with new_folder(target) as draft:
         write_whole(draft / "model.onnx", onnx_model)
         write_whole(draft / "golden.json", golden.to_json().encode())
@@ -358,8 +360,8 @@ def _write_triton_config(path: Path, metadata: ModelMetadata, *, has_correlation
     """
     n_electrode = len(metadata.electrodes)
     config_without_correlation = triton_config(metadata.name, n_electrode, correlation=False)
-    older_lacks_correlation = path.exists() and path.read_text(encoding="utf-8") == config_without_correlation
-    lists_correlation = has_correlation and not older_lacks_correlation
+    is_older_without_correlation = path.exists() and path.read_text(encoding="utf-8") == config_without_correlation
+    lists_correlation = has_correlation and not is_older_without_correlation
     config = triton_config(metadata.name, n_electrode, correlation=lists_correlation)
     write_whole(path, config.encode())
 
@@ -402,11 +404,12 @@ def _check_triton_config(path: Path, name: str, electrodes: tuple[str, ...]) -> 
     """
     if not path.exists():
         return
+    # The text of the file is determined by the name, the number of electrodes, and whether there are correlations.
     text = path.read_text(encoding="utf-8")
     valid_texts = [triton_config(name, len(electrodes), correlation=correlation) for correlation in (False, True)]
     if text in valid_texts:
         return
-    match = re.match('name: "(.*)"', text)
+    match = re.match('name: "(.*)"', text)  # the first line of the file
     if match and match[1] != name:
         raise ModelError(
             f"{path}: names the model {match[1]!r}, its folder is {name!r}: was it copied or renamed? Give it "
@@ -418,9 +421,9 @@ def _check_triton_config(path: Path, name: str, electrodes: tuple[str, ...]) -> 
 
 
 def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
-    """Check a new version in the same way as when it is read.
+    """Check the files of a new version in the same way as when a model is read.
 
-    The metadata of the version are also compared with the expected metadata.
+    The metadata in its `model.onnx` are also compared with the expected metadata.
 
     Args:
         draft: Folder with the files of the new version.

@@ -98,10 +98,10 @@ class Pretensions:
         """Return the content of the file `pretensions.npz`.
 
         The file contains the pretensions, the typical charges and the weights as arrays. A JSON object with the name
-        `about` contains all other numbers.
+        `about` contains all other numbers, and the names of the weights in the order of the layers.
         """
         numbers = {name: getattr(self, name) for name in _NUMBERS}
-        constant_names = list(self.weights)
+        constant_names = list(self.weights)  # the weights are constants of the graph
         about = json.dumps({"format_version": FORMAT, "constants": constant_names, **numbers}, allow_nan=False)
         arrays: dict[str, Any] = {"node_MPa": self.node_MPa, "typical_pC": self.typical_pC, **self.weights}
         file = io.BytesIO()
@@ -142,9 +142,12 @@ class Pretensions:
             Weights, shape (n, k), dimensionless. Each row sums to 1.
         """
         is_other_node = ~np.eye(self.node_MPa.size, dtype=bool)  # shape (k, k), False where i equals j
-        node_difference_MPa = self.node_MPa[:, None] - self.node_MPa  # shape (k, k)
-        difference_MPa = pretension_MPa[:, None, None] - self.node_MPa  # shape (n, 1, k)
-        factors = difference_MPa / np.where(is_other_node, node_difference_MPa, 1.0)  # shape (n, k, k)
+        node_difference_MPa = self.node_MPa[:, None] - self.node_MPa  # p_i - p_j, shape (k, k)
+        difference_MPa = pretension_MPa[:, None, None] - self.node_MPa  # p - p_j, shape (n, 1, k)
+
+        # The factors with i equal to j are no part of the product. Their denominator is replaced, because it is 0.
+        denominator_MPa = np.where(is_other_node, node_difference_MPa, 1.0)
+        factors = difference_MPa / denominator_MPa  # shape (n, k nodes i, k nodes j)
         return np.asarray(np.prod(factors, axis=2, where=is_other_node))
 
     def at(self, node_MPa: Array) -> "Pretensions":
@@ -178,8 +181,9 @@ class Pretensions:
     def vectors(self, charge_pC: Array, pretension_MPa: Array) -> Array:
         """Compute the misfit vectors of presses at several pretensions. The length of a misfit vector is the misfit.
 
-        The vectors are interpolated linearly between the pretensions of `node_MPa`, which must therefore be close to
-        each other. The method `at` returns a network whose pretensions are close to each other.
+        The network computes a vector u for each pretension of `node_MPa`. The vector u is interpolated linearly between
+        these pretensions, which must therefore be close to each other; the method `at` returns such a network. The
+        misfit vector has the direction of u and the length misfit_unit * sinh(|u|).
 
         Args:
             charge_pC: Charges of m presses, shape (m, n_electrode), pC.
@@ -189,19 +193,19 @@ class Pretensions:
             Misfit vectors, shape (m, n, n_electrode), in standard deviations of the noise.
         """
         inputs = self.features.evaluate(charge_pC).astype(np.float32)
-        # The last outputs of the network are the misfit vectors, shape (k pretensions, m presses, n_electrode).
+        # The last outputs of the network are the vectors u, shape (k pretensions, m presses, n_electrode).
         outputs = evaluate(self.perceptron, inputs)
         n_electrode = inputs.shape[1]
         node_vectors = outputs[..., -n_electrode:]
 
-        # The two neighbouring pretensions of `node_MPa`, and the position between them from 0 to 1.
+        # Indices of the two neighbouring pretensions of `node_MPa`, and the position between them from 0 to 1.
         upper = np.clip(np.searchsorted(self.node_MPa, pretension_MPa), 1, self.node_MPa.size - 1)
         lower = upper - 1
         gap_MPa = self.node_MPa[upper] - self.node_MPa[lower]
         fraction = np.clip((pretension_MPa - self.node_MPa[lower]) / gap_MPa, 0.0, 1.0)[:, None, None]
         interpolated = (1.0 - fraction) * node_vectors[lower] + fraction * node_vectors[upper]
 
-        # The misfit is misfit_unit * sinh(length); the direction of the vector stays the same.
+        # Change the length from |u| to the misfit. A smallest length prevents a division by 0.
         length = np.maximum(np.linalg.norm(interpolated, axis=2, keepdims=True), MIN_LENGTH)
         vectors = interpolated * (self.misfit_unit * np.sinh(length) / length)
         return np.asarray(vectors.swapaxes(0, 1))
@@ -244,7 +248,7 @@ def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
     """Create the network from the arrays of a file, and check it.
 
     Args:
-        arrays: Arrays of the file by name.
+        arrays: Arrays of the file by name. The array `about` is a text, a JSON object with all single numbers.
 
     Raises:
         ValueError: If an array is missing or not valid, or the arrays do not fit together.
@@ -266,8 +270,7 @@ def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
         )
     numbers = {name: getattr(about, name) for name in _NUMBERS}
     weight_names = _checked_weights(arrays, about, node_MPa.size)
-    with np.errstate(over="ignore"):
-        weights = {name: arrays[name].astype(np.float32) for name in weight_names}
+    weights = {name: arrays[name].astype(np.float32) for name in weight_names}
     pretensions = Pretensions(node_MPa=node_MPa, typical_pC=typical_pC, weights=weights, **numbers)
     _check_misfits(pretensions)
     return pretensions
@@ -275,11 +278,13 @@ def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
 
 def _check_misfits(pretensions: Pretensions) -> None:
     """Raise ValueError if the network computes misfits that are not finite at pretensions within its range."""
-    checked_MPa = np.linspace(*pretensions.range_MPa, CHECKED_PRETENSIONS)
-    with np.errstate(over="ignore", invalid="ignore"):
-        charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)  # a weak, a typical and a strong press
-        misfits = pretensions.at(checked_MPa).vectors(charges_pC, checked_MPa)
-    if not np.isfinite(misfits).all():
+    min_MPa, max_MPa = pretensions.range_MPa
+    checked_MPa = np.linspace(min_MPa, max_MPa, CHECKED_PRETENSIONS)
+    charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)  # a weak, a typical and a strong press
+    with np.errstate(over="ignore", invalid="ignore"):  # results that overflow are reported below
+        interpolated_network = pretensions.at(checked_MPa)
+        misfit_vectors = interpolated_network.vectors(charges_pC, checked_MPa)
+    if not np.isfinite(misfit_vectors).all():
         raise ValueError("the weights give misfits that are not finite")
 
 
@@ -305,9 +310,10 @@ def _check_nodes(node_MPa: Array, calibrated_MPa: float) -> None:
 def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: int) -> list[str]:
     """Check the shapes of the weights, and return their names in the order of the layers.
 
-    The names of the hidden layers are pairs: the weight and the bias of each layer. The last three names are those of
-    the skip layer, of the bias of the output layer, and of the weight of the output layer. The skip layer connects the
-    inputs with the outputs.
+    The list `about.constants` contains the names. The names of the hidden layers are pairs: the weight and the bias of
+    each layer. The last three names are those of the skip layer, which connects the inputs with the outputs directly,
+    of the bias of the output layer, and of the weight of the output layer. The first axis of each array is the
+    pretension.
 
     Args:
         arrays: Arrays of the file by name.
@@ -317,14 +323,19 @@ def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: in
     Raises:
         ValueError: If an array is missing, or the shapes do not fit together.
     """
-    *hidden_names, skip_weight, output_bias, output_weight = about.constants
-    if len(hidden_names) % 2 or len(set(about.constants)) < len(about.constants):
-        raise ValueError(f"constants: expected pairs of names that differ, got {cut(str(about.constants))}")
+    weight_names = about.constants
+    *hidden_names, skip_weight, output_bias, output_weight = weight_names
+    has_pairs = len(hidden_names) % 2 == 0
+    has_equal_names = len(set(weight_names)) < len(weight_names)
+    if has_equal_names or not has_pairs:
+        raise ValueError(f"constants: expected pairs of names that differ, got {cut(str(weight_names))}")
     n_electrode = finite_array(arrays, "typical_pC", (None,)).size
 
     # The inputs of the first layer are the charges. The inputs of each later layer are the neurons of the layer before.
     n_input = n_electrode
-    for weight, bias in zip(hidden_names[::2], hidden_names[1::2], strict=True):
+    hidden_weights = hidden_names[::2]
+    hidden_biases = hidden_names[1::2]
+    for weight, bias in zip(hidden_weights, hidden_biases, strict=True):
         n_neuron = finite_array(arrays, weight, (n_node, n_input, None)).shape[2]
         finite_array(arrays, bias, (n_node, n_neuron))
         n_input = n_neuron
@@ -334,8 +345,8 @@ def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: in
     finite_array(arrays, skip_weight, (n_node, n_electrode, n_output))
     if n_output < n_electrode:
         raise ValueError(f"{output_weight}: expected at least {n_electrode} outputs, got {n_output}")
-    for name in about.constants:
+    for name in weight_names:
         largest = np.abs(arrays[name].astype(float)).max()
         if largest > MAX_WEIGHT:
             raise ValueError(f"{name}: expected weights up to {MAX_WEIGHT:g}, got {largest:g}")
-    return about.constants
+    return weight_names

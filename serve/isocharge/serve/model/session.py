@@ -64,6 +64,7 @@ def open_session(
     """
     options = _single_thread_options()
     try:
+        # onnxruntime calls the constants of a graph initializers.
         initializers = {name: ort.OrtValue.ortvalue_from_numpy(values) for name, values in constants.items()}
         for name, initializer in initializers.items():
             options.add_initializer(name, initializer)
@@ -218,7 +219,7 @@ class BoundPress:
             electrodes: Number of electrodes.
         """
         charges = np.zeros((1, electrodes), dtype=np.float32)
-        self.columns = _columns(output_widths(session))
+        self.columns = _columns(output_widths(session))  # slice of each output, by the name of the output
         self.size = max(columns.stop for columns in self.columns.values())
         outputs = np.zeros(self.size, dtype=np.float32)
         # The session holds only the addresses of the arrays. The views in `write` and `read` keep the arrays alive.
@@ -247,7 +248,7 @@ class BoundPress:
                 shape of the bound memory. Nothing is written into `out` in this case.
         """
         self._charge_view[:] = charge_pC
-        self.run()
+        self.run()  # reads the charges from their memory, and writes the outputs into the memory of `_output_view`
         target: Any = out.data
         if len(target) == N_WITHOUT_CORRELATION:
             target[:] = self._output_view_without_correlation
@@ -331,8 +332,8 @@ def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
     charges = _as_numbers(charge_pC, electrodes)
     if charges.shape != (len(electrodes),):
         raise ChargeError(f"expected {_expected_charges(electrodes)}, got an array of shape {charges.shape}")
-    batch = as_float32(charges[np.newaxis], electrodes, is_single_press=True)
-    return np.asarray(batch[0])
+    batch_of_one = as_float32(charges[np.newaxis], electrodes, is_single_press=True)
+    return np.asarray(batch_of_one[0])
 
 
 def as_batch(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
@@ -369,7 +370,7 @@ def _as_numbers(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> NDArray[np
         charges = np.asarray(charge_pC)
     except ValueError as error:  # rows of different lengths
         raise ChargeError(f"expected {expected} in each row, got {charge_pC!r:.200} ({error})") from error
-    if charges.dtype.kind not in "fiu":
+    if charges.dtype.kind not in "fiu":  # neither floats nor signed or unsigned integers
         raise ChargeError(f"expected {expected} as numbers (pC), got {charge_pC!r:.200}")
     return charges
 
@@ -387,7 +388,8 @@ def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...], *, is_single_
     """
     if charges.dtype.kind == "f":
         flat = charges.ravel()
-        # The sum of the squares is not finite if a charge is not finite. It is faster than a check of each charge.
+        # If the sum of the squares is not too large, all charges are finite and in the range of float32. One sum is
+        # faster than a check of each charge.
         square_sum_pC2 = np.vdot(flat, flat)
         if square_sum_pC2 <= MAX_FAST_SQUARE_SUM_pC2:
             return np.ascontiguousarray(charges, dtype=np.float32)

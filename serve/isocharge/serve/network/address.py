@@ -47,7 +47,7 @@ class Address:
         return self.uds is not None or self.host == "localhost" or (address is not None and address.is_loopback)
 
     def listen(self, backlog: int) -> socket.socket:
-        """Open a socket that listens on this address, and return it.
+        """Open a Unix or TCP socket that listens on this address, and return it.
 
         Args:
             backlog: Largest number of connections that wait to be accepted.
@@ -59,11 +59,12 @@ class Address:
             if self.uds is not None:
                 return _listen_unix(self.uds, backlog)
             # create_server sets SO_REUSEADDR, so that a port can be used again right after a server was killed.
-            family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
+            is_ipv6 = ":" in self.host
+            family = socket.AF_INET6 if is_ipv6 else socket.AF_INET
             return socket.create_server((self.host, self.port), family=family, backlog=backlog)
-        except ListenError:
+        except ListenError:  # from _listen_unix; its message already states what to do
             raise
-        except (OSError, UnicodeError) as error:
+        except (OSError, UnicodeError) as error:  # a host name that cannot be encoded causes a UnicodeError
             reason = str(error)
             if isinstance(error, OSError) and error.errno in LISTEN_ERRORS:
                 reason = LISTEN_ERRORS[error.errno]
@@ -86,7 +87,8 @@ class Address:
         if self.uds:
             return f"unix:{self.uds}"
         scheme = "https" if secure else "http"
-        host = f"[{self.host}]" if ":" in self.host else self.host
+        is_ipv6 = ":" in self.host
+        host = f"[{self.host}]" if is_ipv6 else self.host
         _, port, *_ = listening.getsockname()  # the actual port, also if the system has chosen it
         return f"{scheme}://{host}:{port}"
 
@@ -117,7 +119,7 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
         backlog: Largest number of connections that wait to be accepted.
     """
     _remove_stale(path)
-    previous_mask = os.umask(0o177)  # only the owner may read and write the new file
+    previous_mask = os.umask(0o177)  # only the owner may read and write the file that `bind` creates
     listening = socket.socket(socket.AF_UNIX)
     try:
         listening.bind(str(path))
@@ -131,7 +133,7 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove the file of a Unix socket on which no server listens any more.
+    """Remove the file of a Unix socket on which no server listens any more. If there is no file, do nothing.
 
     Raises:
         ListenError: If the path is another kind of file, or a server listens on the socket.
@@ -141,8 +143,8 @@ def _remove_stale(path: Path) -> None:
     if not stat.S_ISSOCK(path.stat().st_mode):
         raise ListenError(f"{path}: expected nothing or a left-over socket, found a file; choose another path")
     with socket.socket(socket.AF_UNIX) as client:
-        connect_error = client.connect_ex(str(path))
-    if connect_error != errno.ECONNREFUSED:  # a connection is refused only if no server listens
+        error_number = client.connect_ex(str(path))  # 0 if a server accepts the connection
+    if error_number != errno.ECONNREFUSED:  # a connection is refused only if no server listens
         raise ListenError(f"{path}: another server listens there; stop it or choose another path")
     path.unlink(missing_ok=True)
 
@@ -165,12 +167,14 @@ class Tls:
         Raises:
             InputError: If a file cannot be read, or certificate and key do not belong together.
         """
-        paths = [self.certificate] if self.key is None else [self.certificate, self.key]
+        paths = [self.certificate]
+        if self.key is not None:
+            paths.append(self.key)
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         try:
             for path in paths:
-                read_whole(path)  # refuses a pipe, for which load_cert_chain would wait without end
-            # An empty password, because OpenSSL would otherwise ask for the password of an encrypted key.
+                read_whole(path)  # raises an error for a pipe, for which load_cert_chain would wait without end
+            # If the key is encrypted, OpenSSL uses this empty password and fails. It would otherwise ask for one.
             context.load_cert_chain(self.certificate, self.key, password=lambda: "")
         except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
             names = " and ".join(map(str, paths))
@@ -198,7 +202,7 @@ class Token:
     """
 
     def __init__(self, token: str) -> None:
-        """Check and store the token.
+        """Check the characters of the token, and store the header that clients must send.
 
         Raises:
             InputError: If the token is empty, or has characters that are not possible in a header or in a URL.
@@ -210,7 +214,7 @@ class Token:
                 "token: expected printable ASCII characters without blanks at the ends, and no %, which has another "
                 "meaning in the address of a page; choose another one"
             )
-        self._expected = b"Bearer " + token.encode()
+        self._expected_header = b"Bearer " + token.encode()
 
     def check(self, authorization: bytes) -> None:
         """Check the value of an Authorization header.
@@ -226,7 +230,8 @@ class Token:
         normalised = authorization
         if scheme.lower() == b"bearer":
             normalised = b"Bearer " + token.lstrip(b" ")
-        if not hmac.compare_digest(normalised, self._expected):
+        # The duration of compare_digest does not depend on the number of correct characters.
+        if not hmac.compare_digest(normalised, self._expected_header):
             received = "a wrong one" if authorization else "none"
             raise TokenError(
                 f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {received}"

@@ -81,9 +81,9 @@ class BrowserCheck:
     ) -> str | None:
         """Return the reason why a request is refused; None if the request is accepted.
 
-        The requested host must be one that this server has. If the browser states the origin of the page that sends the
-        request, the page must belong to this server. Otherwise the header `Sec-Fetch-Site` must not name another site,
-        unless the user follows a link to a page of this server.
+        The requested host must be one that this server has, unless every host is accepted. If the browser states the
+        origin of the page that sends the request, the page must belong to this server. Otherwise the header
+        `Sec-Fetch-Site` must not name another site, unless the user follows a link to a page of this server.
 
         Args:
             method: Method in capitals.
@@ -95,16 +95,17 @@ class BrowserCheck:
         """
         if not (self._any_host or self._is_served(host)):
             return (
-                f"Host: expected an IP address or one of {self._served_names()}, got {_shown(host)}; use the server's "
+                f"Host: expected an IP address or one of {self._served_names()}, got {_quoted(host)}; use the server's "
                 "address, or name the host by --allow-host of `isocharge serve http`"
             )
         if origin is not None:
             if self._is_own_page(origin, host):
                 return None
             return (
-                f"Origin: expected a page of this server, got a page of {_shown(origin)}; open {_shown(host)} itself, "
-                "or name the page's host by --allow-host of `isocharge serve http`"
+                f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
+                "itself, or name the page's host by --allow-host of `isocharge serve http`"
             )
+        # Programs other than browsers send no Sec-Fetch-Site.
         if fetch_site is None or fetch_site.lower() in TRUSTED_FETCH_SITES:
             return None
         # A link on a page of another site may open this page, because that site cannot read the answer.
@@ -112,8 +113,8 @@ class BrowserCheck:
         if is_link:
             return None
         return (
-            f"Sec-Fetch-Site: expected a request by a page of this server, got {_shown(fetch_site)}; open the page of "
-            f"{_shown(host)}"
+            f"Sec-Fetch-Site: expected a request by a page of this server, got {_quoted(fetch_site)}; open the page of "
+            f"{_quoted(host)}"
         )
 
     def _is_served(self, host: bytes) -> bool:
@@ -140,9 +141,9 @@ class BrowserCheck:
         requested_host = host.decode("latin-1").lower()
         if page_host == requested_host:
             return True
+        # The hosts may contain a port, the names do not. Equal names with different ports are two servers of a machine.
         page_name = _name_in(f"//{page_host}")
         requested_name = _name_in(f"//{requested_host}")
-        # Equal names with different ports are two servers of the same machine.
         return page_name in self._allowed_names and page_name != requested_name
 
     def _served_names(self) -> str:
@@ -160,14 +161,16 @@ def host_name(text: str) -> str:
         InputError: If the text is not a plain host name or address; a scheme, a port or a path is refused.
     """
     name = text.strip().lower()
-    has_only_plain_characters = name.isascii() and name.isprintable() and not set(name) & set("/@?#%* ,\\")
+    is_printable_ascii = name.isascii() and name.isprintable()
+    has_forbidden_character = any(character in name for character in "/@?#%* ,\\")
+
     is_bracketed = name.startswith("[") and name.endswith("]")
     if is_bracketed:
         name = name[1:-1]
-    has_port = ":" in name and ip_address(name) is None
-    if not name or not has_only_plain_characters or has_port:
+    has_port = ":" in name and ip_address(name) is None  # the only names with colons are IPv6 addresses
+    if not name or not is_printable_ascii or has_forbidden_character or has_port:
         raise InputError(f"--allow-host: expected a host name without scheme, port and path, got {text!r:.100}")
-    return name.removesuffix(".")
+    return name.removesuffix(".")  # "example.org." is the same host as "example.org"
 
 
 def _name_in(url: str) -> str:
@@ -179,6 +182,6 @@ def _name_in(url: str) -> str:
     return name.removesuffix(".")
 
 
-def _shown(value: bytes) -> str:
+def _quoted(value: bytes) -> str:
     """Return the value of a header as text for an error message."""
     return repr(value[:100].decode("latin-1"))

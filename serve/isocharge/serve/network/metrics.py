@@ -47,7 +47,7 @@ class Metrics(Collector):
         self._store = store
         self._traffic = traffic
         self._version = server_version
-        self._registry = CollectorRegistry(auto_describe=False)
+        self._registry = CollectorRegistry(auto_describe=False)  # do not call `collect` at the registration
         self._registry.register(self)
         ProcessCollector(registry=self._registry)
 
@@ -67,7 +67,7 @@ class Metrics(Collector):
 
 
 def _model_families(store: ModelStore) -> Iterable[Metric]:
-    """Return two metrics: the checksum of each loaded version, and the state of every version."""
+    """Return two metrics: the sensor and checksum of each loaded version, and the state of every version."""
     info = InfoMetricFamily("isocharge_model", "Loaded versions of the models.", labels=VERSION_LABELS)
     for loaded in store.loaded_versions():
         properties = {"sensor": loaded.metadata.frame_id, "sha256": loaded.model.golden.sha256}
@@ -76,7 +76,8 @@ def _model_families(store: ModelStore) -> Iterable[Metric]:
         "isocharge_model_ready", "1 if the version is loaded, 0 if it was refused.", labels=VERSION_LABELS
     )
     for row in store.version_states():
-        ready.add_metric((row["name"], row["version"]), row["state"] == "READY")
+        is_ready = row["state"] == "READY"  # exported as 1 or 0
+        ready.add_metric((row["name"], row["version"]), is_ready)
     return info, ready
 
 
@@ -90,7 +91,7 @@ def _traffic_families(traffic: Traffic) -> Iterable[Metric]:
     opened = GaugeMetricFamily(
         "isocharge_open", "Open connections of HTTP and open calls of gRPC.", labels=("transport",)
     )
-    for transport, count_open in traffic.open.items():
+    for transport, count_open in traffic.open.items():  # one function for each transport: "http", "grpc"
         opened.add_metric((transport,), count_open())
     lost_lines = CounterMetricFamily("isocharge_log_lines_lost", "Lines of the log that could not be written.")
     lost_line_count = 0 if traffic.lost_lines is None else traffic.lost_lines()
@@ -99,7 +100,7 @@ def _traffic_families(traffic: Traffic) -> Iterable[Metric]:
 
 
 def _inference_families(counters: _Counters) -> Iterable[Metric]:
-    """Yield the numbers of presses and of refused requests for each version of a model.
+    """Yield one metric for each counter of presses and refused requests, with a value for each version of a model.
 
     Args:
         counters: Counters of each version, by the name and the version of the model.
@@ -134,7 +135,8 @@ def _latency_families(counters: _Counters) -> Iterable[Metric]:
         labels=(*VERSION_LABELS, "stage"),
     )
     for name_and_version, statistics in counters.items():
-        cumulative_counts = accumulate(statistics.latency)  # a bucket of Prometheus includes all lower buckets
+        # A bucket of Prometheus includes all lower buckets.
+        cumulative_counts = accumulate(statistics.latency)
         buckets = list(zip(BUCKET_BOUNDS, cumulative_counts, strict=True))
         total_s = sum(statistics.stages_ns) / 1e9
         latency.add_metric(name_and_version, buckets, total_s)

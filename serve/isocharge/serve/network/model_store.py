@@ -10,9 +10,9 @@ stays available.
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -63,7 +63,10 @@ class LoadedVersion:
         return tuple(output_widths(self.model.session))
 
     def press(self) -> BoundPress:
-        """Return the bound memory for one press. Each thread has its own memory."""
+        """Return input and output memory for one press that is bound to the session of the model.
+
+        Each thread has its own memory, which is allocated at the first call of the thread.
+        """
         bound: BoundPress | None = getattr(self._thread_local, "press", None)
         if bound is None:
             bound = BoundPress(self.model.session, len(self.metadata.electrodes))
@@ -92,9 +95,9 @@ class ModelStore:
         self._statistics: dict[tuple[str, int], Statistics] = {}
         # Versions by name and version. An empty version in the key means the highest version.
         self._loaded: dict[tuple[str, str], LoadedVersion] = {}
-        self._refused: dict[tuple[str, int], str] = {}
+        self._refused: dict[tuple[str, int], str] = {}  # reasons for refusals by name and version
         for name, folder in folders().items():
-            self._load(name, folder)
+            self._load_versions(name, folder)
         if not self._loaded:
             raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or 'no model was found'}")
 
@@ -117,7 +120,7 @@ class ModelStore:
     def _not_found_message(self, name: str, version: str) -> str:
         """Return the message for a model that is not loaded.
 
-        The message lists the loaded versions and the reasons for refusals.
+        The message lists all loaded versions, and the reasons why versions of this model were refused.
 
         Args:
             name: Name of the model.
@@ -128,7 +131,8 @@ class ModelStore:
         available = ", ".join(loaded_labels) or "no model"
         reasons: list[str] = []
         for (refused_name, refused_version), reason in sorted(self._refused.items()):
-            is_requested = refused_name == name and version in ("", str(refused_version))
+            is_requested_version = version in ("", str(refused_version))
+            is_requested = refused_name == name and is_requested_version
             if is_requested and reason not in reasons:
                 reasons.append(reason)
         return "; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *reasons])
@@ -196,9 +200,9 @@ class ModelStore:
     def index(self) -> list[dict[str, str]]:
         """Return the rows of `version_states`, and one row for each model that has not been loaded."""
         rows = self.version_states()
-        names = {row["name"] for row in rows}
+        listed_names = {row["name"] for row in rows}
         for name in self._folders():
-            if name not in names:
+            if name not in listed_names:
                 rows.append({"name": name, "version": "", "state": "UNAVAILABLE", "reason": ""})
         return rows
 
@@ -222,7 +226,8 @@ class ModelStore:
             folder = self._folders().get(name)
             if folder is None:
                 raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
-            refused = self._load(name, folder)
+            refused = self._load_versions(name, folder)
+        # The valid versions are loaded in any case. The errors only report what was not loaded.
         if refused:
             raise ModelError("; ".join(refused.values()))
         if not version_folders(folder):
@@ -241,8 +246,8 @@ class ModelStore:
             reasons = {(name, loaded.metadata.version): UNLOADED for loaded in self.versions_of(name)}
             self._replace(name, [], reasons)
 
-    def _load(self, name: str, folder: Path) -> dict[tuple[str, int], str]:
-        """Load every version of a model, and replace the versions that were loaded before.
+    def _load_versions(self, name: str, folder: Path) -> dict[tuple[str, int], str]:
+        """Load every version of a model from its folder, and replace the versions that were loaded before.
 
         If a version is refused, or no version is found, the other versions that were loaded before stay loaded.
 
@@ -312,22 +317,24 @@ def open_model_store(models: Path | None = None) -> ModelStore:
         ModelError: If `models` is not a folder or contains no model, or no version passes its checks.
     """
     if models is None:
-        roots = repositories()
-    else:
-        roots = [models]
-        if not model_names(models):
-            repositories(models)  # raises an error if the folder itself is missing
-            raise ModelError(f"{models}: expected models, <name>/<version>/model.onnx, found none; correct --models")
+        return ModelStore(partial(_find_model_folders, repositories()))
+    if not model_names(models):
+        repositories(models)  # raises an error if the folder itself is missing
+        raise ModelError(f"{models}: expected models, <name>/<version>/model.onnx, found none; correct --models")
+    return ModelStore(partial(_find_model_folders, [models]))
 
-    def find_folders() -> Mapping[str, Path]:
-        """Return the present folder of each model by its name."""
-        folder_of_model: dict[str, Path] = {}
-        for root in roots:
-            for name in model_names(root):
-                folder_of_model.setdefault(name, root / name)  # the first repository takes precedence
-        return MappingProxyType(folder_of_model)
 
-    return ModelStore(find_folders)
+def _find_model_folders(roots: Sequence[Path]) -> Mapping[str, Path]:
+    """Return the present folder of each model by its name.
+
+    Args:
+        roots: Repositories. If a model is in several repositories, the first one takes precedence.
+    """
+    folder_of_model: dict[str, Path] = {}
+    for root in roots:
+        for name in model_names(root):
+            folder_of_model.setdefault(name, root / name)
+    return MappingProxyType(folder_of_model)
 
 
 def _refusal_reason(folder: Path, error: Exception) -> str:

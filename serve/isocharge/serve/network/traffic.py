@@ -106,7 +106,7 @@ class RequestLog(logging.Handler):
 
         If the text has more than `MAX_TEXT_CHARACTERS` characters, its middle is replaced by " [...] ".
         """
-        cleaned = text.encode("utf-8", "replace").decode()
+        cleaned = text.encode("utf-8", "replace").decode()  # lone surrogates cannot be encoded and become "?"
         if self._secret:
             cleaned = cleaned.replace(self._secret, "[secret]")
         if len(cleaned) <= MAX_TEXT_CHARACTERS:
@@ -206,6 +206,7 @@ class Statistics:
             alarms: Number of presses whose misfit is above the limit.
         """
         read_ns, run_ns, write_ns = stages_ns
+        # Index of the first bucket of the latency histogram whose upper bound is not below the total time.
         bucket = bisect_left(LATENCY_BOUNDS_NS, read_ns + run_ns + write_ns)
         with self._lock:
             self.presses += presses
@@ -236,10 +237,10 @@ class Statistics:
             return replace(self, latency=[*self.latency], stages_ns=[*self.stages_ns], _lock=threading.Lock())
 
     def to_json(self) -> dict[str, Any]:
-        """Return the counters under Triton's names. The time in the queue is 0, because no request waits in a queue."""
+        """Return the counters under the names of Triton's statistics."""
         counters = self.snapshot()
         durations_ns = dict(zip(STAGES, counters.stages_ns, strict=True))
-        durations_ns["queue"] = 0
+        durations_ns["queue"] = 0  # no request waits in a queue
         durations_ns["success"] = sum(counters.stages_ns)
         inference_stats = {name: {"count": counters.answered, "ns": ns} for name, ns in durations_ns.items()}
         inference_stats["fail"] = {"count": counters.refused, "ns": counters.refused_ns}

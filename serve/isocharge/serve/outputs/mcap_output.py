@@ -38,7 +38,7 @@ class McapOutput:
         from isocharge.serve.export.mcap_file import McapFile  # needs the extra `record`
 
         self._path = path
-        self._stack = ExitStack()
+        self._stack = ExitStack()  # closes the file and, in a replay, then renames it
         draft = path if is_live else self._stack.enter_context(new_file(path))
         self._file = self._stack.enter_context(McapFile(draft, electrodes, encoding))
 
@@ -60,7 +60,7 @@ class McapOutput:
     def discard(self) -> None:
         """Close the file without an index. In a replay, the file is removed."""
         self._file.is_abandoned = True
-        # The contexts are left with an error, so that they remove an incomplete file. The error itself is suppressed.
+        # The contexts are left with an error, so that they remove an incomplete file. They raise this error again.
         incomplete = OutputError(f"{self._path}: incomplete")
         try:
             self._stack.__exit__(OutputError, incomplete, None)

@@ -33,7 +33,7 @@ class QueuedOutput:
         self._output = output
         self._target = target
         self._ends_stream = ends_stream
-        self._queue = WriterQueue(self._write, is_ready)
+        self._queue = WriterQueue(self._write, is_ready)  # starts the thread, which calls these functions
 
     @property
     def lost(self) -> int:
@@ -58,25 +58,26 @@ class QueuedOutput:
             else:
                 self._output.close()
         except Exception as error:
-            self._handle(error)
+            self._handle_error(error)
 
     def _write(self, record: PredictionRecord) -> None:
+        """Write a record to the other output, unless this output has failed before. The thread calls this method."""
         if self.has_failed:
             return
         try:
             self._output.write(record)
         except Exception as error:
-            self._handle(error)
+            self._handle_error(error)
 
-    def _handle(self, error: Exception) -> None:
+    def _handle_error(self, error: Exception) -> None:
         """Raise an error that ends the stream, or write the first error of the output to the log.
 
         Raises:
             Exception: The error, if the errors of this output end the stream.
         """
-        is_first = not self.has_failed
+        is_first_error = not self.has_failed
         self.has_failed = True
         if self._ends_stream:
             raise error
-        if is_first:
+        if is_first_error:
             log.error("%s: stopped (%s); the records after that are missing", self._target, error)

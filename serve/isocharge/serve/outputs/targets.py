@@ -47,12 +47,14 @@ def kind_of(target: str) -> OutputKind:
     for kind in OUTPUT_KINDS:
         if kind.accepts(target):
             return kind
-    added_forms = []
+
+    added_forms = []  # for the error message
     for entry_point in entry_points(group=ENTRY_POINTS):
         added_kind = _load_kind(entry_point)
         if added_kind.accepts(target):
             return added_kind
         added_forms.append(added_kind.form)
+
     forms = ", ".join([target_forms(), *added_forms])
     raise InputError(f"output {shown(target)}: expected one of the forms {forms}")
 
@@ -102,10 +104,12 @@ class Outputs:
             context: Description of the stream.
 
         Raises:
-            InputError: If a target has none of the forms, or two targets write to standard output.
+            InputError: If a target has none of the forms, two targets are equal, or two targets write to standard
+                output.
         """
-        kinds = [(target, kind_of(target)) for target in targets]
-        standard_targets = [target for target, kind in kinds if kind.is_standard_output]
+        kinds = {target: kind_of(target) for target in targets}
+        standard_targets = [target for target in targets if kinds[target].is_standard_output]
+        other_targets = [target for target in targets if not kinds[target].is_standard_output]
         if len(standard_targets) > 1:
             raise InputError(
                 f"outputs {shown(standard_targets)}: expected at most one on standard output; remove one of them"
@@ -113,9 +117,7 @@ class Outputs:
         if len(set(targets)) < len(targets):
             raise InputError(f"outputs {shown(list(targets))}: expected targets that differ; remove one of them")
         # Standard output is written last. If its reader has closed it, the other outputs have received the record.
-        file_kinds = [(target, kind) for target, kind in kinds if not kind.is_standard_output]
-        standard_kinds = [(target, kind) for target, kind in kinds if kind.is_standard_output]
-        self._kinds = file_kinds + standard_kinds
+        self._kinds = {target: kinds[target] for target in other_targets + standard_targets}
         self._context = context
         self._outputs: dict[str, Output] = {}
         self.not_written: dict[str, int | None] = {}
@@ -126,21 +128,32 @@ class Outputs:
         Raises:
             IsochargeError: If an output cannot be opened. The outputs that were opened before are discarded.
         """
-        for target, kind in self._kinds:
+        for target, kind in self._kinds.items():
             try:
                 output = kind.open(target, self._context)
             except (IsochargeError, OSError, KeyboardInterrupt):
                 self._discard()
                 raise
-            except Exception as error:
+            except Exception as error:  # an unexpected error, for example of another package
                 self._discard()
                 raise _failure(target, error) from error
             # A live stream must not wait for a slow consumer, so its records are written by another thread.
             if self._context.is_live and kind.may_block:
-                is_ready = self._context.stdout_is_ready if kind.is_standard_output else lambda: True
-                output = QueuedOutput(output, target, is_ready=is_ready, ends_stream=kind.is_standard_output)
+                output = self._queued(output, target, kind)
             self._outputs[target] = output
         return self
+
+    def _queued(self, output: Output, target: str, kind: OutputKind) -> QueuedOutput:
+        """Return an output that writes to another output in a thread.
+
+        Args:
+            output: The other output.
+            target: Its target, for messages.
+            kind: Its kind. Only standard output can report that its reader is slow, and ends the stream on an error.
+        """
+        if kind.is_standard_output:
+            return QueuedOutput(output, target, is_ready=self._context.stdout_is_ready, ends_stream=True)
+        return QueuedOutput(output, target)
 
     def __exit__(self, error: type[BaseException] | None, *_: Any) -> None:
         """Close the outputs. If a replay was stopped, its files are removed."""
@@ -163,13 +176,13 @@ class Outputs:
         for target, output in self._outputs.items():
             try:
                 output.write(record)
-            except (IsochargeError, OSError):
+            except (IsochargeError, OSError):  # its message already states the reason
                 raise
-            except Exception as error:
+            except Exception as error:  # an unexpected error, for example of another package
                 raise _failure(target, error) from error
 
     def close(self) -> None:
-        """Close all open outputs. For each output, count the records that are missing.
+        """Close all open outputs, and store in `not_written` how many records each of them lacks.
 
         Raises:
             OSError, IsochargeError: The first error of an output. The other outputs are closed as well.
@@ -180,6 +193,7 @@ class Outputs:
                 output.close()
             except (OSError, IsochargeError) as error:
                 errors.append(error)
+            # Only a queue can lose records without raising an error.
             if isinstance(output, QueuedOutput) and output.has_failed:
                 self.not_written[target] = None  # the number is unknown, because the output has stopped
             elif isinstance(output, QueuedOutput) and output.lost:

@@ -60,7 +60,7 @@ class TextFile:
         """
         self._path = path
         self._line_of = line_of
-        self._stack = ExitStack()
+        self._stack = ExitStack()  # closes the file and, in a replay, then renames it
         draft = path if is_live else self._stack.enter_context(new_file(path))
         self._file = AtomicWriter(draft)
         self._stack.callback(self._file.close)
@@ -77,7 +77,7 @@ class TextFile:
 
     def discard(self) -> None:
         """Close the file. In a replay, the file is removed."""
-        # The contexts are left with an error, so that they remove an incomplete file. The error itself is suppressed.
+        # The contexts are left with an error, so that they remove an incomplete file. They raise this error again.
         incomplete = OutputError(f"{self._path}: incomplete")
         try:
             self._stack.__exit__(OutputError, incomplete, None)

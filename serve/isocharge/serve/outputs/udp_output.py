@@ -31,7 +31,7 @@ class UdpOutput:
         """
         host, _, port = address.rpartition(":")
         try:
-            if not 0 < int(port) <= MAX_PORT:
+            if not 0 < int(port) <= MAX_PORT:  # int raises ValueError if this is no number
                 raise ValueError(f"a port is a number from 1 to {MAX_PORT}")
             first_address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         except (OSError, ValueError) as error:  # getaddrinfo raises ValueError if a part of the name is too long
@@ -39,10 +39,10 @@ class UdpOutput:
             raise InputError(
                 f"output {shown(SCHEME + address)}: expected {SCHEME}HOST:PORT, as in {example} ({error})"
             ) from error
-        family, _, _, _, socket_address = first_address
+        family, _, _, _, socket_address = first_address  # the family is IPv4 or IPv6
         self._address = socket_address
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
+        self._socket.setblocking(False)  # a live stream must not wait for the network
 
     def write(self, record: PredictionRecord) -> None:
         """Send a record. If the network is not ready, drop the record, because a live stream never waits."""

@@ -77,7 +77,7 @@ class DeviceClock:
         self._latest_host_s = -math.inf  # host time of the latest reading, which must not decrease
 
     def read(self, t_us: int | None, modulus: int, arrived_s: float) -> ReadingTime:
-        """Return the time of the next reading.
+        """Return the time at which the next reading was taken, and the time since the previous reading.
 
         If the device sends a clock, the time is the clock converted to host time by the fit. Otherwise the time is the
         arrival of the chunk.
@@ -87,22 +87,27 @@ class DeviceClock:
             modulus: Time at which the clock wraps to 0, us.
             arrived_s: Arrival of the chunk that contains the reading, unix seconds.
         """
+        # Without a clock, the time of the reading is the arrival.
         if t_us is None:
-            step_s = 0.0
+            step_s = 0.0  # for the first reading
             if self._last_arrival_s is not None:
                 step_s = max(0.0, arrived_s - self._last_arrival_s)
             self._last_arrival_s = arrived_s
             return ReadingTime(arrived_s, None, step_s)
 
-        step_us = self._unwrap(t_us, modulus)  # time since the previous reading
+        step_us = self._advance(t_us, modulus)  # time since the previous reading
         if self._is_ahead_of(arrived_s):
             self.restarts += 1
             self._fitted_us = None  # the fit starts again from this reading
             step_us = 0
-        if self._fitted_us is None:  # until the next chunk arrives, the arrival is the time of this reading
+
+        # Without a fit, the arrival is the time of this reading until the next chunk arrives.
+        if self._fitted_us is None:
             self._fitted_us = self._device_us
             self._fitted_host_s = max(arrived_s, self._latest_host_s)
             self._is_first_fit = True
+
+        # The host time must not decrease, although a correction of the fit may move the prediction back.
         self._latest_host_s = max(self._latest_host_s, self._predict(self._device_us))
         return ReadingTime(self._latest_host_s, self._device_us, step_us * 1e-6)
 
@@ -120,7 +125,7 @@ class DeviceClock:
         return self._predict(self._device_us) - arrived_s > MAX_DEVIATION_s
 
     def arrived(self, arrival_s: float) -> None:
-        """Fit the clock to the arrival of a chunk. The last reading of the chunk must be the latest reading.
+        """Fit the clock to the arrival of a chunk, after `read` was called for the last reading of the chunk.
 
         If the readings come from a file, all chunks have the same arrival time. An arrival time is therefore used only
         if it differs from the previous one.
@@ -130,7 +135,9 @@ class DeviceClock:
         """
         previous_arrival_s = self._chunk_arrival_s
         self._chunk_arrival_s = arrival_s
-        if self._fitted_us is None or previous_arrival_s in (None, arrival_s):
+        is_first_arrival = previous_arrival_s is None
+        is_repeated = previous_arrival_s == arrival_s
+        if self._fitted_us is None or is_first_arrival or is_repeated:
             return
 
         delay_s = arrival_s - self._predict(self._device_us)
@@ -152,10 +159,11 @@ class DeviceClock:
         self._is_first_fit = False
 
     def _continue_fit(self, delay_s: float, step_s: float) -> None:
-        """Correct the fit by one step of the delay-locked loop (Adriaensen 2005).
+        """Correct the fit by one step of a delay-locked loop of second order (Adriaensen 2005).
 
-        With the gain w of the loop, the delay corrects the time with the gain sqrt(2) w and the rate of the clock with
-        the gain w^2.
+        With w = 2 pi bandwidth step_s, the fitted host time is predicted + sqrt(2) w delay_s, and the rate of the clock
+        increases by w^2 delay_s / step_s. The bandwidth falls as the fit gets older. A large w is limited, because the
+        loop would become unstable.
 
         Args:
             delay_s: Time of the arrival minus its prediction, s.
@@ -172,8 +180,8 @@ class DeviceClock:
         """Return the host time, unix seconds, at a time of the device, us."""
         return self._fitted_host_s + self.rate * (device_us - (self._fitted_us or 0)) * 1e-6
 
-    def _unwrap(self, t_us: int, modulus: int) -> int:
-        """Return the time since the previous reading, us, and add it to the clock without wraps.
+    def _advance(self, t_us: int, modulus: int) -> int:
+        """Advance the clock without wraps to the next reading, and return the time since the previous reading, us.
 
         The result is 0 for the first reading. If the clock jumped back, or ahead by more than half of its range, the
         device has restarted. The fit then starts again, and the result is also 0.
@@ -182,14 +190,16 @@ class DeviceClock:
             t_us: Clock of the device as it was sent, us.
             modulus: Time at which the clock wraps to 0, us.
         """
-        last_us = self._raw_us
+        previous_us = self._raw_us
         self._raw_us = t_us
-        if last_us is not None:
-            step_us = (t_us - last_us) % modulus
+        if previous_us is not None:
+            step_us = (t_us - previous_us) % modulus
             if step_us < modulus // 2:
                 self._device_us += step_us
                 return step_us
             self.restarts += 1
+
+        # This is the first reading after a start.
         self._device_us = t_us
         self._fitted_us = None
         return 0

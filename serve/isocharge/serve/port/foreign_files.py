@@ -43,13 +43,13 @@ def _kind_and_command(name: str, head: bytes) -> tuple[str, str] | None:
     """Return the kind of a file that does not come from a board, and advice on what to do with the file.
 
     Args:
-        name: Name of the file.
+        name: Path of the file, or - for the standard input.
         head: First bytes of the file.
 
     Returns:
         Kind and advice, as parts of a sentence; None if the bytes may come from a board.
     """
-    file = shlex.quote(name)
+    file = shlex.quote(name)  # for the commands in the advice
     text_start = head.removeprefix(codecs.BOM_UTF8).lstrip()
     first_line, _, _ = text_start.partition(b"\n")
     if first_line.startswith(RECORDING_START):
@@ -89,7 +89,9 @@ def _is_table_of_presses(name: str, first_line: bytes) -> bool:
     """
     header = first_line.decode("utf-8", "replace").strip()
     columns = {column.strip().strip('"') for column in header.split(",")}
-    if columns & PRESS_COLUMNS:
+    has_press_column = bool(columns & PRESS_COLUMNS)
+    if has_press_column:
         return True
-    has_names = len(columns) > 1 and all(column[:1].isalpha() for column in columns)
-    return name.endswith(".csv") and has_names and not columns & COLUMNS_OF_BOARDS
+    has_board_column = bool(columns & COLUMNS_OF_BOARDS)
+    has_only_names = len(columns) > 1 and all(column[:1].isalpha() for column in columns)
+    return name.endswith(".csv") and has_only_names and not has_board_column

@@ -92,8 +92,8 @@ class Recorder:
         self._header = {KIND: VERSION, "model": model, "policy": policy, "device": dict(device)}
         if name:
             self._header["name"] = name
-        self._last_chunk: Chunk | None = None
-        self._size_before_last = 0  # size of the file before the last chunk, bytes
+        self._last_chunk: Chunk | None = None  # chunk of the latest call of `chunk`
+        self._size_before_last_chunk = 0  # size of the file before this chunk was written, bytes
 
     def __enter__(self) -> Self:
         """Create the file.
@@ -117,19 +117,20 @@ class Recorder:
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
         """Write a chunk and the lines of its records.
 
-        After an interruption, the same chunk may be passed again. It is written only once.
+        If a call was interrupted, for example by Ctrl-C, the caller passes the same chunk again. The chunk is written
+        only once: nothing is written if the file has grown since the first call.
 
         Args:
             chunk: The chunk.
             records: Records of the frames in the chunk, each a line of JSON.
         """
-        is_written = chunk is self._last_chunk and self._file.tell() > self._size_before_last
-        if is_written:
+        is_same_chunk = chunk is self._last_chunk
+        if is_same_chunk and self._file.tell() > self._size_before_last_chunk:
             return
         base64_data = base64.b64encode(chunk.data).decode()
         chunk_line = json.dumps({"chunk": [chunk.timestamp, chunk.clock_ns, chunk.outage_s, base64_data]})
         self._last_chunk = chunk
-        self._size_before_last = self._file.tell()
+        self._size_before_last_chunk = self._file.tell()
         self._write("\n".join([chunk_line, *records]))
 
     def tare(self) -> None:
@@ -205,9 +206,9 @@ class Recording:
             if not path.is_file():
                 raise RecordingError("there is no file of that name")
             with path.open(encoding="utf-8") as file:
-                first = next(bounded_lines(file, LONGEST_ENTRY), "")
-            header = parse_json(first, "first line", RecordingError, _Header)
-        except (OSError, ValueError) as error:
+                first_line = next(bounded_lines(file, LONGEST_ENTRY), "")  # empty if the file is empty
+            header = parse_json(first_line, "first line", RecordingError, _Header)
+        except (OSError, ValueError) as error:  # RecordingError is a ValueError
             raise RecordingError(
                 f"{path}: expected a recording of `serve stream --record` ({cut(str(error))})"
             ) from error
@@ -222,21 +223,21 @@ class Recording:
         self.name = header.name
 
     def events(self) -> Iterator[Event | Marker | NewModel | Back]:
-        """Yield the chunks, requests for a new tare, markers and changes of the model, in their order.
+        """Yield the chunks with the latencies of their records, and all other events of the recording, in their order.
 
         Raises:
             RecordingError: If a line other than the last one is damaged.
         """
-        # A chunk is followed by its records, so it is yielded when the next chunk or the end of the file is reached.
+        # The records of a chunk follow it, so a chunk is yielded at the next event or at the end of the file.
         chunk: Chunk | None = None
         latencies_us: list[float] = []
         for entry in self._lines(_Entry):
-            if entry.latency_us is not None:
+            if entry.latency_us is not None:  # only records have a latency
                 latencies_us.append(entry.latency_us)
                 continue
             if chunk is not None:
                 yield Event(chunk, tuple(latencies_us))
-            chunk = entry.recorded_chunk
+            chunk = entry.recorded_chunk  # None if the entry is another event
             latencies_us = []
             if chunk is None:
                 yield entry.other_event
@@ -255,18 +256,18 @@ class Recording:
         return self._lines(kind, beginning='{"timestamp"')
 
     def _lines(self, kind: type[Line], beginning: str = "") -> Iterator[Line]:
-        """Yield the content of the lines after the first line, and report the progress.
+        """Parse the lines after the first line, yield their content, and report the progress of reading.
 
         Args:
             kind: Struct as which each line is parsed.
-            beginning: First characters of the lines to parse; empty for all lines. Damaged lines, which do not begin
-                with a brace, are always parsed and cause the error.
+            beginning: First characters of the lines to parse; empty for all lines. A line that does not begin with a
+                brace is damaged. It is always parsed, so that an error is raised.
 
         Raises:
             RecordingError: If a line other than the last one is damaged.
         """
         line_number = 1
-        read_characters = 0
+        read_characters = 0  # nearly all characters are one byte
         file_bytes = self._path.stat().st_size
         try:
             with self._path.open(encoding="utf-8", errors="replace") as file:
@@ -274,7 +275,8 @@ class Recording:
                     is_complete = line.endswith("\n")
                     if not is_complete:
                         return  # the power failed while the line was written
-                    is_selected = line.startswith(beginning) or not line.startswith("{")
+                    is_damaged = not line.startswith("{")
+                    is_selected = line.startswith(beginning) or is_damaged
                     if line_number > 1 and is_selected:
                         yield parse_json(line, "", RecordingError, kind)
                     line_number += 1

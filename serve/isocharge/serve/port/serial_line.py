@@ -60,7 +60,7 @@ class Requester:
         self._now_s = now_s
         self._requests = 0  # number of requests so far
         self._echoes = 0  # number of complete echoes so far
-        self.reset()
+        self.reset()  # makes the first request due
 
     @property
     def echo_share(self) -> float:
@@ -76,16 +76,16 @@ class Requester:
     def wait_s(self) -> float:
         """Return the time until the next request is due, s; 0 if it is due now.
 
-        After a request without an answer, the time until the next request is longer. No request is due while bytes are
-        arriving.
+        Requests are due at the rate of the board. After a request without an answer, at least `REPEAT_TIME_s` must
+        pass. After the latest received byte, at least `QUIET_TIME_s` must pass.
         """
         now_s = self._now_s()
         due_s = self._requested_s + 1.0 / self._request.rate_Hz
         is_unanswered = self._received_s < self._requested_s
         if is_unanswered:
             due_s = max(due_s, self._requested_s + REPEAT_TIME_s)
-        quiet_s = self._received_s + QUIET_TIME_s
-        return max(0.0, due_s - now_s, quiet_s - now_s)
+        quiet_end_s = self._received_s + QUIET_TIME_s  # bytes of the answer may arrive until then
+        return max(0.0, due_s - now_s, quiet_end_s - now_s)
 
     def next_request(self) -> bytes:
         """Return the bytes of the next request, and store the time of the request."""
@@ -108,13 +108,13 @@ class Requester:
         echo_length = min(len(received), len(self._expected_echo))
         is_echo = received[:echo_length] == self._expected_echo[:echo_length]
         if echo_length == 0 or not is_echo:
-            self._expected_echo = b""
+            self._expected_echo = b""  # the answer has begun, so no echo follows
             return received
 
         self._expected_echo = self._expected_echo[echo_length:]  # the part that has not arrived yet
         if not self._expected_echo:
             self._echoes += 1
-        if not self._request.echo:
+        if not self._request.echo:  # the line has no echo, so these bytes belong to the answer
             return received
         return received[echo_length:]
 
@@ -159,7 +159,7 @@ class SerialLine:
         """
         # pyserial is imported only here, so that programs that only predict need not wait for the import.
         serial = importlib.import_module("serial")
-        if url.startswith("tcp://"):
+        if url.startswith("tcp://"):  # pyserial has another name for this scheme
             url = url.replace("tcp://", "socket://", 1)
         self._serial: Any = serial.serial_for_url(url, baudrate=baud, exclusive=True)
         # Without this mode, USB adapters collect bytes for 16 ms.
@@ -202,7 +202,7 @@ class SerialLine:
             return b""
         # This needs one system call. pyserial would need five, or one for each byte of a socket.
         data = os.read(self._descriptor, MAX_READ_BYTES)
-        if not data:
+        if not data:  # the end of the stream is also readable
             raise OSError("it is readable and has no data: it was unplugged, or the other end has closed")
         return data
 
@@ -217,7 +217,7 @@ class SerialLine:
         """
         if timeout_s != self._serial.timeout:  # Setting the timeout costs a system call.
             self._serial.timeout = timeout_s
-        data: bytes = self._serial.read(1)
+        data: bytes = self._serial.read(1)  # waits for at most the timeout
         if data:
             data += self._serial.read(self._serial.in_waiting)
         return data
@@ -240,7 +240,7 @@ class UdpSocket:
 
         Raises:
             OSError: If the address cannot be bound.
-            ValueError: If the URL holds no address.
+            ValueError: If the URL has no port, or has more than a host and a port.
         """
         parts = urlsplit(url)
         if parts.port is None or parts.path or parts.query:
@@ -264,7 +264,7 @@ class UdpSocket:
             self._socket.recv(MAX_READ_BYTES)
 
     def receive(self, timeout_s: float) -> bytes:
-        """Return the next datagram that is not empty.
+        """Return the next datagram that is not empty. A line feed is added to text if the board sends none.
 
         Args:
             timeout_s: Longest time to wait, s.
@@ -303,5 +303,5 @@ class UdpSocket:
         has_control_characters = _CONTROL_CHARACTER.search(data) is not None
         if self._board_ends_lines or has_control_characters:
             return data
-        is_utf8 = data.decode("utf-8", "replace").encode() == data
+        is_utf8 = data.decode("utf-8", "replace").encode() == data  # invalid bytes would have been replaced
         return data + b"\n" if is_utf8 else data

@@ -101,10 +101,10 @@ class Port:
         self._line: SerialLine | UdpSocket | None = None
 
     def __enter__(self) -> Self:
-        """Open the port, and drop the bytes that it has buffered.
+        """Open the port, and drop the bytes that it has buffered. Try again until `wait` seconds have passed.
 
         Raises:
-            PortError: If the port cannot be opened within `wait`.
+            PortError: If the port cannot be opened within `wait`, or its URL is wrong.
             InputError: If the port is a file.
         """
         deadline_s = time.monotonic() + self._wait
@@ -113,18 +113,19 @@ class Port:
                 self._open()
                 return self
             except PortError as error:
-                is_wrong_url = isinstance(error.__cause__, ValueError)
+                is_wrong_url = isinstance(error.__cause__, ValueError)  # waiting would not help
                 if is_wrong_url or time.monotonic() >= deadline_s:
                     raise
                 time.sleep(FIRST_RETRY_PAUSE_s)
 
     def _open(self) -> None:
-        """Open the line, drop the bytes that it has buffered, and request a frame if the board needs requests.
+        """Open the line, and drop the bytes that it has buffered.
 
         Raises:
             PortError: If the line cannot be opened.
             InputError: If the port is a file.
         """
+        # On systems without POSIX ports, the name of a port, such as COM3, is no path of a file.
         is_path = "://" not in self.url
         if is_path and HAS_POSIX_PORTS and not Path(self.url).exists():
             raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
@@ -135,12 +136,12 @@ class Port:
                 self._line = UdpSocket(self.url)
             else:
                 self._line = SerialLine(self.url, self._baud)
-            self._line.reset_input_buffer()  # A terminal drops its buffer by itself, a socket does not.
+            self._line.reset_input_buffer()  # a terminal drops its buffer when it is opened, a socket does not
         except OPEN_ERRORS as error:
             self._close()
             raise self._opening_error(error, is_path=is_path) from error
         if self._requester:
-            self._requester.reset()
+            self._requester.reset()  # the first request is due at once
 
     def _opening_error(self, cause: Exception, *, is_path: bool) -> PortError:
         """Return the error of a port that cannot be opened.
@@ -175,7 +176,7 @@ class Port:
         return self._requester.echo_share if self._requester else 0.0
 
     def __iter__(self) -> Iterator[Chunk]:
-        """Yield chunks as they arrive.
+        """Yield chunks as they arrive. If the port is lost, open it again if `reconnect` is true.
 
         Raises:
             PortLost: If the port disappears or stays silent for `silence_s`, and `reconnect` is false.
@@ -224,7 +225,7 @@ class Port:
             try:
                 self._open()
                 return self._read()
-            except PortError:
+            except PortError:  # also PortLost, if no bytes arrive after opening
                 continue
 
     def _read(self) -> bytes:
@@ -278,6 +279,7 @@ class Port:
                 return b""
             if requester.wait_s() == 0.0:
                 line.write(requester.next_request())
+            # Wait for bytes until the next request is due.
             received = line.receive(min(requester.wait_s(), remaining_s))
             answer = requester.remove_echo(received)
             if answer:
@@ -319,19 +321,19 @@ class FileSource:
         self._name = name
 
     def __iter__(self) -> Iterator[Chunk]:
-        """Yield chunks until the file ends. All bytes of a file on a disk arrive at the time at which it is opened.
+        """Yield chunks until the file ends. The bytes of a file on a disk have the time at which reading begins.
 
         Raises:
             InputError: If the file is a recording, a table or another file that does not come from a board.
         """
-        opened_s = time.time()
+        start_s = time.time()
         is_on_disk = stat.S_ISREG(os.fstat(self._descriptor).st_mode)
         is_first_chunk = True
         while data := os.read(self._descriptor, CHUNK_BYTES):
             if is_first_chunk:
                 refuse_foreign_file(self._name, data)
             is_first_chunk = False
-            arrival_s = opened_s if is_on_disk else time.time()
+            arrival_s = start_s if is_on_disk else time.time()
             yield Chunk(data, arrival_s, time.perf_counter_ns())
 
 
@@ -362,8 +364,8 @@ def open_source(
         return contextlib.nullcontext(FileSource(sys.stdin.fileno(), STDIN))
 
     # Wait until the path exists, because only then it is known whether it is a file or a port.
-    deadline_s = time.monotonic() + wait
     is_path = "://" not in url
+    deadline_s = time.monotonic() + wait
     while is_path and not Path(url).exists() and time.monotonic() < deadline_s:
         time.sleep(FIRST_RETRY_PAUSE_s)
     if is_path and _is_file_or_pipe(Path(url)):
@@ -405,6 +407,7 @@ def _open_file(path: Path) -> Iterator[FileSource]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); expected a file of frames") from error
     with file:
-        if path.is_file():
-            refuse_foreign_file(str(path), os.pread(file.fileno(), HEAD_BYTES, 0))
+        if path.is_file():  # the first bytes of a pipe cannot be read twice, so FileSource checks them
+            head = os.pread(file.fileno(), HEAD_BYTES, 0)
+            refuse_foreign_file(str(path), head)
         yield FileSource(file.fileno(), str(path))

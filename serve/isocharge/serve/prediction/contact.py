@@ -53,7 +53,8 @@ class Contact(NamedTuple):
         """Return the contact with larger standard deviations, which include an additional, independent error.
 
         A single error changes x, y and the force together, so their changes are fully correlated. The correlations of
-        the contact therefore change as well.
+        the contact therefore change as well. The variance of x grows by x_shift^2, and the covariance of x and y by
+        x_shift * y_shift.
 
         Args:
             shift: Changes of x and y, mm, and of the force, N, that one standard deviation of the error causes.
@@ -96,7 +97,7 @@ class Contact(NamedTuple):
         for name, std in stds.items():
             decimals = MAX_DECIMALS
             if math.isfinite(std) and std > 0.0:
-                decimals_of_two_digits = 1 - math.floor(math.log10(std))  # 3 for a standard deviation of 0.012
+                decimals_of_two_digits = 1 - math.floor(math.log10(std))  # for example, 3 if the std is 0.012
                 decimals = min(max(decimals_of_two_digits, 0), MAX_DECIMALS)
             value = getattr(self, name)
             yield name, f"{value:.{decimals}f}", f"{std:.{decimals}f}"
@@ -134,14 +135,14 @@ class Sensitivity:
     ) -> tuple[float, float, float]:
         """Compute by how much a change of the parameter changes the position and the force of a contact.
 
-        The contact is assumed to change in proportion to the parameter. The change of the contact for a change of the
-        parameter by `unit` is stored. It is used again for contacts that are close to the contact for which it was
-        computed.
+        The contact is assumed to change in proportion to the parameter. The change of the contact for a fixed step of
+        the parameter, which the constructor was given, is stored. The stored change is used again for contacts that are
+        close to the contact for which it was computed, so that no second prediction is needed.
 
         Args:
             contact: The contact at the present value of the parameter.
-            size: Change of the parameter, in the same unit as `unit`.
-            predict_after_unit: Function that predicts the contact with the parameter increased by `unit`.
+            size: Change of the parameter, in the same unit as the step.
+            predict_after_unit: Function that predicts the contact with the parameter increased by the step.
 
         Returns:
             Changes of x and y, mm, and of the force, N.
@@ -287,6 +288,7 @@ class Validity:
         """Description of the working area for messages: its radius, or its bounding box if it is not centred."""
         if self.is_centred:
             return f"up to {self.radius_mm:.3g} mm"
+        # Corners of the bounding box
         left, bottom = self.corners_mm.min(axis=0)
         right, top = self.corners_mm.max(axis=0)
         return f"from ({left:.3g}, {bottom:.3g}) to ({right:.3g}, {top:.3g}) mm"
@@ -294,7 +296,7 @@ class Validity:
     def is_beyond(self, contact: Contact) -> bool:
         """Return whether a contact is so far outside the domain that it cannot be a measurement."""
         centre_x_mm, centre_y_mm = self.centre_mm
-        limit_mm2, limit_N = self.implausible_limits
+        limit_mm2, limit_N = self.implausible_limits  # squared distance from the centre, and force
         x_mm = contact.x_mm - centre_x_mm
         y_mm = contact.y_mm - centre_y_mm
         return x_mm * x_mm + y_mm * y_mm > limit_mm2 or contact.force_N > limit_N
@@ -303,7 +305,7 @@ class Validity:
     def inscribed_radius_squared_mm2(self) -> float:
         """Squared radius of the largest circle around the origin inside the working area, mm^2.
 
-        The result is 0 if the origin is outside the working area.
+        It is the squared distance of the origin from the nearest edge of the area, or 0 if the origin is outside.
         """
         origin_x_mm = np.zeros(1)  # `inside_polygon` takes arrays of points, here of one point
         origin_y_mm = np.zeros(1)
@@ -337,7 +339,8 @@ class Validity:
     def _is_outside(self, contact: Contact) -> bool:
         """Return whether a contact is outside the working area or the range of forces.
 
-        Only a contact between the inscribed and the circumscribed circle of the area is compared with the polygon.
+        Only a contact between the inscribed and the circumscribed circle of the area, both around the origin, is
+        compared with the polygon. This saves time, because most contacts lie inside the inscribed circle.
         """
         min_force_N, max_force_N = self.force_range_N
         if contact.force_N < min_force_N or contact.force_N > max_force_N:
@@ -369,10 +372,11 @@ class Validity:
             return [()] * len(is_outside)
 
         centre_x_mm, centre_y_mm = self.centre_mm
-        limit_mm2, limit_N = self.implausible_limits
+        limit_mm2, limit_N = self.implausible_limits  # squared distance from the centre, and force
         with np.errstate(over="ignore"):  # a distance that overflows is infinite and exceeds the limit
             distance_squared_mm2 = (contacts.x_mm - centre_x_mm) ** 2 + (contacts.y_mm - centre_y_mm) ** 2
         is_beyond = (distance_squared_mm2 > limit_mm2) | (contacts.force_N > limit_N)
+        # The four conditions of each contact are converted to the words of the flags.
         columns = (is_outside.tolist(), is_beyond.tolist(), has_misfit.tolist(), is_above_yield.tolist())
         return [_flag_words(*conditions) for conditions in zip(*columns, strict=True)]
 
@@ -401,7 +405,8 @@ def _flag_words(is_outside: bool, is_beyond: bool, has_misfit: bool, is_above_yi
 def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
     """Return whether points lie inside a polygon.
 
-    A point is inside if a horizontal ray from the point to the right crosses an odd number of edges.
+    A point is inside if a horizontal ray from the point to the right crosses an odd number of edges. An edge is crossed
+    if one of its ends is above the point and the other is not, and if the edge is to the right of the point.
 
     Args:
         x: First coordinates of the points, shape (n,), in the unit of the corners.
@@ -415,7 +420,7 @@ def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
     # Coordinates of shape (m, 1), so that the arrays below have the shape (m edges, n points).
     x_start, y_start = corners.T[..., np.newaxis]
     x_end, y_end = edge_ends.T[..., np.newaxis]
-    crosses_height = (y_start > y) != (y_end > y)
+    crosses_height = (y_start > y) != (y_end > y)  # the edge crosses the horizontal line through the point
     with np.errstate(divide="ignore", invalid="ignore"):  # horizontal edges have no crossing
         crossing_x = x_start + (y - y_start) * (x_end - x_start) / (y_end - y_start)
     is_to_the_right = x < crossing_x

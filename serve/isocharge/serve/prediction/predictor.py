@@ -113,6 +113,8 @@ class Predictor:
             self._press.write(*as_press(charge_pC, self.metadata.electrodes))
         self._press.run()
         contact = Contact(*self._press.read())
+
+        # The distance is compared with its square, which is faster.
         x_mm = contact.x_mm - self._centre_x_mm
         y_mm = contact.y_mm - self._centre_y_mm
         is_implausible = contact.force_N > self._limit_N or x_mm * x_mm + y_mm * y_mm > self._limit_mm2
@@ -166,7 +168,8 @@ class Predictor:
         columns_of_output = self._press.columns
         charges = as_batch(charge_pC, self.metadata.electrodes)
         outputs = run(self._session, charges, tuple(columns_of_output))
-        # One row for each press and one column for each attribute of Contact. Missing correlations are NaN.
+        # One row for each press and one column for each attribute of Contact. Correlations are NaN if the model does
+        # not compute them.
         contacts = np.full((len(charges), len(Contact._fields)), np.nan, np.float32)
         for name, columns in columns_of_output.items():
             contacts[:, columns] = outputs[name]
@@ -208,16 +211,20 @@ def _describe(value: object) -> str:
 def _check_bound_memory(press: BoundPress, model: Model) -> None:
     """Check that this version of onnxruntime reads and writes the bound memory itself, not a copy.
 
+    A press is computed both in the bound memory and with `session.run`, which copies the arrays. A small difference is
+    allowed.
+
     Args:
         press: Bound memory for one press of the model.
-        model: The model, of which the first golden press is computed.
+        model: The model. Its golden vectors contain charges, of which the first press is computed.
 
     Raises:
         ModelError: If the bound press and `session.run` give different results.
     """
-    charges = model.golden.charge_pC[:1]
+    charges = model.golden.charge_pC[:1]  # shape (1, electrodes)
     press.write(*charges[0])
     press.run()
+    # `press.read` returns the outputs in the order of `press.columns`.
     outputs = run(model.session, charges, tuple(press.columns))
     expected = np.concatenate([rows[0] for rows in outputs.values()])
     actual = press.read()

@@ -131,7 +131,8 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     Raises:
         PressError: If the charges of one of the model's electrodes are missing.
     """
-    # Exclude the bad presses, and test whether noise and rig explain the errors of the others.
+    # Exclude the bad presses, and test whether noise and rig explain the errors of the others. The rig is the machine
+    # that sets the position and the force of each press, with some uncertainty.
     metadata = predictor.metadata
     errors = press_errors(predictor, presses)
     is_bad = _bad_presses(errors)
@@ -140,7 +141,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     agreement = Agreement.of(errors, rows)
     position = _position_summary(errors, rows)
     force = _force_summary(errors, rows)
-    misfit_text = _frequent_misfits(errors, rows, metadata)
+    misfit_text = _frequent_misfits(errors, rows, metadata)  # empty if there are not too many misfits
 
     fits = None  # too few presses
     if count >= MIN_PRESSES:
@@ -173,7 +174,7 @@ def _bad_presses(errors: PressErrors) -> Booleans:
 
     The bad presses are the presses with improbable errors, if all other presses agree with the model. No press is bad
     if all presses agree with the model, if too many presses would have to be excluded, or if the other presses do not
-    agree with the model either.
+    agree with the model either. A single bad press is always allowed, even among few presses.
     """
     is_compared = errors.is_compared
     no_bad_press = np.zeros_like(is_compared)
@@ -204,7 +205,9 @@ def _improbable_presses(errors: PressErrors, is_compared: Booleans) -> Booleans:
         is_compared: Which presses are compared, shape (n,).
     """
     max_probability = BAD_PRESS_PROBABILITY / max(1, int(is_compared.sum()))
-    squared_ratio = errors.squared_ratio  # of x, y and the force, shape (n, 3), NaN if unknown
+    # Squared errors of x, y and the force, relative to their expected variances, shape (n, 3), NaN if unknown. Their
+    # sum over one press has a chi-squared distribution. The probability is only computed if the sum is large.
+    squared_ratio = errors.squared_ratio
     is_candidate = is_compared & (np.nansum(squared_ratio, axis=1) > BAD_PRESS_MIN_CHI_SQUARED)
     is_improbable = np.zeros_like(is_compared)
     for press in np.flatnonzero(is_candidate):
@@ -240,6 +243,9 @@ def _force_summary(errors: PressErrors, rows: Booleans) -> ErrorSummary | None:
 def _frequent_misfits(errors: PressErrors, rows: Booleans, metadata: ModelMetadata) -> str:
     """Return a statement if more presses than chance explains have a misfit above the limit of the model.
 
+    The misfit is the distance of the charges from those of the nearest single contact. One per cent of good presses
+    have a misfit above the limit, by definition of the limit.
+
     Args:
         errors: Errors of all presses.
         rows: Which presses are counted, shape (n,).
@@ -261,8 +267,9 @@ def _frequent_misfits(errors: PressErrors, rows: Booleans, metadata: ModelMetada
 def _probability_of_fewer(misfit_count: int, count: int) -> float:
     """Return the probability that fewer than `misfit_count` of `count` good presses have a misfit above the limit.
 
-    The number of such presses follows a binomial distribution with the probability `MISFIT_FRACTION`. The terms of the
-    distribution are computed from their logarithms, because the binomial coefficients would overflow.
+    The number of such presses follows a binomial distribution with the probability p = `MISFIT_FRACTION`. With n =
+    `count`, the result is the sum of binomial(n, k) (p / (1 - p))^k (1 - p)^n over k from 0 to `misfit_count` - 1. The
+    terms are computed from their logarithms, because the binomial coefficients would overflow.
     """
     log_odds = math.log(MISFIT_FRACTION / (1.0 - MISFIT_FRACTION))
     log_probability_of_none = count * math.log1p(-MISFIT_FRACTION)
@@ -289,13 +296,17 @@ def _verdict(
         return f"too few presses to say: {count} can be compared, {MIN_PRESSES} are needed"
     if fits:
         return "fits: noise explains the errors"
+
+    # The attribute `beyond` is the part of the errors that noise and rig do not explain.
     unexplained = []
     if position is not None:
         unexplained.append(f"{position.beyond:.2g} mm")
     if force is not None:
         unexplained.append(f"{force.beyond:.2g} %")
     verdict = f"does not fit: {' and '.join(unexplained)} beyond noise"
-    return f"{verdict}; {misfit_text}" if misfit_text else verdict
+    if misfit_text:
+        return f"{verdict}; {misfit_text}"
+    return verdict
 
 
 def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: ErrorSummary | None) -> Iterator[str]:
@@ -345,9 +356,9 @@ def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[s
     different_reasons = set(reasons) - {""}  # a press that is compared has an empty reason
     for reason in sorted(different_reasons):
         lines = [line for line, line_reason in zip(errors.lines, reasons, strict=True) if line_reason == reason]
-        words = row_words(lines, errors.row_noun, MAX_LISTED_PRESSES)
+        list_of_lines = row_words(lines, errors.row_noun, MAX_LISTED_PRESSES)  # such as "lines 2, 5 and 4 more"
         explanation = _explain_exclusion(reason, metadata)
-        yield f"{len(lines)} of {len(reasons)} presses do not count: {explanation} ({words})"
+        yield f"{len(lines)} of {len(reasons)} presses do not count: {explanation} ({list_of_lines})"
 
 
 def _explain_exclusion(reason: str, metadata: ModelMetadata) -> str:
@@ -389,7 +400,11 @@ def _misfit_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]
 
 
 def _common_notes(agreement: Agreement) -> Iterator[str]:
-    """Yield notes about the common shift of the positions and the common scale of the forces, if significant."""
+    """Yield notes about the common shift of the positions and the common scale of the forces, if significant.
+
+    Args:
+        agreement: Tests of the errors, with the mean of the errors of x, y and the force over all presses.
+    """
     shift_x = agreement.shift_x
     shift_y = agreement.shift_y
     relative_force = agreement.force

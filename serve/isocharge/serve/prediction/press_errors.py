@@ -86,14 +86,19 @@ class PressErrors:
         return np.hypot(self.error[:, X], self.error[:, Y])
 
     def row(self, press: int) -> dict[str, Any]:
-        """Return the values of one press as a dictionary. The names contain the units."""
-        error = self.error[press]
+        """Return the values of one press as a dictionary. The names contain the units.
+
+        Args:
+            press: Index of the press, from 0.
+        """
+        error = self.error[press]  # of x, y and the force, relative for the force
         noise_std = self.noise_std[press]
         rig_std = self.rig_std[press]
-        predicted = self.predicted[press, :N_WITHOUT_CORRELATION].tolist()
+        contact_names = Contacts._fields[:N_WITHOUT_CORRELATION]
+        contact_values = self.predicted[press, :N_WITHOUT_CORRELATION].tolist()
         return {
             "line": self.lines[press],
-            **dict(zip(Contacts._fields[:N_WITHOUT_CORRELATION], predicted, strict=True)),
+            **dict(zip(contact_names, contact_values, strict=True)),
             "x_error_mm": error[X],
             "y_error_mm": error[Y],
             "position_error_mm": self.position_error_mm[press],
@@ -124,6 +129,8 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
     # Errors of the position are in mm, errors of the force are relative to the measured force.
     scale = np.ones((len(model_presses), 3))
     scale[:, FORCE] = measured[:, FORCE]
+
+    # Uncertainty of the measured values. That of the force is already relative.
     position_std_mm = model_presses.position_std_mm
     rig_std = np.column_stack([position_std_mm, position_std_mm, model_presses.force_std])
     is_unknown = np.isnan(measured)
@@ -162,6 +169,8 @@ def _predicted_contacts(predictor: Predictor, charge_pC: Array) -> Array:
 
 def _flags(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], ...]:
     """Return the flags `outside` and `misfit` of predicted contacts.
+
+    The flag `misfit` is set above a lower limit than in `Validity`: one per cent of good presses exceed it.
 
     Args:
         metadata: Metadata of the model.
@@ -262,7 +271,7 @@ class ErrorSummary:
         mean_noise_variance = float(np.mean(noise_variance))
         mean_rig_variance = float(np.mean(rig_variance))
         explained_variance = mean_noise_variance + mean_rig_variance
-        unexplained_variance = max(mean_square - mean_noise_variance - mean_rig_variance, 0.0)
+        unexplained_variance = max(mean_square - mean_noise_variance - mean_rig_variance, 0.0)  # 0 if it is negative
         return cls(
             presses=absolute_error.size,
             rms=math.sqrt(mean_square),
@@ -316,7 +325,8 @@ class CommonError:
         chi_squared = float(weight @ (known_error - mean) ** 2)
         chi_squared_per_degree = chi_squared / max(count - 1, 1)
         std = math.sqrt(mean_variance * max(chi_squared_per_degree, 1.0))
-        # A constant error of the rig does not become smaller by averaging over the presses.
+        # The significance also allows for a constant error of the rig, which is COMMON_RATIO times the standard
+        # deviation of a single press. A mean over many presses does not make this error smaller.
         std_with_rig = math.sqrt(mean_variance * (1.0 + COMMON_RATIO**2 * count))
         return cls(mean, std, significance=mean / std_with_rig)
 
@@ -347,8 +357,12 @@ class Agreement:
     def of(cls, errors: PressErrors, rows: Booleans) -> "Agreement":
         """Test whether noise and rig explain the errors of the selected presses.
 
+        The first test uses the sum of all squared errors relative to their expected variances. The second test uses the
+        mean errors of x, y and the force, which all presses have in common. Both sums have a chi-squared distribution
+        if noise and rig explain the errors.
+
         Args:
-            errors: Errors of all presses.
+            errors: Errors of all presses, NaN where a measured value is unknown.
             rows: Which presses are selected, shape (n,).
         """
         error = errors.error[rows]
@@ -372,12 +386,17 @@ class Agreement:
 
     @property
     def acceptable(self) -> bool:
-        """Whether noise and rig explain the errors."""
-        max_p_value = 0.5 * SIGNIFICANCE  # for each of the two tests
+        """Whether noise and rig explain the errors.
+
+        The probability that good presses fail one of the two tests is at most `SIGNIFICANCE`, so each test has half of
+        it. The expected variances are not known exactly, and with many presses a small error of them is significant.
+        The scatter is therefore also accepted if its chi-squared sum is little larger than `degrees`, the expected sum.
+        """
+        max_p_value = 0.5 * SIGNIFICANCE
         max_accepted_chi_squared = MAX_ACCEPTED_CHI_SQUARED * self.degrees
-        scatter_is_large = self.p_value < max_p_value and self.chi_squared > max_accepted_chi_squared
-        common_error_is_large = self.common_p_value < max_p_value
-        return not scatter_is_large and not common_error_is_large
+        is_scatter_large = self.p_value < max_p_value and self.chi_squared > max_accepted_chi_squared
+        is_common_error_large = self.common_p_value < max_p_value
+        return not is_scatter_large and not is_common_error_large
 
 
 def _p_value(chi_squared: float, degrees: int) -> float:
@@ -400,8 +419,9 @@ def chi_squared_survival(statistic: float, degrees: int) -> float:
     if math.isinf(x):
         return 0.0
 
-    # The sum of x^s exp(-x) / Gamma(s + 1) over s = degrees / 2 - 1, degrees / 2 - 2, ... down to 0 or 1/2,
-    # plus erfc(sqrt(x)) if the number of degrees is odd. The term with the smallest s is computed first.
+    # With x = statistic / 2, the probability is the sum of x^s exp(-x) / Gamma(s + 1) over s = degrees / 2 - 1,
+    # degrees / 2 - 2, ... down to 0 or 1/2, plus erfc(sqrt(x)) if the number of degrees is odd. The term with the
+    # smallest s is computed first: exp(-x) for s = 0, and sqrt(4 x / pi) exp(-x) for s = 1/2.
     is_odd = degrees % 2 == 1
     smallest_s = 0.5 if is_odd else 0.0
     smallest_log_term = -x
@@ -412,7 +432,7 @@ def chi_squared_survival(statistic: float, degrees: int) -> float:
     term_count = degrees // 2
     s = smallest_s + np.arange(1, term_count)
     log_ratio_to_smallest = np.concatenate([[0.0], np.cumsum(np.log(x / s))])
-    log_terms = smallest_log_term + log_ratio_to_smallest[:term_count]
+    log_terms = smallest_log_term + log_ratio_to_smallest[:term_count]  # no term for one degree of freedom
     probability = float(np.exp(log_terms).sum())
     if is_odd:
         probability += math.erfc(math.sqrt(x))

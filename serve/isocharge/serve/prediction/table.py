@@ -13,7 +13,7 @@ from typing import TextIO
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans, Singles
 from isocharge.common.errors import ChargeError
 from isocharge.common.tables.csv_table import CsvTable
 from isocharge.common.tables.number_table import CHARGE_RULE, NumberTable, ignored_columns_message
@@ -111,34 +111,45 @@ def write_contacts(
         charge_pC: The charges of the presses, shape (n, electrodes), pC. If given together with `validity`, a row
             whose charges do not exceed the noise has a force of 0, and its other cells are empty.
     """
-    # Rows without a touch have the same cells.
     is_touch = np.ones(len(contacts.x_mm), dtype=bool)
     if validity is not None and charge_pC is not None:
         is_touch = validity.is_touch(charge_pC)
-    names = Contacts._fields[:N_WITHOUT_CORRELATION]
-    no_contact = tuple("0.000000" if name == "force_N" else "" for name in names)
 
-    # The rows are converted in blocks, so that the texts of a large table need not be in memory at once.
     writer = csv.writer(out, lineterminator="\n")
+    names = Contacts._fields[:N_WITHOUT_CORRELATION]
     header = names if validity is None else (*names, "flags")
     writer.writerow(header)
+
+    # The rows are converted in blocks, so that the texts of a large table need not be in memory at once.
     rows = np.column_stack(contacts)
     for start in range(0, len(rows), BLOCK_ROWS):
-        block = rows[start : start + BLOCK_ROWS]
-        block_is_touch = is_touch[start : start + BLOCK_ROWS].tolist()
-        values = block[:, :N_WITHOUT_CORRELATION].tolist()
-        flags: list[tuple[str, ...]] = [()] * len(block)
+        block = slice(start, start + BLOCK_ROWS)
+        writer.writerows(_contact_rows(rows[block], is_touch[block], validity))
+
+
+def _contact_rows(contact_values: Singles, is_touch: Booleans, validity: Validity | None) -> Iterator[tuple[str, ...]]:
+    """Yield the cells of a CSV row for each press. Without a touch, the force is 0 and the other cells are empty.
+
+    Args:
+        contact_values: Values of a `Contact` for each press, shape (n, 10). The correlations are not written.
+        is_touch: Whether something touches in each press, shape (n,).
+        validity: Domain of the model. If given, the last cell contains the flags, which are separated by blanks.
+    """
+    names = Contacts._fields[:N_WITHOUT_CORRELATION]
+    no_contact = tuple("0.000000" if name == "force_N" else "" for name in names)
+    values_of_press = contact_values[:, :N_WITHOUT_CORRELATION].tolist()
+    flags_of_press: list[tuple[str, ...]] = [()] * len(contact_values)
+    if validity is not None:
+        flags_of_press = validity.batch_flags(Contacts(*contact_values.T))
+    for values, is_touched, flags in zip(values_of_press, is_touch.tolist(), flags_of_press, strict=True):
+        cells = no_contact
+        flag_text = ""
+        if is_touched:
+            cells = tuple(f"{value:.6f}" for value in values)
+            flag_text = " ".join(flags)
         if validity is not None:
-            flags = validity.batch_flags(Contacts(*block.T))
-        for numbers, row_is_touch, row_flags in zip(values, block_is_touch, flags, strict=True):
-            cells = no_contact
-            flag_text = ""
-            if row_is_touch:
-                cells = tuple(f"{number:.6f}" for number in numbers)
-                flag_text = " ".join(row_flags)
-            if validity is not None:
-                cells = (*cells, flag_text)
-            writer.writerow(cells)
+            cells = (*cells, flag_text)
+        yield cells
 
 
 def blocks(rows: Array) -> Iterator[Array]:

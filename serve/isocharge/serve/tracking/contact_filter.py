@@ -65,7 +65,8 @@ class ContactFilter:
 
     def reset(self) -> None:
         """Discard the contact."""
-        # The filters start again with the first contact, so that their values here are never used.
+        # The filters start again with the first contact, so that their values here are never used. A position is a
+        # complex number x + iy.
         self._position_filter = TwoModeFilter.start(0j, 1.0, POSITION_MOTION)
         self._force_filter = TwoModeFilter.start(0.0, 1.0, FORCE_MOTION)
         self._tracked: TrackedContact | None = None
@@ -73,11 +74,14 @@ class ContactFilter:
         self._t_s = 0.0  # time of the latest frame that was no outlier
 
     def step(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> TrackedContact:
-        """Smooth the position and the force of the next frame, each with its own filter.
+        """Smooth the position and the logarithm of the force of the next frame, each with its own filter.
 
         Both filters start again after a gap in time, or if the filter of the position rejects the position. If only the
         force is rejected, only the filter of the force starts again. A rejected position is an outlier if the contact
         would have to move faster than `MAX_SPEED_mm_per_s`. Up to `MAX_OUTLIERS` outliers in succession are ignored.
+
+        The filters use only the share of the variances that is independent from frame to frame, because smoothing does
+        not reduce errors that are the same in all frames.
 
         Args:
             contact: Contact predicted by the model.
@@ -94,7 +98,7 @@ class ContactFilter:
         log_force = None
 
         # Continue the filters. A filter rejects a measured value far from its prediction, and then returns None.
-        dt_s = t_s - self._t_s
+        dt_s = t_s - self._t_s  # since the latest frame that was not ignored
         previous = self._tracked
         if previous is not None and 0.0 < dt_s <= MAX_GAP_s:
             position = self._position_filter.step(measured.position, dt_s, measured.shape, position_variance)
@@ -129,22 +133,27 @@ class ContactFilter:
             correlation = 0.0
         shape, position_variance = CovarianceShape.of_position(contact.x_std_mm, contact.y_std_mm, correlation)
         force_N = max(MIN_FORCE_N, contact.force_N)
+
+        # Share of the variances that belongs to noise that is independent from frame to frame.
         white_share = 1.0 - self._constant_share
         for flag in flags:
             white_share *= FLAG_VARIANCE_FACTORS.get(flag, 1.0)
         return MeasuredContact(
-            complex(contact.x_mm, contact.y_mm),
-            shape,
-            position_variance,
-            math.log(force_N),
-            contact.force_std_N / force_N,
-            white_share,
+            position=complex(contact.x_mm, contact.y_mm),
+            shape=shape,
+            position_variance=position_variance,
+            log_force=math.log(force_N),
+            log_force_std=contact.force_std_N / force_N,
+            white_share=white_share,
         )
 
     def _tracked_contact(
         self, contact: Contact, measured: MeasuredContact, position: Estimate, log_force: Estimate
     ) -> TrackedContact:
         """Return the smoothed contact, whose standard deviations include the constant errors of the model.
+
+        The filters smooth only errors that change from frame to frame. The variance of the constant errors is a fixed
+        share of the variance that the model states. It is added to the variance of the smoothed values.
 
         Args:
             contact: Contact predicted by the model.
@@ -153,10 +162,13 @@ class ContactFilter:
             log_force: Smoothed logarithm of the force.
         """
         constant_share = self._constant_share
+        # Standard deviation of the result, relative to the standard deviation that the model states.
         std_ratio = math.sqrt(position.variance / measured.position_variance + constant_share)
         constant_log_force_variance = measured.log_force_std * measured.log_force_std * constant_share
         log_force_std = math.sqrt(log_force.variance + constant_log_force_variance)
         force_N = math.exp(log_force.value.real)
+
+        # A held contact has no velocity. The mean velocity is that of the moving mode times its probability.
         moving_probability = self._position_filter.moving_probability
         velocity = moving_probability * self._position_filter.velocity
         return TrackedContact(

@@ -153,8 +153,8 @@ class ContactMixture:
     def update(self, charge_pC: Array, t_s: float) -> list[ContactHypothesis]:
         """Process the next frame.
 
-        The mixture is updated once for all frames of a step of `STEP_s`. Between the updates, the contacts are
-        extrapolated to the time of the frame.
+        The mixture is updated once for all frames of a step, which is a period of `STEP_s`. Between the updates, the
+        contacts are extrapolated to the time of the frame with their velocities.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
@@ -170,10 +170,14 @@ class ContactMixture:
         return [hypothesis.extrapolated(t_s - self._t_s) for hypothesis in self._hypotheses]
 
     def _process_step(self, t_s: float) -> None:
-        """Update the mixture with the mean charges of the frames of a step. The step ends at time `t_s`."""
+        """Update the mixture with the mean charges of the frames of a step. The next step begins.
+
+        Args:
+            t_s: Time of the latest frame of the step, s.
+        """
         charges, times_s = zip(*self._step_frames, strict=True)  # charges and time of each frame
         mean_time_s = sum(times_s) / len(times_s)
-        dt_s = mean_time_s - self._t_s
+        dt_s = mean_time_s - self._t_s  # since the mean time of the previous step
         self._step_frames = []
         self._step_begin_s = t_s
         self._t_s = mean_time_s
@@ -206,7 +210,8 @@ class ContactMixture:
         """Search the whole film for contacts that explain the charges.
 
         Components with large variances are placed on a spiral that covers the film, and are then updated with the
-        charges.
+        charges. A state contains the position, the logarithm of the force, the rates of these three, and the logarithm
+        of the gain of each electrode.
 
         Args:
             measurement: Charges of this step.
@@ -215,9 +220,10 @@ class ContactMixture:
             The components that explain the charges; None if there are none.
         """
         n_electrode = measurement.charge_pC.size
-        mean = np.zeros((N_INITIAL_COMPONENTS, N_MOTION + n_electrode))
+        mean = np.zeros((N_INITIAL_COMPONENTS, N_MOTION + n_electrode))  # rates and logarithms of gains are 0
         mean[:, CONTACT] = self._initial_contacts
 
+        # Standard deviation of each entry of the state. Each component covers an equal part of the film.
         std = np.empty(N_MOTION + n_electrode)
         std[POSITION] = self.charges.radius_mm / math.sqrt(N_INITIAL_COMPONENTS)
         std[LOG_FORCE] = INITIAL_LOG_FORCE_STD
@@ -226,14 +232,16 @@ class ContactMixture:
         std[GAINS] = GAIN_STD
         covariance = np.tile(np.diag(std**2.0), (N_INITIAL_COMPONENTS, 1, 1))
 
-        components = Components(mean, covariance, np.zeros(N_INITIAL_COMPONENTS))
+        equal_log_weights = np.zeros(N_INITIAL_COMPONENTS)
+        components = Components(mean, covariance, equal_log_weights)
         return self._update(components, measurement, INITIAL_ITERATIONS)
 
     def _advance(self, components: Components, measurement: Measurement, dt_s: float) -> Components | None:
         """Predict the components, and update them with the charges of a step.
 
-        A component with another velocity is added if the innovation of the most probable component is large, or if
-        the most probable component is fast.
+        A component with another velocity is added if the innovation of the most probable component (measured minus
+        predicted charges) is large, or if the most probable component is fast. The update then determines which of the
+        components is right.
 
         Args:
             components: Components after the previous step.
@@ -244,6 +252,9 @@ class ContactMixture:
             The updated components; None if no component explains the charges.
         """
         predicted = predict_components(components, dt_s)
+
+        # The added component begins as a copy of the most probable component. Its weight is multiplied by the
+        # probability that the velocity has changed suddenly since the previous step.
         most_probable = predicted.best
         added_mean = predicted.mean[most_probable].copy()
         added_covariance = predicted.covariance[most_probable].copy()
@@ -265,6 +276,10 @@ class ContactMixture:
     def _squared_innovation(self, components: Components, measurement: Measurement) -> float:
         """Compute the squared Mahalanobis distance of the innovation of the most probable component.
 
+        The innovation v is the difference of the measured and the predicted charges. Its covariance is S = J P J^T + R,
+        where P is the covariance of the state, J the derivative of the charges with respect to the state, and R the
+        covariance of the noise. The result is v^T S^-1 v.
+
         Args:
             components: Predicted components.
             measurement: Charges of this step.
@@ -281,6 +296,9 @@ class ContactMixture:
     ) -> tuple[Array, LinearisedUpdate]:
         """Search for the state of each component that is most probable after the measured charges.
 
+        Each iteration linearises the charges about the present state and computes the Kalman update of the prior mean
+        with them. The state moves towards the updated mean, but not beyond the range of the linearisation.
+
         Args:
             prior: Predicted components.
             measurement: Charges of this step.
@@ -292,15 +310,15 @@ class ContactMixture:
         state = prior.mean
         linearised = linearise_update(self.charges, state, prior, measurement)
         for _ in range(iterations):
-            transposed = linearised.cross_covariance.swapaxes(1, 2)
-            change_from_prior = (transposed @ linearised.weighted_innovation)[:, :, 0]
+            state_charge_covariance = linearised.cross_covariance.swapaxes(1, 2)  # (n_component, n_state, n_electrode)
+            change_from_prior = (state_charge_covariance @ linearised.weighted_innovation)[:, :, 0]
             step = prior.mean + change_from_prior - state
             state = state + limit_iteration_step(step)
             linearised = linearise_update(self.charges, state, prior, measurement)
         return state, linearised
 
     def _update(self, prior: Components, measurement: Measurement, iterations: int) -> Components | None:
-        """Update the components with the charges, and prune and split them.
+        """Update the components with the charges, and then prune and split them.
 
         The weight of each component is multiplied by its likelihood. Components outside of the film are removed. If the
         most probable component does not explain the charges, there is no contact.
@@ -315,11 +333,12 @@ class ContactMixture:
         """
         state, linearised = self._most_probable_states(prior, measurement, iterations)
 
-        # Likelihood p of each component: -2 ln p = squared misfit + squared change of the state + ln det(covariance).
-        # All squares have the shape (n_component,).
+        # Likelihood p of each component: -2 ln p = squared misfit + squared change of the state + ln det(covariance of
+        # the innovation). The change of the state is relative to its covariance before the update. All terms have the
+        # shape (n_component,).
         residual_pC = measurement.charge_pC - linearised.charge_pC
         squared_misfit = (residual_pC**2 / measurement.variance).sum(axis=1)
-        column = linearised.weighted_innovation
+        column = linearised.weighted_innovation  # S^-1 v of the innovation v with the covariance S
         row = column.swapaxes(1, 2)
         squared_state_change = (row @ linearised.charge_covariance @ column)[:, 0, 0]
         square = squared_misfit + squared_state_change
@@ -341,6 +360,9 @@ class ContactMixture:
     def _split_at_fold(self, components: Components) -> Components:
         """Add a component towards each side of a fold if the most probable component extends across the fold.
 
+        At a fold of the map from contacts to charges, two contacts with equal charges meet. The contact may be on
+        either side, but a single Gaussian component describes only one side well.
+
         Args:
             components: Components after the update with the charges of this step.
 
@@ -351,6 +373,8 @@ class ContactMixture:
         mean = components.mean[best]
         covariance = components.covariance[best]
         has_space_for_two = len(components.mean) <= MAX_COMPONENTS - 2
+
+        # Standard deviation of the position along the longest axis of its covariance
         variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])
         longest = variances.size - 1  # `eigh` returns the variances in ascending order
         std_mm = math.sqrt(max(variances[longest], 0.0))  # rounding errors may make the variance negative
@@ -390,7 +414,8 @@ class ContactMixture:
         state_jacobian = jacobians[0]  # shape (n_electrode, 3)
         other_jacobians = jacobians[1:]
 
-        # With more than three electrodes, the Jacobians are not square, but this product of two Jacobians is.
+        # For three electrodes, det(J^T K) = det(J) det(K), which is negative if the two determinants differ in sign.
+        # With more electrodes, the Jacobians J and K are not square, but the product is.
         relative_orientation = np.linalg.det(state_jacobian.T @ other_jacobians)
         return np.asarray(relative_orientation < 0.0)
 
@@ -398,7 +423,7 @@ class ContactMixture:
         """Combine the components that describe the same contact.
 
         The most probable component and all components of the same contact form a group. The components that remain are
-        grouped in the same way.
+        grouped in the same way, until no component remains.
 
         Args:
             components: Components after the update with the charges of this step.
@@ -419,21 +444,24 @@ class ContactMixture:
         return sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)
 
     def _is_same_contact(self, components: Components, rows: Integers) -> Booleans:
-        """Return which components describe the same contact as the first component.
+        """Return which components describe the same contact as the component of the first row.
+
+        Components of the same contact are near each other, and no fold of the map from contacts to charges lies between
+        them. They are near if x and y differ by less than a few standard deviations of the difference.
 
         Args:
             components: All components.
-            rows: Indices of the components to compare, shape (n,).
+            rows: Indices of the components to compare, shape (n,). The first one is the reference.
 
         Returns:
-            Whether each component is near the first one and on the same side of the folds, shape (n,).
+            Whether each component of `rows` describes the same contact, shape (n,).
         """
         first = rows[0]
         mean = components.mean[rows]
         position_variance = components.covariance[:, [X, Y], [X, Y]]  # of x and of y, shape (n_component, 2)
-        std_mm = np.sqrt(position_variance[first] + position_variance[rows])
-        distance_mm = np.abs(mean[:, POSITION] - components.mean[first, POSITION])
-        is_near = (distance_mm < SEPARATE_DISTANCE * std_mm).all(axis=1)
+        difference_std_mm = np.sqrt(position_variance[first] + position_variance[rows])
+        difference_mm = np.abs(mean[:, POSITION] - components.mean[first, POSITION])
+        is_near = (difference_mm < SEPARATE_DISTANCE * difference_std_mm).all(axis=1)
         is_same = is_near & ~self._is_across_fold(components.mean[first], mean)
         is_same[0] = True  # even if rounding errors make the first component appear to be across a fold
         return np.asarray(is_same)
@@ -442,7 +470,8 @@ class ContactMixture:
 def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:
     """Return contacts (x, y, ln F) of medium force on a spiral that covers the film, shape (n, 3).
 
-    On this spiral (Vogel 1979), the contacts cover equal areas of the film.
+    On this spiral (Vogel 1979), the contacts cover equal areas of the film: the radius grows with the square root of
+    the number of the contact, and successive contacts differ by the golden angle.
     """
     number = np.arange(N_INITIAL_COMPONENTS)
     angle = GOLDEN_ANGLE * number

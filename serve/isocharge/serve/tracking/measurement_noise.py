@@ -47,7 +47,7 @@ class CovarianceShape(NamedTuple):
 
     @classmethod
     def of_position(cls, x_std_mm: float, y_std_mm: float, correlation: float) -> tuple["CovarianceShape", float]:
-        """Split the covariance of a position into its shape and its size.
+        """Split the covariance of a position into its shape and its size: covariance = size * shape.
 
         Args:
             x_std_mm: Standard deviation of x, mm.
@@ -57,8 +57,8 @@ class CovarianceShape(NamedTuple):
         Returns:
             The shape, and the square root of the determinant of the covariance, mm^2.
         """
-        # The determinant is (x_std * y_std)^2 * (1 - correlation^2). The shape is the covariance divided by the square
-        # root of the determinant, and its inverse is stored, divided by the number of dimensions.
+        # The determinant is (x_std * y_std)^2 * (1 - correlation^2). The size is its square root, so that the shape has
+        # the determinant 1. The inverse of the shape is stored, divided by the number of dimensions.
         uncorrelated_share = 1.0 - correlation * correlation
         root = math.sqrt(max(uncorrelated_share, MIN_UNCORRELATED_SHARE))
         size_mm2 = x_std_mm * y_std_mm * root
@@ -108,7 +108,8 @@ class NoiseEstimate(NamedTuple):
         """Return the estimate after another measured value.
 
         The value is compared with the linear extrapolation of the two previous values. The estimate is the mean of the
-        squared errors of these extrapolations, relative to the variance stated by the model.
+        squared errors of these extrapolations over the latest frames, relative to the error that the variance stated by
+        the model would cause. The squared error of one frame is limited, because a sudden movement is not noise.
 
         Args:
             measured: The measured value: a position x + iy, mm, or the logarithm of a force.
@@ -118,16 +119,18 @@ class NoiseEstimate(NamedTuple):
         """
         change = measured - self.measured
         rate = change / dt_s
-        if self.dt_s <= 0.0:  # there is no previous rate yet
+        if self.dt_s <= 0.0:  # there is only one previous value, so that no value can be extrapolated
             return self._replace(measured=measured, rate=rate, dt_s=dt_s)
 
         # The error is x2 - (1 + r) x1 + r x0, where r is the ratio of the two intervals. The noise of the three values
-        # is independent, so that their variances add up.
+        # is independent, so that the error has the variance (1 + (1 + r)^2 + r^2) times the variance of one value.
         time_ratio = dt_s / self.dt_s
         extrapolation_variance = stated_variance * (1.0 + time_ratio * time_ratio + (1.0 + time_ratio) ** 2)
         extrapolation_error = change - self.rate * dt_s
         relative_square = shape.mean_square(extrapolation_error) / extrapolation_variance
         limited_square = min(relative_square, MAX_RELATIVE_SQUARE * self.relative_variance)
+
+        # Running mean, in which the number of frames is limited so that the estimate follows changes of the noise.
         frames = min(self.frames + 1, MAX_FRAMES)
         mean_square = self.relative_variance + (limited_square - self.relative_variance) / frames
         relative_variance = min(max(mean_square, MIN_RELATIVE_VARIANCE), MAX_RELATIVE_VARIANCE)

@@ -97,7 +97,7 @@ class ContactHypothesis(NamedTuple):
         multiplied by the standard deviation of this logarithm.
         """
         x_mm, y_mm, log_force = self.mean[CONTACT].tolist()
-        covariance = self.covariance[CONTACT, CONTACT]
+        covariance = self.covariance[CONTACT, CONTACT]  # of x, y and ln F, shape (3, 3)
         std = np.sqrt(covariance.diagonal())
         correlation = covariance / np.outer(std, std)
         x_std_mm, y_std_mm, log_force_std = std.tolist()
@@ -179,6 +179,7 @@ def predict_components(components: Components, dt_s: float) -> Components:
         components: Components after the previous step.
         dt_s: Time since the previous step, s.
     """
+    # A state contains a contact (x, y, ln F), its rates, and gains, which stay the same.
     mean = components.mean.copy()
     mean[:, CONTACT] += dt_s * mean[:, RATES]
 
@@ -186,7 +187,8 @@ def predict_components(components: Components, dt_s: float) -> Components:
     transition[CONTACT, RATES] = dt_s * np.eye(3)
     covariance = transition @ components.covariance @ transition.T
 
-    # The process noise of the position is proportional to the squared speed, because contacts at rest rarely move.
+    # The white acceleration makes the velocity uncertain. Its density for the position is proportional to the squared
+    # speed, because contacts at rest rarely move, but it is never 0.
     squared_speed = (mean[:, VELOCITY] ** 2).sum(axis=1)
     relative_density = np.maximum(squared_speed / POSITION_MOTION.velocity_variance, MIN_ACCELERATION_SHARE)
     position_density = POSITION_MOTION.acceleration_density * relative_density
@@ -215,7 +217,11 @@ def _add_process_noise(covariance: Array, value: int, rate: int, density: Array 
 def prune_components(components: Components) -> Components:
     """Remove improbable components, and merge similar components.
 
-    At most the `MAX_COMPONENTS` most probable components remain.
+    A component is merged into a more probable component with a similar motion: only its weight is added. At most the
+    `MAX_COMPONENTS` most probable components remain.
+
+    Args:
+        components: Components after an update. The largest logarithm of their weights is 0.
     """
     log_weight = components.log_weight.copy()
     descending_rows = np.argsort(-log_weight, kind="stable")
@@ -225,7 +231,7 @@ def prune_components(components: Components) -> Components:
         similar_row = _similar_component(components, row, selected)
         if similar_row is None:
             selected.append(row)
-        else:  # add the weight of this component to the weight of the similar component
+        else:
             log_weight[similar_row] = np.logaddexp(log_weight[similar_row], log_weight[row])
     return components._replace(log_weight=log_weight).select(selected[:MAX_COMPONENTS])
 
@@ -233,22 +239,25 @@ def prune_components(components: Components) -> Components:
 def _similar_component(components: Components, row: int, candidates: list[int]) -> int | None:
     """Return the first candidate whose motion is similar to the motion of a component; None if there is none.
 
+    The motion is x, y, ln F and their rates. It is similar if each of these values differs by less than
+    `MERGE_DISTANCE` standard deviations of the component.
+
     Args:
         components: All components.
         row: Row of the component.
         candidates: Rows of the candidates.
     """
-    mean = components.mean[:, MOTION]
+    motion = components.mean[:, MOTION]
     std = np.sqrt(components.covariance[row].diagonal()[MOTION])
     for candidate in candidates:
-        distance = np.abs(mean[row] - mean[candidate])
-        if (distance < MERGE_DISTANCE * std).all():
+        difference = np.abs(motion[row] - motion[candidate])
+        if (difference < MERGE_DISTANCE * std).all():
             return candidate
     return None
 
 
 def combine_components(components: Components, probability: Array) -> ContactHypothesis:
-    """Combine components of the same contact into one Gaussian with the same mean and covariance of the state.
+    """Combine components of the same contact into one Gaussian with the mean and the covariance of their mixture.
 
     Args:
         components: The components.
@@ -260,7 +269,7 @@ def combine_components(components: Components, probability: Array) -> ContactHyp
     total_probability = probability.sum()
     share = probability / total_probability
     mean = share @ components.mean
-    deviation = components.mean - mean
+    deviation = components.mean - mean  # shape (n, n_state)
 
     # The covariance of a mixture is the mean of the covariances plus the covariance of the means.
     covariance_within = np.tensordot(share, components.covariance, 1)

@@ -49,9 +49,12 @@ class LinearisedUpdate(NamedTuple):
 def charges_and_jacobian(charges: ChargeSeries, mean: Array) -> tuple[Array, Array]:
     """Compute the charges of states, and their derivatives with respect to the state.
 
+    The charge of an electrode is the charge of the film times the gain of the electrode.
+
     Args:
         charges: Charges of the film.
-        mean: States, shape (n, 6 + n_electrode).
+        mean: States, shape (n, 6 + n_electrode): contact (x, y, ln F), rates of these three values, and logarithms of
+            the gains.
 
     Returns:
         The charges, shape (n, n_electrode), pC, and their derivatives, shape (n, n_electrode, 6 + n_electrode).
@@ -60,10 +63,12 @@ def charges_and_jacobian(charges: ChargeSeries, mean: Array) -> tuple[Array, Arr
     gains = np.exp(mean[:, GAINS])  # the state has the logarithms of the gains
     charge_pC = film_charge_pC * gains
 
-    # Derivatives with respect to the contact, its rates and the logarithms of the gains.
+    # Derivatives with respect to the contact, its rates and the logarithms of the gains. The charges do not depend on
+    # the rates. The derivative of a charge with respect to the logarithm of its own gain is the charge itself.
     contact_jacobian = film_jacobian * gains[:, :, None]
     rate_jacobian = np.zeros((*charge_pC.shape, 3))
-    gain_jacobian = charge_pC[:, :, None] * np.eye(charge_pC.shape[1])
+    n_electrode = charge_pC.shape[1]
+    gain_jacobian = charge_pC[:, :, None] * np.eye(n_electrode)
     jacobian = np.concatenate([contact_jacobian, rate_jacobian, gain_jacobian], axis=2)
     return charge_pC, jacobian
 
@@ -72,6 +77,10 @@ def linearise_update(
     charges: ChargeSeries, state: Array, prior: Components, measurement: Measurement
 ) -> LinearisedUpdate:
     """Linearise the charges about a state of each component, and compute the quantities of a Kalman update.
+
+    With the Jacobian J of the charges, the prior covariance P and the covariance R of the measurement, the covariance
+    of the charges and the state is J P, and the covariance of the innovation is S = J P J^T + R. The innovation v is
+    the measured charges minus the linearised charges of the prior mean, and the weighted innovation is S^-1 v.
 
     Args:
         charges: Charges of the film.
@@ -85,9 +94,9 @@ def linearise_update(
     charge_covariance = cross_covariance @ transposed
     innovation_covariance = charge_covariance + np.diag(measurement.variance)
 
-    # The linearised charges of the prior mean are the charges of the state plus this change.
-    prior_rows = (prior.mean - state)[:, None]  # shape (n, 1, 6 + n_electrode)
-    prior_change_pC = (prior_rows @ transposed)[:, 0]
+    # The linearised charges of the prior mean are the charges of the state plus J times (prior mean minus state).
+    prior_difference = (prior.mean - state)[:, None]  # shape (n, 1, 6 + n_electrode)
+    prior_change_pC = (prior_difference @ transposed)[:, 0]
     innovation = measurement.charge_pC - charge_pC - prior_change_pC
     weighted_innovation = np.linalg.solve(innovation_covariance, innovation[:, :, None])
     return LinearisedUpdate(
@@ -98,11 +107,14 @@ def linearise_update(
 def updated_covariance(prior: Components, linearised: LinearisedUpdate) -> Array:
     """Return the covariances of the components after a Kalman update, shape (n, 6 + n_electrode, 6 + n_electrode).
 
+    The updated covariance is P - C^T S^-1 C, where P is the covariance of the prior, C is the covariance of the charges
+    and the state, and S is the covariance of the innovation. S^-1 C is the transposed Kalman gain.
+
     Args:
         prior: Predicted components.
         linearised: The update, linearised about the new states.
     """
-    cross_covariance = linearised.cross_covariance
+    cross_covariance = linearised.cross_covariance  # shape (n, n_electrode, 6 + n_electrode)
     transposed_gain = np.linalg.solve(linearised.innovation_covariance, cross_covariance)
     covariance = prior.covariance - cross_covariance.swapaxes(1, 2) @ transposed_gain
     symmetric = 0.5 * (covariance + covariance.swapaxes(1, 2))  # rounding errors would make it asymmetric
@@ -111,6 +123,9 @@ def updated_covariance(prior: Components, linearised: LinearisedUpdate) -> Array
 
 def limit_iteration_step(step: Array) -> Array:
     """Shorten long steps of the state, so that the linearisation is accurate over each step.
+
+    A step is too long if the position changes by more than `MAX_ITERATION_STEP_mm`, or the logarithm of the force by
+    more than `MAX_ITERATION_LOG_STEP`. The whole step is then divided by the ratio to the limit.
 
     Args:
         step: Step of the state of each component, shape (n, 6 + n_electrode).

@@ -36,7 +36,7 @@ class TouchEvents:
             t_s: Time of the frame, s.
         """
         self._press_s = t_s
-        self._rest_position = complex(tracked.x_mm, tracked.y_mm)
+        self._rest_position = complex(tracked.x_mm, tracked.y_mm)  # a position is x + iy, mm
         self._rest_begin_s = t_s
         self._latest_event = "press"
         return "press"
@@ -45,10 +45,11 @@ class TouchEvents:
         """Return the event that begins with a frame; None if there is none.
 
         A slide begins when the contact moves and is away from the position at which it last rested. A hold begins when
-        the contact has rested at one position for `HOLD_TIME_s`. The same event does not occur twice in succession.
+        the contact has rested at one position for `HOLD_TIME_s`. The same event does not occur twice in succession. If
+        it is uncertain whether the contact moves or rests, nothing begins.
 
         Args:
-            tracked: The tracked contact.
+            tracked: The tracked contact. Its attribute `moving` is the probability that it moves.
             t_s: Time of the frame, s.
         """
         position = complex(tracked.x_mm, tracked.y_mm)
@@ -58,7 +59,7 @@ class TouchEvents:
                 self._latest_event = "slide"
                 return "slide"
         elif tracked.moving < REST_PROBABILITY:
-            if is_away:
+            if is_away:  # the contact begins to rest at another position
                 self._rest_position = position
                 self._rest_begin_s = t_s
             elif self._latest_event != "hold" and t_s - self._rest_begin_s >= HOLD_TIME_s:

@@ -70,6 +70,9 @@ class Tracker:
     ) -> tuple[TrackedContact | None, str | None]:
         """Process the next frame.
 
+        On most films, a filter smooths the contacts that the model predicts. On a film on which several contacts may
+        have the same charges, a mixture tracks these contacts by the charges themselves.
+
         Args:
             contact: Contact predicted by the model; None if nothing touches, or the frame is invalid.
             t_s: Time of the frame on any clock, s.
@@ -77,9 +80,9 @@ class Tracker:
             charge_pC: Touch charges of the frame, shape (n_electrode,), pC; only needed with a mixture.
 
         Returns:
-            The tracked contact, and the event that begins with this frame. The contact is None if nothing touches or no
-            contact explains the charges. The event is `press`, `hold`, `slide`, `tap` or `release`; None if no event
-            begins.
+            The tracked contact, and the event that begins with this frame. The contact is None if nothing touches, or
+            if no contact has explained the charges since the touch began. The event is `press`, `hold`, `slide`, `tap`
+            or `release`; None if no event begins.
         """
         self.mixture_contact = None
         if contact is None:
@@ -90,10 +93,10 @@ class Tracker:
         if self.mixture is None or charge_pC is None:
             tracked = self._filter.step(contact, t_s, flags)
         else:
-            hypotheses: list[ContactHypothesis] = []
+            hypotheses: list[ContactHypothesis] = []  # possible contacts, the most probable first
             if SATURATED not in flags:
                 hypotheses = self.mixture.update(charge_pC, t_s)
-            if not hypotheses:  # the frame contains no information about the contact
+            if not hypotheses:  # the frame contains no information, so that the previous contact stays
                 return self._tracked, None
             self.mixture_contact = hypotheses[0].contact
             self.other = _other_contact(hypotheses)
@@ -113,7 +116,7 @@ class Tracker:
                 self.mixture.reset()
             return None
         event = self._events.end(t_s)
-        self.reset()
+        self.reset()  # afterwards, because it also discards the events
         return event
 
 

@@ -106,7 +106,7 @@ class RecordedTape(Tape):
         """
         super().__init__(dtype)
         self._file = tempfile.TemporaryFile()  # noqa: SIM115
-        self._piece_s = FIRST_PIECE_S
+        self._piece_s = FIRST_PIECE_S  # duration of a piece
         self._max_force_N: list[float] = []
         self._map(LIVE_SAMPLES)
 
@@ -126,7 +126,7 @@ class RecordedTape(Tape):
         known_s = np.nan_to_num(samples["timestamp"], nan=0.0)
         largest_so_far_s = np.maximum.accumulate(known_s)
         ordered["timestamp"] = np.maximum(largest_so_far_s, latest_s)
-        while self.total + len(ordered) > len(self._ring):
+        while self.total + len(ordered) > len(self._ring):  # a recording is stored completely
             self._map(2 * len(self._ring))
         super().append(ordered)
         self._update_overview(ordered)
@@ -149,7 +149,7 @@ class RecordedTape(Tape):
         Args:
             samples: New samples, shape (n,), whose times do not decrease.
         """
-        elapsed_s = samples["timestamp"] - self.timestamp(0)
+        elapsed_s = samples["timestamp"] - self.timestamp(0)  # time since the first sample of the recording
         while elapsed_s[-1] >= MAX_PIECES * self._piece_s:
             pairs = [self._max_force_N[first : first + 2] for first in range(0, len(self._max_force_N), 2)]
             self._max_force_N = [max(pair) for pair in pairs]
@@ -159,9 +159,9 @@ class RecordedTape(Tape):
         new_piece_count = piece_count - len(self._max_force_N)
         self._max_force_N += [0.0] * new_piece_count
 
-        # Neighbouring samples of one piece form a run.
+        # Neighbouring samples of one piece form a run, whose largest force NumPy computes in one call for all runs.
         force_N = np.nan_to_num(samples["force_N"], nan=0.0)
-        begins_run = np.diff(piece_of_sample, prepend=-1) != 0
+        begins_run = np.diff(piece_of_sample, prepend=-1) != 0  # the first sample always begins a run
         run_starts = np.flatnonzero(begins_run)
         run_pieces = piece_of_sample[run_starts].tolist()
         run_max_N = np.maximum.reduceat(force_N, run_starts).tolist()
@@ -186,7 +186,9 @@ class Playhead:
     has_jumped: bool = True
 
     def advance(self, step_s: float, end_s: float, *, is_complete: bool) -> bool:
-        """Advance the position.
+        """Advance the position in a recording that is played. At its end, playing stops.
+
+        The end of the part that has been read so far only limits the position, because the next part may follow.
 
         Args:
             step_s: Time since the latest call, s.
@@ -206,7 +208,7 @@ class Playhead:
         """Carry out a request of the page. Playing at the end of the recording begins at its start.
 
         Args:
-            request: The request.
+            request: A new speed, a new position (s from the start of the recording), or a request to pause or to play.
             end_s: Length of the part of the recording that has been read, s.
         """
         match request:
@@ -310,8 +312,8 @@ class Hub:
 
     async def run(self) -> None:
         """Receive samples and messages, and wake the viewers. The method ends when the reader has ended."""
-        progress_update_s = 0.0
-        while self._link.is_open:
+        progress_update_s = 0.0  # Unix time of the latest update
+        while self._link.is_open:  # the reader has not ended
             self._receive()
             if time.time() - progress_update_s > PROGRESS_INTERVAL_S:
                 progress_update_s = time.time()
@@ -319,7 +321,7 @@ class Hub:
             self._wake_viewers()
             await asyncio.sleep(POLL_INTERVAL_S if self.viewers else IDLE_POLL_INTERVAL_S)
         self.has_ended = True
-        self._wake_viewers()
+        self._wake_viewers()  # so that they see `has_ended`
 
     def _wake_viewers(self) -> None:
         """Wake all viewers, which then check whether they have new samples."""
@@ -344,7 +346,7 @@ class Hub:
     def _update_state(self, message: dict[str, Any]) -> None:
         """Update the state with the values in a message of the reader.
 
-        A marker is appended to the list of markers. All other values replace the values with the same names.
+        A marker is appended to the list of the latest markers. All other values replace those with the same names.
         """
         values = dict(message)
         marker = values.pop("marker", None)
@@ -352,7 +354,7 @@ class Hub:
             markers = [*self.state.get("markers", ()), marker]
             self.state["markers"] = markers[-MAX_MARKERS:]
         self.state.update(values)
-        self.version += 1
+        self.version += 1  # each viewer sends the state again if the version has changed
 
 
 class Viewer:
@@ -434,12 +436,12 @@ class Viewer:
         tape = self._hub.tape
         self._begin_anew_after_jump()
         stop = self._first_hidden_sample()
-        start = max(self._next_sample, tape.oldest)
-        begins_anew = self._begins_anew
+        start = max(self._next_sample, tape.oldest)  # older samples are no longer on the tape
+        begins_anew = self._begins_anew  # the page then discards what it shows, even if there are no samples
         self._begins_anew = False
         if stop <= start and not begins_anew:
             return None
-        self._missed_samples += start - self._next_sample  # they are no longer on the tape
+        self._missed_samples += start - self._next_sample
         self._next_sample = stop
         self._sent_messages += 1
         limit = MAX_MESSAGE_SAMPLES if begins_anew else max_samples

@@ -114,10 +114,10 @@ class PageEnd(LinkEnd):
     _incomplete: bytes = b""
 
     def receive_samples(self, size: int) -> bytes:
-        """Return the samples that have already arrived. The method does not wait.
+        """Return the complete samples that have already arrived. The method does not wait.
 
         Args:
-            size: Size of a sample, bytes. An incomplete sample is kept for the next call.
+            size: Size of a sample, bytes. The bytes of an incomplete sample are kept for the next call.
         """
         data = self._incomplete
         try:

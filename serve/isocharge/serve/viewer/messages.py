@@ -59,15 +59,19 @@ OTHER_PREFIX = "other_"
 
 
 def _live_numbers() -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the numbers in a sample, which come from the record and from its `other` contact."""
+    """Return the names of the numbers in a sample: those of the record, and those of its `other` contact.
 
-    def live_names(fields: Sequence[Field]) -> tuple[str, ...]:
-        """Return the names of the fields that are numbers and are shown on the live page."""
-        return tuple(field.name for field in fields if field.meaning.is_shown_live and field.kind == "number")
-
+    The timestamp is not among the names, because a sample contains it as a number of another type.
+    """
     (other_field,) = (field for field in RECORD_FIELDS if field.name == "other")
-    record_names = tuple(name for name in live_names(RECORD_FIELDS) if name != "timestamp")
-    return record_names, live_names(other_field.parts)
+    record_names = tuple(name for name in _live_names(RECORD_FIELDS) if name != "timestamp")
+    other_names = _live_names(other_field.parts)
+    return record_names, other_names
+
+
+def _live_names(fields: Sequence[Field]) -> tuple[str, ...]:
+    """Return the names of the fields that are numbers and are shown on the live page."""
+    return tuple(field.name for field in fields if field.meaning.is_shown_live and field.kind == "number")
 
 
 RECORD_NUMBERS, OTHER_NUMBERS = _live_numbers()
@@ -109,8 +113,9 @@ class SampleFormat:
 
     def describe(self) -> dict[str, Any]:
         """Return the layout for the page: the size of a sample (bytes), and the offset of each number (bytes)."""
+        layout: Mapping[str, Any] = self.dtype.fields or {}  # name, and (type, offset) or (type, offset, title)
         offsets = {}
-        for name, (_type, offset, *_title) in (self.dtype.fields or {}).items():
+        for name, (_type, offset, *_title) in layout.items():
             if name != "padding":
                 offsets[name] = offset
         return {"bytes": self.dtype.itemsize, "offsets": offsets}
@@ -118,8 +123,8 @@ class SampleFormat:
     def pack(self, record: PredictionRecord) -> bytes:
         """Return a record as the bytes of a sample.
 
-        The sample contains the tracked contact if there is one, because the page shows it. Unknown numbers become NaN,
-        and each flag is one bit.
+        The sample contains the tracked contact if there is one, because the page shows it. Numbers of another contact
+        that also explains the charges follow. Unknown numbers become NaN, and each flag is one bit.
         """
         bits = CONTACT_BIT if record.contact else 0
         for flag in record.flags:
@@ -138,7 +143,7 @@ class SampleFormat:
         charges = [charge_by_electrode.get(name) for name in self.electrodes]
         charge_pC = [math.nan if charge is None else charge for charge in charges]
         timestamp = math.nan if record.timestamp is None else record.timestamp
-        record_count = 1
+        record_count = 1  # the page may later receive several samples as a single one, which counts all records
         try:
             return self._struct.pack(timestamp, *numbers, bits, record_count, *charge_pC)
         except OverflowError:  # a number is beyond the range of float32
@@ -153,9 +158,10 @@ def _clip(values: Sequence[float]) -> list[float]:
 def coalesce(samples: Samples, max_samples: int) -> Samples:
     """Coalesce samples. Each returned sample represents a run of neighbouring samples.
 
-    The latest sample of a run is returned. If the latest sample is not a contact, the sample of the run with the
+    The latest sample of a run is returned. If the latest sample is not a contact, the contact of the run with the
     largest force is returned instead, so that a short tap is not lost. The returned sample has the flags of all samples
-    of the run, their largest latency, and the sum of their numbers of records.
+    of the run, their largest latency, and the sum of their numbers of records. One bit of the flags is set if a sample
+    is a contact. This bit is taken from the returned sample alone.
 
     Args:
         samples: The samples, shape (n,).
@@ -166,30 +172,36 @@ def coalesce(samples: Samples, max_samples: int) -> Samples:
     """
     if len(samples) <= max_samples:
         return samples
+    # Start of each run, and the end of the last run
     edges = np.linspace(0, len(samples), max_samples + 1).astype(int)
-    starts = edges[:-1]
     shown: Samples = samples[_shown_positions(samples, edges)]
     contact_bit = shown["flags"] & CONTACT_BIT
+
+    # `reduceat` combines the values from each start to the next.
+    starts = edges[:-1]
     run_flags = np.bitwise_or.reduceat(samples["flags"], starts) & ~np.uint32(CONTACT_BIT)
     shown["flags"] = run_flags | contact_bit
     shown["records"] = np.add.reduceat(samples["records"], starts)
-    shown["latency_us"] = np.fmax.reduceat(samples["latency_us"], starts)
+    shown["latency_us"] = np.fmax.reduceat(samples["latency_us"], starts)  # ignores latencies that are NaN
     return shown
 
 
 def _shown_positions(samples: Samples, edges: np.ndarray) -> np.ndarray:
-    """Return the index of the sample that represents each run, shape (n_run,).
+    """Return the index of the sample that represents each run of neighbouring samples, shape (n_run,).
+
+    The latest sample represents a run. If a contact has ended in the run, its sample with the largest force does.
 
     Args:
         samples: The samples, shape (n,).
         edges: Start of each run, and the end of the last run, shape (n_run + 1,).
     """
     is_contact = (samples["flags"] & CONTACT_BIT) != 0
-    force_N = np.where(is_contact, np.nan_to_num(samples["force_N"], nan=0.0), -1.0)
-    last = edges[1:] - 1
-    largest_force = np.array([start + int(force_N[start:stop].argmax()) for start, stop in pairwise(edges)])
-    contact_has_ended = ~is_contact[last] & is_contact[largest_force]
-    return np.where(contact_has_ended, largest_force, last)
+    known_force_N = np.nan_to_num(samples["force_N"], nan=0.0)
+    force_N = np.where(is_contact, known_force_N, -1.0)  # every contact has a larger value than no contact
+    latest = edges[1:] - 1
+    strongest = np.array([start + int(force_N[start:stop].argmax()) for start, stop in pairwise(edges)])
+    contact_has_ended = ~is_contact[latest] & is_contact[strongest]
+    return np.where(contact_has_ended, strongest, latest)
 
 
 HEADER = struct.Struct("<BBHIdII")
@@ -293,6 +305,9 @@ DEFLECTION_FILE = "deflection.json"
 def find_field(model: Path, metadata: ModelMetadata) -> DeflectionField | None:
     """Return the deflection field of the film for which a model was trained; None if there is none.
 
+    The version folder of the model may contain the field. Otherwise the fields that isocharge contains for the films of
+    its released models are searched for a field of this film.
+
     Args:
         model: Version folder.
         metadata: Metadata of the model.
@@ -305,8 +320,11 @@ def find_field(model: Path, metadata: ModelMetadata) -> DeflectionField | None:
         return read_deflection_field(path)
     film = metadata.sensor.get("film")
     with as_file(files("isocharge.serve.viewer") / "fields") as folder:
-        fields = map(read_deflection_field, sorted(folder.glob("*.json")))
-        return next((field for field in fields if field.fits(film)), None)
+        for field_path in sorted(folder.glob("*.json")):
+            field = read_deflection_field(field_path)
+            if field.fits(film):
+                return field
+    return None
 
 
 def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | None) -> dict[str, Any]:
@@ -319,13 +337,17 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
     """
     sensor = metadata.sensor
     film = sensor.get("film")
+
+    # The first polygon of an electrode is its pad. The others, if there are any, are leads.
     electrode_polygons = _electrode_polygons(sensor, metadata.electrodes)
+    outlines_mm = {electrode: pad for electrode, (pad, *_) in electrode_polygons.items()}
+    leads_mm = {electrode: leads for electrode, (_, *leads) in electrode_polygons.items() if leads}
     description = {
         "name": name,
         "model": metadata.label,
         "sensor": metadata.frame_id,
         "electrodes": list(metadata.electrodes),
-        "outlines_mm": {electrode: pad for electrode, (pad, *_) in electrode_polygons.items()},
+        "outlines_mm": outlines_mm,
         "radius_mm": film.get("radius_mm") if isinstance(film, dict) else None,
         "working_area_mm": [[float(x), float(y)] for x, y in metadata.working_area_mm],
         "force_range_N": list(metadata.force_range_N),
@@ -334,14 +356,13 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
         "deflection": None if field is None else field.to_json(),
         "sample": SampleFormat(metadata.electrodes).describe(),
     }
-    leads_mm = {electrode: leads for electrode, (_, *leads) in electrode_polygons.items() if leads}
     if leads_mm:
         description["more_mm"] = leads_mm
     return description
 
 
 def _electrode_polygons(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[list[float]]]]:
-    """Return the polygons of each electrode on the real film.
+    """Return the polygons of each electrode on the real film, which a calibration may have rotated and shifted.
 
     The first polygon is the pad, and the others are further metal such as leads.
 
@@ -353,7 +374,8 @@ def _electrode_polygons(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, l
         Polygons by electrode, each a list of corners (x, y), mm; empty if the sensor has an unknown form.
     """
     try:
-        # The type is not `Positive`, because msgspec 0.22 crashes on a union of a fixed tuple and a bounded number.
+        # A part is a point or a polygon for each electrode, and a number for the side of all square electrodes. The
+        # number is not `Positive`, because msgspec 0.22 crashes on a union of a fixed tuple and a bounded number.
         parts = convert(sensor["electrodes"], dict[str, Point | float | _Polygon], "sensor", InputError)
         calibration = sensor.get("calibration") or {}
         return {
@@ -385,7 +407,8 @@ def _designed_polygons(parts: Mapping[str, Any], name: str) -> list[list[Point]]
     An electrode without polygons is a square around a point.
 
     Args:
-        parts: Section `electrodes` of a sensor file.
+        parts: Section `electrodes` of a sensor file: a point (x, y) or a polygon for each electrode name, and the side
+            of the squares under the key `side_mm`.
         name: Name of the electrode.
     """
     part = parts[name]

@@ -58,13 +58,20 @@ def playground_html(models: tuple[str, ...] = MODELS) -> str:
     """
     with as_file(files("isocharge.serve.viewer")) as folder:
         series = read_stress_series(folder / SERIES_FILE)
-        parts = {
-            "icon": base64.b64encode((folder / "page/icon.svg").read_bytes()).decode(),
-            "style": "\n".join((folder / name).read_text("utf-8") for name in STYLES),
-            "script": "\n".join(MODULE_SYNTAX.sub("", (folder / name).read_text("utf-8")) for name in SCRIPTS),
-            "data": _as_json(_page_data(series, models)),
-        }
-        html = (folder / "playground/index.html").read_text("utf-8")
+        icon = (folder / "page/icon.svg").read_bytes()
+        styles = [(folder / name).read_text("utf-8") for name in STYLES]
+        scripts = [(folder / name).read_text("utf-8") for name in SCRIPTS]
+        template = (folder / "playground/index.html").read_text("utf-8")
+    parts = {
+        "icon": base64.b64encode(icon).decode(),
+        "style": "\n".join(styles),
+        # All scripts become one script, which must not import or export anything.
+        "script": "\n".join(MODULE_SYNTAX.sub("", script) for script in scripts),
+        "data": _as_json(_page_data(series, models)),
+    }
+
+    # The template contains the name of each part in double braces.
+    html = template
     for name, text in parts.items():
         html = html.replace("{{" + name + "}}", text)
     return html
@@ -92,17 +99,20 @@ def _describe_model(name: str, series: StressSeries) -> dict[str, Any]:
     model = load_model(find_model(name))
     metadata = model.metadata
     piezo = metadata.sensor.get("piezo", {})
-    if not series.fits(metadata.sensor.get("film")) or piezo.get("d31") != piezo.get("d32"):
+    is_biaxial = piezo.get("d31") == piezo.get("d32")  # equal coefficients in both directions of the film
+    if not series.fits(metadata.sensor.get("film")) or not is_biaxial:
         raise ModelError(
             f"{name}: expected a model of the biaxial film of 25 um without pretension, whose stress the playground "
             f"contains, got the film {metadata.sensor.get('film')} with {piezo}; choose another model"
         )
     description = describe_film(metadata.name, metadata, None)
     outlines = description["outlines_mm"]
-    if any(len(outlines.get(electrode, ())) != QUADRILATERAL for electrode in metadata.electrodes):
+    corner_counts = [len(outlines.get(electrode, ())) for electrode in metadata.electrodes]
+    if any(corner_count != QUADRILATERAL for corner_count in corner_counts):
         raise ModelError(f"{name}: expected electrodes with four corners, got {outlines}; choose another model")
     validity = Validity.of(metadata)
-    compressed_network = gzip.compress((model.folder / "model.onnx").read_bytes(), compresslevel=9, mtime=0)
+    network = (model.folder / "model.onnx").read_bytes()
+    compressed_network = gzip.compress(network, compresslevel=9, mtime=0)  # no time, so that the bytes are repeatable
     return description | {
         "piezo_pC_per_N": piezo["d31"],
         "noise": {"white_pC": metadata.noise.white_pC, "gain": metadata.noise.gain},

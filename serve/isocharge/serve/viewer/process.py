@@ -6,6 +6,8 @@ This process is separate from the reader, which is the process that reads the po
 import asyncio
 import os
 import signal
+import socket
+import ssl
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
@@ -72,6 +74,7 @@ def page_process(page: Page) -> Iterator[str]:
         InputError: If the token or the TLS files cannot be used.
         ListenError: If the address is in use or cannot be used.
     """
+    # The new process sends its URL, or an error, through a pipe.
     context = get_context("spawn")
     url_receiver, url_sender = context.Pipe(duplex=False)
     process = context.Process(target=_run, args=(page, url_sender), name="page", daemon=True)
@@ -83,6 +86,7 @@ def page_process(page: Page) -> Iterator[str]:
     try:
         yield _receive_url(url_receiver)
     finally:
+        # The process ends by itself when the link is closed. If it does not, it is terminated.
         process.join(STOP_TIMEOUT_S)
         if process.is_alive():
             process.terminate()
@@ -100,19 +104,29 @@ def run_page(page: Page, announce: Callable[[str], object]) -> None:
         InputError: If the token or the TLS files cannot be used.
         ListenError: If the address is in use or cannot be used.
     """
-    access = Access(None if page.token is None else Token(page.token), page.address.host)
+    # The token and the TLS files are read first, so that the server does not listen if they cannot be used.
+    token = None if page.token is None else Token(page.token)
+    access = Access(token, page.address.host)
     tls_context = None if page.tls is None else page.tls.context()
     hub = Hub(page.link, page.description, is_recording=page.is_recording)
     with closing(hub), page.address.listen(BACKLOG) as listening:
         announce(page.address.url(listening, secure=page.tls is not None))
-
-        async def serve() -> None:
-            """Answer browsers until the reader has ended."""
-            async with PageServer(hub, access).listening(listening, tls_context):
-                await hub.run()
-
+        server = PageServer(hub, access)
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-            runner.run(serve())
+            runner.run(_serve(server, hub, listening, tls_context))
+
+
+async def _serve(server: PageServer, hub: Hub, listening: socket.socket, tls_context: ssl.SSLContext | None) -> None:
+    """Answer browsers until the reader of the stream has ended.
+
+    Args:
+        server: The server of the page.
+        hub: The hub, which distributes the samples of the stream to the viewers.
+        listening: Socket that listens.
+        tls_context: Certificate and key; None for HTTP without TLS.
+    """
+    async with server.listening(listening, tls_context):
+        await hub.run()  # ends when the reader has ended
 
 
 def _run(page: Page, url_sender: Connection) -> None:
@@ -122,7 +136,7 @@ def _run(page: Page, url_sender: Connection) -> None:
         page: Settings of the page.
         url_sender: Pipe to the process that has started the page.
     """
-    with suppress(OSError):
+    with suppress(OSError):  # the page runs with the normal priority if the system does not allow a lower one
         os.nice(NICE)
     try:
         run_page(page, url_sender.send)
@@ -140,10 +154,12 @@ def _receive_url(url_receiver: Connection) -> str:
         IsochargeError: The error that prevents the page from starting.
         ListenError: If the process ends or sends nothing within `START_TIMEOUT_S`.
     """
+    result = None
     try:
-        result = url_receiver.recv() if url_receiver.poll(START_TIMEOUT_S) else None
-    except EOFError:
-        result = None
+        if url_receiver.poll(START_TIMEOUT_S):
+            result = url_receiver.recv()
+    except EOFError:  # the process has ended without sending anything
+        pass
     if isinstance(result, IsochargeError):
         raise result
     if result is None:
@@ -155,7 +171,8 @@ def _receive_url(url_receiver: Connection) -> str:
 def _interrupts_ignored() -> Iterator[None]:
     """Ignore Ctrl-C during the block. A process that is started in the block also ignores Ctrl-C.
 
-    The process of the page therefore ends only when the reader ends.
+    The process of the page therefore ends only when the reader ends. In another thread than the main thread, the block
+    runs without this change, because Python allows only the main thread to set signal handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

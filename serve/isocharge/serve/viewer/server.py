@@ -164,6 +164,9 @@ class RateLimit:
     def allows(self, count: int, now_s: float) -> bool:
         """Count received data, and return whether their amount is within the limit.
 
+        The limit is a token bucket: an allowance of bytes grows at a constant rate up to a largest value, and received
+        data reduce it.
+
         Args:
             count: Size of the data, bytes.
             now_s: Time on a monotonic clock, s.
@@ -186,13 +189,14 @@ class PageConnection(ServerConnection):
     def data_received(self, data: bytes) -> None:
         """Process received data, or end the connection if the client sends too much.
 
-        Reading is paused while the client does not read, because responses would otherwise fill the memory.
+        While the client does not read the responses, writing is paused. Reading is then paused, too, because the
+        responses to further data would fill the memory.
         """
         if not self._rate_limit.allows(len(data), time.monotonic()):
             self.transport.abort()
             return
         super().data_received(data)
-        if self.paused:
+        if self.paused:  # writing is paused
             self.transport.pause_reading()
 
     def resume_writing(self) -> None:
@@ -247,7 +251,8 @@ class PageServer:
     def _http_response(self, _connection: ServerConnection, request: http11.Request) -> http11.Response | None:
         """Return the response to an HTTP request; None if the request opens a WebSocket.
 
-        The files of the page need no token. The description of the session and the WebSocket need the token.
+        The files of the page need no token. The description of the session and the WebSocket need the token, which is
+        either in the Authorization header or, from a browser that opens a WebSocket, in a subprotocol.
 
         Args:
             _connection: Connection of the request, which is not used.
@@ -261,13 +266,15 @@ class PageServer:
                 raise UnknownPath(f"nothing is served under {path[:200]!r}; the page is /")
             items = request.headers.raw_items()
             headers = {name.lower().encode(): value.encode("ascii", "surrogateescape") for name, value in items}
-            subprotocols = ",".join(request.headers.get_all("Sec-WebSocket-Protocol")).split(",")
-            self._access.check(headers, map(str.strip, subprotocols))
+            # The subprotocols may be in several headers, and each header may list several of them.
+            subprotocol_list = ",".join(request.headers.get_all("Sec-WebSocket-Protocol"))
+            subprotocols = [subprotocol.strip() for subprotocol in subprotocol_list.split(",")]
+            self._access.check(headers, subprotocols)
             if path == SESSION_PATH:
                 return _last_response(self._session())
             if len(self._hub.viewers) >= MAX_VIEWERS:
                 raise TooMany(f"all {MAX_VIEWERS} places for viewers are taken; close a page that nobody looks at")
-            return None
+            return None  # the connection becomes a WebSocket
         except Exception as error:  # every error is sent to the client; unexpected errors are also logged
             return _last_response(error_response(error))
 
@@ -313,9 +320,9 @@ class PageServer:
                     for message in viewer.messages(time.time()):
                         await connection.send(message)
             await connection.close(CloseCode.SERVICE_RESTART, "the stream has ended")
-        except TimeoutError:
+        except TimeoutError:  # the viewer does not read
             connection.transport.abort()
-        except ConnectionClosed:
+        except ConnectionClosed:  # the viewer has disconnected
             pass
 
     async def _handle_message(self, viewer: Viewer, connection: ServerConnection, message: str | bytes) -> None:
@@ -328,7 +335,7 @@ class PageServer:
         """
         try:
             if isinstance(message, bytes):
-                viewer.confirm(confirmed_number(message))
+                viewer.confirm(confirmed_number(message))  # the page has drawn the samples of this message
                 return
             request = parse_json(message, "", RequestError, self._hub.request_type)
             if not self._hub.handle(request, viewer):

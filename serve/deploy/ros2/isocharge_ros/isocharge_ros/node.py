@@ -31,34 +31,52 @@ class TouchNode(Node):
         )
 
     def publish(self, record):
-        """Publish the wrench of a record and, if something touches the film, the pose of the contact."""
+        """Publish the wrench of a prediction record and, if something touches the film, the pose of the contact."""
         if record.force_N is None:  # the board has sent a value that is no number
             return
-        contact = contact_of(record.json_values)
-        self.publish_wrench(contact, record)
-        if record.contact:
-            self.publish_pose(contact, record)
+        record_values = contact_of(record.json_values)  # with the tracked contact, if contacts are tracked
+        self.publish_wrench(record_values, record)
+        has_contact = record.contact
+        if has_contact:
+            self.publish_pose(record_values, record)
 
-    def publish_wrench(self, contact, record):
-        """Publish the load of the probe on the film, N and N m about the origin. The force acts along -z."""
-        force_N = contact["force_N"]
-        x_m = 1e-3 * (contact["x_mm"] or 0.0)
-        y_m = 1e-3 * (contact["y_mm"] or 0.0)
+    def publish_wrench(self, record_values, record):
+        """Publish the load of the probe on the film, N and N m.
+
+        A press of force F at (x, y) has the force (0, 0, -F) and the torque (-y F, x F, 0) about the origin.
+
+        Args:
+            record_values: Values of the record by name, in which a tracked contact replaces the contact of the frame.
+            record: The record, which has the time and the coordinate frame.
+        """
+        force_N = record_values["force_N"]
+        # Without a contact, the force is 0 and there is no position.
+        x_m = 1e-3 * (record_values["x_mm"] or 0.0)
+        y_m = 1e-3 * (record_values["y_mm"] or 0.0)
+
         message = self.with_header(WrenchStamped(), record)
         message.wrench.force.z = -force_N
         message.wrench.torque.x = -y_m * force_N
         message.wrench.torque.y = x_m * force_N
         self.wrench_publisher.publish(message)
 
-    def publish_pose(self, contact, record):
-        """Publish the position of the contact with its covariance, m and m^2."""
-        x_std_m = 1e-3 * contact["x_std_mm"]
-        y_std_m = 1e-3 * contact["y_std_mm"]
+    def publish_pose(self, record_values, record):
+        """Publish the position of the contact with its covariance, m and m^2.
+
+        Args:
+            record_values: Values of the record by name, in which a tracked contact replaces the contact of the frame.
+            record: The record, which has the time and the coordinate frame.
+        """
+        x_std_m = 1e-3 * record_values["x_std_mm"]
+        y_std_m = 1e-3 * record_values["y_std_mm"]
+        xy_correlation = record.xy_correlation or 0.0  # some models compute no correlation
+        xy_covariance = x_std_m * y_std_m * xy_correlation
         rotation_variances = [ROTATION_VARIANCE_rad2] * 3
-        xy_covariance = x_std_m * y_std_m * (record.xy_correlation or 0.0)
+
         message = self.with_header(PoseWithCovarianceStamped(), record)
-        message.pose.pose.position.x = 1e-3 * contact["x_mm"]
-        message.pose.pose.position.y = 1e-3 * contact["y_mm"]
+        message.pose.pose.position.x = 1e-3 * record_values["x_mm"]
+        message.pose.pose.position.y = 1e-3 * record_values["y_mm"]
+        # The covariance of x, y, z and three rotations is a list of 36 numbers, row by row.
         message.pose.covariance[DIAGONAL] = [x_std_m**2, y_std_m**2, DEFLECTION_STD_m**2, *rotation_variances]
         message.pose.covariance[X_WITH_Y] = xy_covariance
         message.pose.covariance[Y_WITH_X] = xy_covariance
@@ -66,7 +84,8 @@ class TouchNode(Node):
 
     def with_header(self, message, record):
         """Set the frame and the time of a message to those of a record, and return the message."""
-        seconds, nanoseconds = divmod(time_of({"timestamp": record.timestamp}), NANOSECONDS_PER_SECOND)
+        time_ns = time_of({"timestamp": record.timestamp})  # checks that ROS 2 can express the time
+        seconds, nanoseconds = divmod(time_ns, NANOSECONDS_PER_SECOND)
         message.header.frame_id = record.frame_id
         message.header.stamp.sec = seconds
         message.header.stamp.nanosec = nanoseconds
@@ -74,19 +93,22 @@ class TouchNode(Node):
 
 
 def main():
-    """Read the port, and publish each record until the node is stopped."""
+    """Read the port of the board, compute the contacts, and publish each record until the node is stopped."""
     rclpy.init()
     node = TouchNode()
-    parameters = {name: node.declare_parameter(name, default).value for name, default in DEFAULT_PARAMETERS.items()}
+    parameters = {}
+    for name, default in DEFAULT_PARAMETERS.items():
+        parameters[name] = node.declare_parameter(name, default).value
+
     try:
-        device = load_device(parameters["device"] or None)
+        device = load_device(parameters["device"] or None)  # an empty name means the default device
         predictor = Predictor(parameters["model"])
         with Port(parameters["port"], wait=parameters["wait_s"], reconnect=True, request=device.request) as port:
             for record in stream(port, predictor, device):
                 node.publish(record)
                 if not rclpy.ok():  # another process has stopped the node
                     break
-    except KeyboardInterrupt:
+    except KeyboardInterrupt:  # Ctrl-C is the usual way to stop the node
         pass
     finally:
         node.destroy_node()

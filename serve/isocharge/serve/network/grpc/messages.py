@@ -29,8 +29,9 @@ def _service_descriptor() -> Any:
     """Return the descriptor of the service from the compiled protocol file."""
     compiled = files("isocharge.serve.network.grpc").joinpath("inference.binpb").read_bytes()
     pool = DescriptorPool()
-    for file in FileDescriptorSet.FromString(compiled).file:
-        pool.Add(file)
+    descriptor_set = FileDescriptorSet.FromString(compiled)
+    for file_descriptor in descriptor_set.file:
+        pool.Add(file_descriptor)
     return pool.FindServiceByName(SERVICE)
 
 
@@ -47,10 +48,11 @@ CONTENT_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
 def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> InferRequest:
     """Parse a ModelInferRequest, and return the charges and the requested outputs.
 
-    If the charges of the request are raw contents, the outputs of the response are raw contents, too.
+    The message is converted to the JSON object of the HTTP protocol, and then parsed as such. If the charges of the
+    request are raw contents, the outputs of the response are raw contents, too.
 
     Args:
-        message: The message.
+        message: The message of gRPC.
         loaded: The model.
         max_presses: Largest number of presses in one request.
 
@@ -62,22 +64,23 @@ def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> Infer
     raw_contents = message.raw_input_contents
     if len(raw_contents) > 1:
         raise RequestError(f"expected one input tensor, got {len(raw_contents)} raw contents")
-    raw = raw_contents[0] if raw_contents else None
+    raw_charges = raw_contents[0] if raw_contents else None
     json_object = {
         "id": message.id,
-        "inputs": [_input_object(tensor, raw) for tensor in message.inputs],
+        "inputs": [_input_object(tensor, raw_charges) for tensor in message.inputs],
         "outputs": [{"name": output.name, "parameters": _unsupported_parameters(output)} for output in message.outputs],
-        "parameters": {"binary_data_output": raw is not None},
+        "parameters": {"binary_data_output": raw_charges is not None},
     }
-    return parse_request(json_object, raw or b"", loaded, max_presses)
+    return parse_request(json_object, raw_charges or b"", loaded, max_presses)
 
 
-def _input_object(tensor: Any, raw: bytes | None) -> dict[str, Any]:
+def _input_object(tensor: Any, raw_charges: bytes | None) -> dict[str, Any]:
     """Return an input tensor as the JSON object of the HTTP protocol.
 
     Args:
         tensor: Message with the name, the number type and the shape of the tensor, and possibly its numbers.
-        raw: Raw content of the message, which follows the JSON text in the HTTP protocol; None if there is none.
+        raw_charges: Raw content of the request, which follows the JSON text in the HTTP protocol; None if the request
+            has none.
     """
     parameters: dict[str, Any] = _unsupported_parameters(tensor)
     json_object = {
@@ -86,10 +89,11 @@ def _input_object(tensor: Any, raw: bytes | None) -> dict[str, Any]:
         "shape": list(tensor.shape),
         "parameters": parameters,
     }
-    if raw is not None:
-        parameters["binary_data_size"] = len(raw)
-    if tensor.HasField("contents") or raw is None:
-        field = CONTENT_FIELDS.get(tensor.datatype, "fp32_contents")
+    if raw_charges is not None:
+        parameters["binary_data_size"] = len(raw_charges)
+    # A tensor with both numbers and raw content gets both keys, and is refused when the object is parsed.
+    if tensor.HasField("contents") or raw_charges is None:
+        field = CONTENT_FIELDS.get(tensor.datatype, "fp32_contents")  # an unknown number type is refused then, too
         json_object["data"] = list(getattr(tensor.contents, field))
     return json_object
 
@@ -112,11 +116,13 @@ def write_response(answer: InferAnswer) -> Any:
     message.id = answer.id
     for name, rows in answer.outputs.items():
         is_text = name == FLAGS
-        tensor = message.outputs.add(name=name, datatype="BYTES" if is_text else "FP32", shape=rows.shape)
+        datatype = "BYTES" if is_text else "FP32"
+        tensor = message.outputs.add(name=name, datatype=datatype, shape=rows.shape)
         if name in answer.binary:
             message.raw_output_contents.append(binary_tensor(rows))
         elif is_text:
-            tensor.contents.bytes_contents.extend(text.encode() for text in rows[:, 0].tolist())
+            texts = rows[:, 0].tolist()  # this output has one column
+            tensor.contents.bytes_contents.extend(text.encode() for text in texts)
         else:
             tensor.contents.fp32_contents.extend(rows.ravel().tolist())
     return message

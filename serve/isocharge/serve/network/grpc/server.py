@@ -7,7 +7,7 @@ import asyncio
 from collections.abc import Coroutine, Iterator
 from contextlib import contextmanager
 from threading import Thread
-from typing import Any
+from typing import Any, TypeVar
 
 import grpc
 import grpc.aio
@@ -17,6 +17,8 @@ from isocharge.common.errors import ListenError
 from isocharge.serve.network.address import ServerLimits, Tls
 from isocharge.serve.network.grpc.service import Service
 from isocharge.serve.network.protocol import Handler
+
+T = TypeVar("T")
 
 GRACE_SECONDS = 10
 """Time that requests which have begun have to finish when the server stops, s."""
@@ -46,24 +48,20 @@ def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) 
         ListenError: If the address is in use or cannot be used.
         InputError: If a TLS file cannot be used.
     """
+    is_ipv6 = ":" in host
+    url_host = f"[{host}]" if is_ipv6 else host
+    scheme = "grpcs" if tls else "grpc"
     with _event_loop() as loop:
-
-        def run(coroutine: Coroutine[Any, Any, Any]) -> Any:
-            """Run a coroutine in the event loop of the server, and return its result."""
-            return asyncio.run_coroutine_threadsafe(coroutine, loop).result()
-
-        url_host = f"[{host}]" if ":" in host else host
-        server, actual_port = run(_start(handler, f"{url_host}:{port}", tls))
-        scheme = "grpcs" if tls else "grpc"
+        server, actual_port = _run_in(loop, _start(handler, f"{url_host}:{port}", tls))
         try:
             yield f"{scheme}://{url_host}:{actual_port}"
         finally:
-            run(server.stop(GRACE_SECONDS))
+            _run_in(loop, server.stop(GRACE_SECONDS))
 
 
 @contextmanager
 def _event_loop() -> Iterator[asyncio.AbstractEventLoop]:
-    """Run an event loop in its own thread while the block runs."""
+    """Run an event loop in its own thread while the block runs, and yield the event loop."""
     loop = uvloop.new_event_loop()
     thread = Thread(target=loop.run_forever, name="grpc")
     thread.start()
@@ -71,22 +69,30 @@ def _event_loop() -> Iterator[asyncio.AbstractEventLoop]:
         yield loop
     finally:
         # Wait for the calls that run in other threads, stop the loop, and wait for the thread of the loop.
-        asyncio.run_coroutine_threadsafe(loop.shutdown_default_executor(), loop).result()
+        _run_in(loop, loop.shutdown_default_executor())
         loop.call_soon_threadsafe(loop.stop)
         thread.join()
         loop.close()
 
 
+def _run_in(loop: asyncio.AbstractEventLoop, coroutine: Coroutine[Any, Any, T]) -> T:
+    """Run a coroutine in an event loop of another thread, wait for its end, and return its result."""
+    return asyncio.run_coroutine_threadsafe(coroutine, loop).result()
+
+
 async def _start(handler: Handler, address: str, tls: Tls | None) -> tuple[grpc.aio.Server, int]:
-    """Start a server, and return it with the port on which it listens.
+    """Start a gRPC server, and return it with the port on which it listens.
 
     Args:
-        handler: Handler of the HTTP server.
+        handler: Handler of the HTTP server, whose models, limits and token are used.
         address: `host:port`; the port 0 selects a free port.
         tls: Certificate and key; None for no TLS.
     """
     limits = handler.limits
-    server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=2 * limits.connections)
+    # The service itself limits the calls to `connections`, and ends a waiting call when a new call exceeds this limit.
+    # The limit of grpcio must be higher, because grpcio refuses calls above it before they reach the service.
+    max_calls = 2 * limits.connections
+    server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=max_calls)
     server.add_generic_rpc_handlers((Service(handler).handlers(),))
     port = _listen(server, address, tls)
     await server.start()

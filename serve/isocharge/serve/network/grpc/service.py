@@ -56,20 +56,28 @@ class Service:
     """Answers calls with the models, the token and the limits of a handler."""
 
     def __init__(self, handler: Handler) -> None:
-        """Register the function that answers each method.
+        """Store the models, limits, token and counters, and register the function that answers each method.
 
         Args:
             handler: Handler of the HTTP server, whose models, limits, token and counters are used.
         """
-        store = handler.store
-        self._store = store
+        self._store = handler.store
         self._limits = handler.limits
         self._traffic = handler.traffic
         self._token = handler.token
         self._open_count = 0
         self._waiting: dict[asyncio.Timeout, None] = {}  # an ordered set of the calls that wait for a message
         self._traffic.open["grpc"] = lambda: self._open_count
-        self._functions: dict[str, Callable[[Any], Any]] = {
+        self._functions = self._functions_of_methods()
+
+    def _functions_of_methods(self) -> dict[str, Callable[[Any], Any]]:
+        """Return the function that answers each method, by the name of the method.
+
+        Each function takes the message of the request. It returns the message of the response, its content as a JSON
+        object, or None for an empty response.
+        """
+        store = self._store
+        return {
             "ServerLive": lambda _: {"live": True},
             "ServerReady": lambda _: {"ready": bool(store.loaded_versions())},
             "ModelReady": lambda request: {"ready": store.label(request.name, request.version) is not None},
@@ -93,7 +101,7 @@ class Service:
         return grpc.method_handlers_generic_handler(SERVICE, methods)
 
     async def _handle(self, name: str, _: object, context: grpc.aio.ServicerContext) -> Any:
-        """Answer a call, and count it with its status and its error.
+        """Answer a call. Count it with its status, and write it to the log, if there is one.
 
         Args:
             name: Name of the method.
@@ -105,20 +113,15 @@ class Service:
         """
         call = _Call()
         start_ns = time.perf_counter_ns()
-        status = "CANCELLED"  # stays if the client disconnects
+        status = "CANCELLED"  # stays if the client disconnects, because grpcio then cancels this coroutine
         error_type = None
         try:
-            result = await self._answer_call(name, context, call)
+            response = await self._answer_call(name, context, call)
             status = "OK"
-            return result
-        except TimeoutError as error:
-            status = "DEADLINE_EXCEEDED"
-            error_type = type(error).__name__
-            message = "the call waited too long for its client, or others needed its place"
+            return response
         except Exception as error:  # every error is sent to the client
-            _, status = statuses(error)
+            status, message = _status_and_message(error)
             error_type = type(error).__name__
-            message = client_message(error)
         finally:
             self._traffic.note(
                 Exchange(
@@ -133,7 +136,7 @@ class Service:
                     client=context.peer() if self._traffic.log else None,
                 )
             )
-        # An error has occurred. It ends the call with its status and its message.
+        # This line is reached only after an error, whose status and message end the call.
         return await context.abort(grpc.StatusCode[status], message)
 
     async def _answer_call(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes | None:
@@ -156,7 +159,7 @@ class Service:
             return await self._answer_message(name, context, call)
 
     async def _answer_message(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes:
-        """Return the serialized response to the only message of a call.
+        """Wait for the only message of a call, and return the serialized response to it.
 
         Args:
             name: Name of the method.
@@ -175,7 +178,10 @@ class Service:
         return self._respond(name, data, call)
 
     async def _answer_stream(self, context: grpc.aio.ServicerContext, call: _Call) -> None:
-        """Send a response to each message of a stream.
+        """Send a response to each message of a stream until the client ends the stream.
+
+        The first message must arrive within `header_seconds`, and each later message within `idle_seconds`. The client
+        must read each response within `body_seconds`.
 
         Args:
             context: Context of the call, from which messages are read and to which responses are written.
@@ -184,11 +190,11 @@ class Service:
         Raises:
             TimeoutError: If the client sends no message, or does not read a response, in time.
         """
-        timeout_s = self._limits.header_seconds
-        while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
+        data = await self._next_message(context, self._limits.header_seconds)
+        while data is not grpc.aio.EOF:
             async with asyncio.timeout(self._limits.body_seconds):
                 await context.write(self._respond(STREAM, data, call))
-            timeout_s = self._limits.idle_seconds
+            data = await self._next_message(context, self._limits.idle_seconds)
 
     def _respond(self, name: str, data: bytes, call: _Call) -> bytes:
         """Return the serialized response to a serialized message.
@@ -210,8 +216,10 @@ class Service:
         model_version = getattr(request, "model_version", "") or getattr(request, "version", "")
         call.model = self._store.label(model_name, model_version)
 
-        answer = self._functions[name](request)
-        response = answer if isinstance(answer, Message) else ParseDict(answer or {}, response_type())
+        # A function returns the response as a message, as a JSON object, or, if the response is empty, as None.
+        response = self._functions[name](request)
+        if not isinstance(response, Message):
+            response = ParseDict(response or {}, response_type())
         response_data: bytes = response.SerializeToString()
         call.bytes_out += len(response_data)
         return response_data
@@ -244,7 +252,7 @@ class Service:
         except Exception as error:  # every error is sent to the client
             _, status = statuses(error)
             response = response_type(error_message=client_message(error))
-        self._traffic.count("grpc", f"{STREAM} message", status)
+        self._traffic.count("grpc", f"{STREAM} message", status)  # the stream itself is counted as one call
         return response
 
     @contextmanager
@@ -273,10 +281,11 @@ class Service:
         """
         if not self._waiting:
             raise TooMany(f"all {self._limits.connections} calls are taken; try again later")
-        oldest = next(iter(self._waiting))
-        del self._waiting[oldest]
-        # A deadline in the present makes the timeout of the waiting call expire at once.
-        oldest.reschedule(asyncio.get_running_loop().time())
+        # The timeouts of the waiting calls are stored in the order in which the calls began to wait.
+        oldest_timeout = next(iter(self._waiting))
+        del self._waiting[oldest_timeout]
+        # With its deadline set to the present time, the timeout expires at once and ends the waiting call.
+        oldest_timeout.reschedule(asyncio.get_running_loop().time())
 
     async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
         """Wait for the next message of a call.
@@ -294,11 +303,19 @@ class Service:
             TimeoutError: If the message does not arrive in time, or this call is ended because of a new call.
         """
         async with asyncio.timeout(timeout_s) as timeout:
-            self._waiting[timeout] = None
+            self._waiting[timeout] = None  # a new call may let this timeout expire early
             try:
                 return await context.read()
             finally:
                 self._waiting.pop(timeout, None)
+
+
+def _status_and_message(error: Exception) -> tuple[str, str]:
+    """Return the name of the gRPC status with which an error ends a call, and the message to the client."""
+    if isinstance(error, TimeoutError):
+        return "DEADLINE_EXCEEDED", "the call waited too long for its client, or others needed its place"
+    _, grpc_status = statuses(error)
+    return grpc_status, client_message(error)
 
 
 def _authorization(context: grpc.aio.ServicerContext) -> bytes:

@@ -82,13 +82,13 @@ class Connection(asyncio.Protocol):
         self._body = bytearray()
         self._expects_continue = False
 
-        # The data that are being parsed.
-        self._piece_bytes = 0
+        # The data that are being parsed. A piece is the part of the data that is passed to the parser at a time.
+        self._piece_bytes = 0  # size of the present piece
         self._unchecked_bytes = 0  # bytes since the request began, or since the latest part of its body
-        self._piece_begins_with_request = True
-        self._piece_was_answered = False  # whether a request of the present piece of data was answered
-        self._unparsed = bytearray()
-        self._next_turn: asyncio.Handle | None = None
+        self._piece_begins_with_request = True  # false after the first request of the piece has begun
+        self._piece_was_answered = False  # whether a request of the present piece was answered
+        self._unparsed = bytearray()  # received data that wait to be parsed
+        self._next_turn: asyncio.Handle | None = None  # scheduled call of `_parse_stored_data`
 
         # The latest complete request. If it came in one piece, its text and size are stored to recognise a repetition.
         self._head: Head | None = None
@@ -99,13 +99,13 @@ class Connection(asyncio.Protocol):
         self._answering: asyncio.Task[None] | None = None
         self._waiting: deque[tuple[Head, bytes]] = deque()
 
-        self._is_stopping = False
-        self._is_refused = False
-        self._is_half_closed = False
-        self._is_blocked = False
+        self._is_stopping = False  # whether the server stops
+        self._is_refused = False  # whether a refusal was sent, after which no request is read
+        self._is_half_closed = False  # whether the client sends no more data, but still receives responses
+        self._is_blocked = False  # whether sending waits, because the client does not read its responses
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Accept the connection. If there are too many connections, refuse it."""
+        """Accept the connection. If there are too many, end an unused connection, or refuse this one."""
         self._transport = transport
         peer = transport.get_extra_info("peername")
         self._client = None  # a Unix socket has no address of the client
@@ -114,7 +114,7 @@ class Connection(asyncio.Protocol):
             self._client = (str(host), int(port))
         self._connections.add(self)
         self._set_deadline(self._limits.header_seconds)
-        is_one_too_many = len(self._connections) > self._limits.connections
+        is_one_too_many = len(self._connections) > self._limits.connections  # including this connection
         if is_one_too_many and not self._end_oldest_unused():  # no other connection can make room for this one
             self._refuse(refusal(503, f"all {self._limits.connections} connections are taken; try again later"))
 
@@ -144,10 +144,12 @@ class Connection(asyncio.Protocol):
         """Parse short data at once, and long data in slices, between which other connections are served.
 
         While an answer is computed, or the client does not read its responses, data are only stored. If a request has
-        the same head as the latest request, the head is not parsed again.
+        the same head (request line and headers) as the latest request, the head is not parsed again.
         """
         if self._is_refused or self._transport.is_closing():
             return
+
+        # Store long data, and data that must wait for earlier data or an answer. Parse them in slices.
         must_wait = self._unparsed or self._answering or self._is_blocked
         if must_wait or len(data) > SLICE_BYTES:
             self._unparsed += data
@@ -155,14 +157,14 @@ class Connection(asyncio.Protocol):
                 self._parse_stored_data()
             return
 
-        # The data are a request with the same head as the latest request.
+        # Answer a request that has the same head and the same size as the latest request, without the parser.
         repeats_head = len(data) == self._remembered_bytes and data.startswith(self._remembered_head)
         if repeats_head and self._head is not None:
             body = data[len(self._remembered_head) :]
             self._answer(self._head, body)
             return
 
-        # The data are any other short data.
+        # Parse any other short data. If they are one complete request, remember its head.
         begins_request = self._phase is Phase.IDLE
         self._parse(data)
         if begins_request and self._piece_was_answered:
@@ -198,9 +200,9 @@ class Connection(asyncio.Protocol):
 
         If a request is incomplete, or its answer is being computed, the connection is closed after the response.
         """
-        self._is_stopping = True
+        self._is_stopping = True  # the next response closes the connection
         has_open_request = self._phase is not Phase.IDLE or self._answering is not None
-        if self._is_refused:
+        if self._is_refused:  # the connection only lingers until the client has read the refusal
             self._transport.abort()
         elif not has_open_request:
             self._transport.close()
@@ -223,6 +225,7 @@ class Connection(asyncio.Protocol):
         """
         self._next_turn = None
         turn_end = time.perf_counter() + TURN_SECONDS
+        # Parsing a slice may begin an answer in another thread, fill the send buffer, or refuse a request.
         while self._unparsed and not (self._answering or self._is_blocked or self._is_refused):
             if self._transport.is_closing():
                 return
@@ -235,15 +238,15 @@ class Connection(asyncio.Protocol):
         self._resume_reading()
 
     def _resume_reading(self) -> None:
-        """Read more data if all data are parsed, and otherwise pause reading.
+        """Let the transport read more data if all data are parsed. Otherwise let it pause reading.
 
-        If all data are parsed and the client has ended its data, the connection is closed instead.
+        If all requests are answered and the client sends no more data, close the connection.
         """
         if self._transport.is_closing():
             return
         if self._unparsed:
             self._transport.pause_reading()
-        elif not self._is_blocked:
+        elif not self._is_blocked:  # the method `resume_writing` continues a blocked connection
             self._transport.resume_reading()
             if self._is_half_closed and not self._answering:
                 self._transport.close()
@@ -256,7 +259,7 @@ class Connection(asyncio.Protocol):
         return parser
 
     def _parse(self, data: bytes) -> None:
-        """Parse a piece of data. If a request is still incomplete, check its size.
+        """Parse a piece of data. If a request is incomplete afterwards, check its size.
 
         The parser calls the methods `on_...`, which answer each complete request.
         """
@@ -276,7 +279,10 @@ class Connection(asyncio.Protocol):
             self._check_incomplete_request()
 
     def _check_incomplete_request(self) -> None:
-        """Check the size of the headers, trailers and chunk extensions, and set the deadline of a new phase."""
+        """Check the size of an incomplete request without its body, and set the deadline of a new phase.
+
+        This size includes the headers, and the trailers and chunk extensions of a body that is sent in chunks.
+        """
         if self._unchecked_bytes > self._limits.header_bytes:
             self._refuse_headers()
         elif self._timed_phase is not self._phase:
@@ -292,9 +298,9 @@ class Connection(asyncio.Protocol):
         A new parser is needed, because the old parser treats everything after the headers as another protocol.
         """
         method = self._parser.get_method()
-        if method == b"CONNECT":
+        if method == b"CONNECT":  # the parser treats this method like an upgrade
             self._refuse(refusal(400, "CONNECT: this server opens no tunnels"))
-        if self._is_refused:
+        if self._is_refused:  # here, or before because of its headers
             return
         self._parser = self._new_parser()
         self._phase = Phase.IDLE
@@ -341,12 +347,12 @@ class Connection(asyncio.Protocol):
             self._refuse_headers()
             return
 
-        is_parsed_again = self._parser.should_upgrade()
+        is_parsed_again = self._parser.should_upgrade()  # then this method is called a second time
         if self._expects_continue and not self._is_refused and not is_parsed_again:
             self._transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 
     def on_body(self, body: bytes) -> None:
-        """Append a part of the body, and check the size of the body."""
+        """Append a part of the body, and refuse the request if its body is too large."""
         if self._is_refused:
             return
         self._unchecked_bytes = 0  # the body has its own limit, which is checked here
@@ -357,7 +363,7 @@ class Connection(asyncio.Protocol):
             self._refuse(error_response(error))
 
     def on_message_complete(self) -> None:
-        """Answer the complete request, unless it was refused.
+        """Answer the complete request, unless it was refused. If an answer is being computed, the request waits for it.
 
         A request for a protocol upgrade is not answered here, because it is parsed again without the upgrade.
         """
@@ -368,9 +374,9 @@ class Connection(asyncio.Protocol):
         method = self._parser.get_method().decode("latin-1")
         is_last = not self._parser.should_keep_alive()
         head = Head(method, request_path(self._url), self._headers, is_last)
-        body = bytes(self._body)
         self._head = head
-        if self._answering:
+        body = bytes(self._body)
+        if self._answering:  # responses must have the order of the requests
             self._waiting.append((head, body))
         elif self._handler.may_block(head.path):
             self._answer_in_thread(head, body)
@@ -406,7 +412,7 @@ class Connection(asyncio.Protocol):
         )
         self._answering = None
         self._write(response, head)
-        while self._waiting and self._answering is None:
+        while self._waiting and self._answering is None:  # _answer_in_thread sets _answering again
             next_head, next_body = self._waiting.popleft()
             if self._handler.may_block(next_head.path):
                 self._answer_in_thread(next_head, next_body)
@@ -435,7 +441,8 @@ class Connection(asyncio.Protocol):
         if self._is_refused or self._transport.is_closing():
             return
         is_last = self._is_stopping or head.is_last
-        self._transport.write(response_bytes(response, is_last=is_last, with_body=head.method != "HEAD"))
+        is_head_request = head.method == "HEAD"
+        self._transport.write(response_bytes(response, is_last=is_last, with_body=not is_head_request))
         if is_last:
             self._transport.close()
         elif self._is_blocked and self._transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
@@ -469,7 +476,7 @@ class Connection(asyncio.Protocol):
         self._unparsed.clear()
         self._handler.refused(response, self._client)
         self._transport.write(response_bytes(response, is_last=True))
-        if self._transport.can_write_eof():
+        if self._transport.can_write_eof():  # TLS cannot end only the data of the server
             self._transport.write_eof()
             self._set_deadline(LINGER_SECONDS)
         else:

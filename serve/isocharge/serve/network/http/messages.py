@@ -33,7 +33,7 @@ class Head(NamedTuple):
 
 
 def response_bytes(response: Response, *, is_last: bool, with_body: bool = True) -> bytes:
-    """Return a response as the bytes that are sent.
+    """Return a response as the bytes that are sent: status line, headers, a blank line, and the body.
 
     Args:
         response: The response.
@@ -43,7 +43,7 @@ def response_bytes(response: Response, *, is_last: bool, with_body: bool = True)
     parts = [STATUS_LINES[response.status]]
     for name, value in response.headers:
         parts += (name, b": ", value, b"\r\n")
-    parts.append(CLOSING_HEADER if is_last else b"\r\n")
+    parts.append(CLOSING_HEADER if is_last else b"\r\n")  # both end with the blank line
     if with_body:
         parts.append(response.body)
     return b"".join(parts)

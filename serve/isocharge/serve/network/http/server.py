@@ -49,9 +49,9 @@ class HttpServer:
         self._limits = handler.limits
         self._tls = tls.context() if tls else None
         self._connections: set[Connection] = set()
-        self._handshakes: dict[asyncio.Task[None], None] = {}  # an ordered set
+        self._handshakes: dict[asyncio.Task[None], None] = {}  # tasks of TLS handshakes: a set in order of their start
         self._is_stopped = False
-        handler.traffic.open["http"] = lambda: len(self._connections)
+        handler.traffic.open["http"] = lambda: len(self._connections)  # for the metric of open connections
         self._socket = address.listen(BACKLOG)
         self.url = address.url(self._socket, secure=tls is not None)
 
@@ -71,6 +71,7 @@ class HttpServer:
 
     async def _serve(self) -> None:
         """Accept connections and answer requests until the server is stopped, and then finish the open requests."""
+        # Accept connections in another task. This task checks the deadlines.
         loop = asyncio.get_running_loop()
         is_main_thread = threading.current_thread() is threading.main_thread()
         signals = SIGNALS if is_main_thread else ()  # other threads cannot handle signals
@@ -81,8 +82,9 @@ class HttpServer:
             await asyncio.sleep(TICK_SECONDS)
             close_overdue(self._connections, loop.time())
 
+        # Stop accepting, and finish the open requests.
         for signal_number in signals:
-            loop.remove_signal_handler(signal_number)  # a second Ctrl-C does not wait
+            loop.remove_signal_handler(signal_number)  # so that a second Ctrl-C ends the program at once
         for task in (accepting, *self._handshakes):
             task.cancel()
         await asyncio.gather(accepting, *self._handshakes, return_exceptions=True)
@@ -95,7 +97,7 @@ class HttpServer:
             connection.shutdown()
         grace_end = loop.time() + GRACE_SECONDS
         while self._connections and loop.time() < grace_end:
-            await asyncio.sleep(0.5 * TICK_SECONDS)
+            await asyncio.sleep(0.5 * TICK_SECONDS)  # shorter than usual, so that the server ends soon
             close_overdue(self._connections, loop.time())
         for connection in list(self._connections):
             connection.abort()
@@ -104,7 +106,7 @@ class HttpServer:
         """Accept connections until the task is cancelled.
 
         Unfinished TLS handshakes count as connections. If there are too many connections, the oldest handshake is
-        cancelled.
+        cancelled. Without TLS, and if there is no handshake, the new connection itself checks the limit.
         """
         self._socket.setblocking(False)
         while True:
@@ -120,7 +122,7 @@ class HttpServer:
                 oldest_handshake.cancel()
             handshake = loop.create_task(self._connect(accepted, loop))
             self._handshakes[handshake] = None
-            handshake.add_done_callback(self._handshakes.pop)
+            handshake.add_done_callback(self._handshakes.pop)  # removes the task when it ends
 
     async def _connect(self, accepted: socket.socket, loop: asyncio.AbstractEventLoop) -> None:
         """Create the connection of an accepted socket, after the TLS handshake if the server uses TLS.
@@ -130,8 +132,8 @@ class HttpServer:
             loop: Event loop of the server.
         """
         new_connection = partial(Connection, self._handler, self._connections, loop)
-        timeout_s = self._limits.header_seconds if self._tls else None
+        timeout_s = self._limits.header_seconds if self._tls else None  # asyncio refuses a timeout without TLS
         try:
             await loop.connect_accepted_socket(new_connection, accepted, ssl=self._tls, ssl_handshake_timeout=timeout_s)
         except (OSError, asyncio.CancelledError):  # OSError includes ssl.SSLError and TimeoutError
-            accepted.close()
+            accepted.close()  # nothing is raised, because the failure of one client must not affect the server

@@ -69,10 +69,11 @@ def match_path(path: str) -> Match:
     The name and the version are empty if the path contains none. The result is `NO_ROUTE` if no route has this path.
     """
     for pattern, route in _PATTERNS:
-        found = pattern.fullmatch(path)
-        if found is not None:
-            parameters = found.groupdict()
-            return Match(route, route.paths[0], parameters.get("model", ""), parameters.get("version", ""))
+        path_match = pattern.fullmatch(path)
+        if path_match is not None:
+            parameters = path_match.groupdict()
+            label = route.paths[0]  # all paths of a route are counted together
+            return Match(route, label, parameters.get("model", ""), parameters.get("version", ""))
     return NO_ROUTE
 
 
@@ -100,7 +101,8 @@ class Handler:
         self.store = store
         self.token = token
         self.limits = limits or ServerLimits()
-        self._browser_check = browser_check or BrowserCheck(any_host=token is not None)
+        has_token = token is not None
+        self._browser_check = browser_check or BrowserCheck(any_host=has_token)
         self.traffic = traffic or Traffic()
         metrics = Metrics(store, self.traffic, describe.server_metadata()["version"])
         self._service = Service(store, self.limits, metrics, partial(openapi_document, ROUTES, store))
@@ -111,7 +113,7 @@ class Handler:
         return route is not None and route.may_block
 
     def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
-        """Answer one request.
+        """Answer one request, count it, and write it to the log, if there is one.
 
         Args:
             method: Method in capitals.
@@ -168,12 +170,13 @@ class Handler:
         """
         self._browser_check.check(method, fields)
         route = match.route
-        # The token is checked before the path, so that a client without a token does not learn which paths exist.
+        # The token is checked before unknown paths are refused, so that a client without a token does not learn which
+        # paths exist.
         if self.token is not None and (route is None or route.needs_token):
             self.token.check(fields.get(b"authorization", b""))
         if route is None:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
-        is_head_of_get = method == "HEAD" and route.method == "GET"
+        is_head_of_get = method == "HEAD" and route.method == "GET"  # the transport then omits the body
         if method != route.method and not is_head_of_get:
             raise WrongMethod(f"{path}: expected the method {route.method}, got {method[:20]}", route.method)
         self.limits.check_body(len(body))

@@ -10,11 +10,10 @@ import struct
 import time
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import orjson
-from msgspec import Meta, Struct
 
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import RequestError, TooLarge
@@ -29,6 +28,7 @@ from isocharge.serve.model.session import (
     write_finite,
 )
 from isocharge.serve.network.model_store import LoadedVersion
+from isocharge.serve.network.protocol.infer_body import InferBody, InputTensor, OutputTensor
 from isocharge.serve.prediction.contact import Contacts
 
 DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype("<f8")}
@@ -42,44 +42,6 @@ MAX_LENGTH_DIGITS = 12
 
 Rows = np.ndarray[Any, Any]
 """Values of an output, shape (n, width): numbers, or texts for the output `flags`."""
-
-Unsupported = Annotated[None, Meta(description="nothing, as this server does not support it")]
-
-
-class Parameters(Struct, frozen=True):
-    """Parameters of a request, an input or an output. Unknown parameters are ignored, as Triton does."""
-
-    binary_data: bool | None = None
-    binary_data_output: bool = False
-    binary_data_size: int | None = None
-    shared_memory_region: Unsupported = None
-    classification: Unsupported = None
-
-
-class InputTensor(Struct, frozen=True):
-    """Input tensor with the charges, pC. The numbers are checked later, when the shape is known to be valid."""
-
-    name: Literal["charge_pC"]
-    datatype: Literal["FP32", "FP64"]
-    shape: list[int]
-    data: Annotated[Any, Meta(extra_json_schema={"type": "array", "description": "numbers, flat or in rows"})] = None
-    parameters: Parameters = Parameters()
-
-
-class OutputTensor(Struct, frozen=True):
-    """Requested output."""
-
-    name: Literal["contact", "contact_std", "contact_correlation", "misfit", "flags"]
-    parameters: Parameters = Parameters()
-
-
-class InferBody(Struct, frozen=True):
-    """Body of a request for an inference."""
-
-    inputs: Annotated[list[InputTensor], Meta(min_length=1, max_length=1, description="a list with one tensor")]
-    id: str = ""
-    outputs: list[OutputTensor] = []
-    parameters: Parameters = Parameters()
 
 
 class InferRequest(NamedTuple):
@@ -149,13 +111,15 @@ def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, 
         return parse_request(read_object(body), b"", loaded, max_presses)
     # The digits are tested first, because int() accepts signs, blanks and underscores, and is slow for a long text.
     is_short_number = header_length.isdigit() and len(header_length) <= MAX_LENGTH_DIGITS
-    if not is_short_number or int(header_length) > len(body):
+    json_length = int(header_length) if is_short_number else None
+    if json_length is None or json_length > len(body):
         raise RequestError(
             f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
             f"got {header_length.decode('latin-1')!r:.50}"
         )
-    json_length = int(header_length)
-    return parse_request(read_object(body[:json_length]), memoryview(body)[json_length:], loaded, max_presses)
+    content = read_object(body[:json_length])
+    binary_tensors = memoryview(body)[json_length:]  # a view, because the bytes need not be copied
+    return parse_request(content, binary_tensors, loaded, max_presses)
 
 
 def parse_request(
@@ -174,7 +138,7 @@ def parse_request(
         ChargeError: If a charge is not finite.
         TooLarge: If there are more presses than `max_presses`.
     """
-    body = convert(content, InferBody, "", RequestError)
+    body = convert(content, InferBody, where="", error=RequestError)  # the error message needs no file name
     default_is_binary = body.parameters.binary_data_output
     if body.outputs:
         names, binary_names = _requested_outputs(body.outputs, loaded, default_is_binary=default_is_binary)
@@ -201,6 +165,7 @@ def _requested_outputs(
     names = tuple(output.name for output in outputs)
     if len(set(names)) < len(names):
         raise RequestError("outputs: expected each name once")
+    # The names have been checked when the request was parsed, and only this output is missing in some models.
     if CORRELATION in names and CORRELATION not in loaded.outputs:
         raise RequestError(
             f"outputs: expected one of {', '.join(loaded.outputs)}, got {CORRELATION!r}, which "
@@ -220,7 +185,8 @@ def _read_charges(
 ) -> Singles:
     """Return the charges of an input tensor, shape (n, electrodes), pC.
 
-    The shape is checked before any memory of that size is used.
+    The charges are either values in the JSON text, or bytes that follow this text. The shape is checked before any
+    memory of that size is used.
 
     Args:
         tensor: The input tensor.
@@ -234,24 +200,17 @@ def _read_charges(
         TooLarge: If there are more presses than `max_presses`.
     """
     shape = tensor.shape
-    if len(shape) != 2 or shape[0] < 1 or shape[1] != len(electrodes):
-        raise RequestError(
-            f"input {INPUT!r}: expected the shape [n, {len(electrodes)}] with n > 0, "
-            f"a column for each of {electrodes}, got {shape!r:.100}"
-        )
-    press_count, electrode_count = shape
-    if press_count > max_presses:
-        raise TooLarge(f"input {INPUT!r}: expected at most {max_presses} presses in one request, got {press_count}")
-
-    # The charges are either values in the JSON text, or bytes after this text whose number the request states.
-    stated_size = tensor.parameters.binary_data_size
+    _check_shape(shape, electrodes, max_presses)
+    stated_size = tensor.parameters.binary_data_size  # number of bytes after the JSON text, as the request states it
     if stated_size is None and not binary:
         return _from_values(tensor.data, shape, electrodes)
 
     dtype = DATATYPES[tensor.datatype]
+    press_count, electrode_count = shape
     expected_size = press_count * electrode_count * dtype.itemsize
     has_expected_size = stated_size == len(binary) == expected_size
-    if not has_expected_size or tensor.data is not None:
+    has_json_values = tensor.data is not None
+    if not has_expected_size or has_json_values:
         raise RequestError(
             f"expected either `data` or {expected_size} bytes after the JSON, announced by `binary_data_size` of the "
             f"input and Inference-Header-Content-Length, got binary_data_size {stated_size!r:.50} and {len(binary)} "
@@ -260,6 +219,28 @@ def _read_charges(
     # The copy is aligned. The bytes after a JSON text may begin at any address.
     charges = np.frombuffer(binary, dtype).reshape(shape).copy()
     return as_float32(charges, electrodes)
+
+
+def _check_shape(shape: list[int], electrodes: tuple[str, ...], max_presses: int) -> None:
+    """Check the shape of the input tensor that a request states.
+
+    Args:
+        shape: The shape, which should be the number of presses and the number of electrodes.
+        electrodes: Electrodes of the model.
+        max_presses: Largest number of presses in one request.
+
+    Raises:
+        RequestError: If there is no press, or the number of columns is not the number of electrodes.
+        TooLarge: If there are more presses than `max_presses`.
+    """
+    if len(shape) != 2 or shape[0] < 1 or shape[1] != len(electrodes):
+        raise RequestError(
+            f"input {INPUT!r}: expected the shape [n, {len(electrodes)}] with n > 0, "
+            f"a column for each of {electrodes}, got {shape!r:.100}"
+        )
+    press_count, _ = shape
+    if press_count > max_presses:
+        raise TooLarge(f"input {INPUT!r}: expected at most {max_presses} presses in one request, got {press_count}")
 
 
 def _from_values(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
@@ -283,9 +264,10 @@ def _from_values(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> 
     # to 1.0. A list that contains True or False, or the equal numbers 1 and 0, is therefore converted by `_from_array`.
     if is_flat_list and not (True in values or False in values):
         charges = np.empty(shape, np.float32)
-        write_into_charges = partial(_packer(len(values)), charges.data, 0)
+        write_into_charges = partial(_packer(len(values)), charges.data, 0)  # writes at the offset 0
         if write_finite(write_into_charges, values):
             return charges
+    # The other function is slower, but accepts rows, and raises the errors.
     return _from_array(values, shape, electrodes)
 
 
@@ -296,17 +278,22 @@ def _packer(count: int) -> Callable[..., None]:
 
 
 def _from_array(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
-    """Return the charges from values of any kind; raise RequestError or ChargeError if they are not valid.
+    """Return the charges from values of any kind, shape (n, electrodes), pC.
 
     Args:
         values: Content of the key `data` of the request.
         shape: Number of presses and number of electrodes.
         electrodes: Names of the electrodes, for error messages.
+
+    Raises:
+        RequestError: If the values are not numbers, or have neither this shape nor the shape of a flat list.
+        ChargeError: If a charge is not finite.
     """
     numbers = _as_array(values)
     press_count, electrode_count = shape
+    flat_shape = [press_count * electrode_count]
     is_numeric = numbers.dtype.kind in "fiu"  # floating-point numbers, and integers with and without sign
-    has_shape = list(numbers.shape) in (shape, [press_count * electrode_count])
+    has_shape = list(numbers.shape) in (shape, flat_shape)
     if not (is_numeric and has_shape):
         raise RequestError(
             f"input {INPUT!r}: expected `data`, numbers for the shape {shape}, flat or in rows, "
@@ -319,26 +306,34 @@ def _as_array(values: Any) -> np.ndarray[Any, Any]:
     """Convert a list, or a list of lists, to an array.
 
     If the values contain true or false, the array has the type object, because NumPy would convert these values to 1
-    and 0. If the values do not form an array, the result is an array of None.
+    and 0. If the values do not form an array, the result is an array of None. The caller refuses both types.
     """
+    dtype = object if _contains_booleans(values) else None  # None: NumPy chooses the type
     try:
-        is_nested = isinstance(values, list) and bool(values) and isinstance(values[0], list)
-        rows = values if is_nested else [values]
-        has_booleans = any(type(row) is list and any(type(value) is bool for value in row) for row in rows)
-        return np.asarray(values, object if has_booleans else None)
-    except (ValueError, OverflowError):
+        return np.asarray(values, dtype)
+    except (ValueError, OverflowError):  # rows of different lengths, or an integer that is too large
         return np.array(None)
+
+
+def _contains_booleans(values: Any) -> bool:
+    """Return whether true or false is an element of a list, or of a list in a list of lists."""
+    is_nested = isinstance(values, list) and bool(values) and isinstance(values[0], list)
+    rows = values if is_nested else [values]
+    return any(type(row) is list and any(type(value) is bool for value in row) for row in rows)
 
 
 def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
     """Return the body of the response to an inference.
+
+    Args:
+        answer: Outputs of the model, and the names of those that are sent as binary tensors.
 
     Returns:
         The body: JSON, which may be followed by binary tensors; and the length of the JSON in bytes if binary tensors
         follow, otherwise None.
     """
     content: dict[str, Any] = {"model_name": answer.name, "model_version": answer.version}
-    if answer.id:
+    if answer.id:  # empty if the request has no identifier
         content["id"] = answer.id
     binary_tensors = {name: binary_tensor(rows) for name, rows in answer.outputs.items() if name in answer.binary}
     content["outputs"] = [_json_tensor(name, rows, binary_tensors.get(name)) for name, rows in answer.outputs.items()]
@@ -369,7 +364,8 @@ def _json_tensor(name: str, rows: Rows, binary: bytes | None) -> dict[str, Any]:
         binary: The binary tensor; None if the values are written as JSON.
     """
     is_text = name == FLAGS
-    tensor = {"name": name, "datatype": "BYTES" if is_text else "FP32", "shape": rows.shape}
+    datatype = "BYTES" if is_text else "FP32"
+    tensor = {"name": name, "datatype": datatype, "shape": rows.shape}
     if binary is not None:
         return tensor | {"parameters": {"binary_data_size": len(binary)}}
     values = rows.ravel()
@@ -380,7 +376,7 @@ ResponseType = TypeVar("ResponseType")
 
 
 def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> tuple[dict[str, Rows], int, int]:
-    """Run the model. This function may be called from any thread.
+    """Run the model on the charges of presses. This function may be called from any thread.
 
     Args:
         loaded: The model.
@@ -394,7 +390,7 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
     Raises:
         ModelError: If onnxruntime fails to run the graph.
     """
-    if FLAGS in names:  # the flags are computed from all outputs of the graph
+    if FLAGS in names:  # the flags are computed from all outputs of the graph, which do not include the flags
         outputs, unchecked, alarms = infer(loaded, charge_pC, loaded.outputs)
         outputs[FLAGS] = _flags(loaded, outputs)
         return {name: outputs[name] for name in names}, unchecked, alarms
@@ -406,14 +402,14 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
     check_output_shapes(outputs, count, loaded.metadata.label)
     if "misfit" not in outputs:
         return outputs, count, 0
-    good_count = int(np.count_nonzero(outputs["misfit"] <= loaded.validity.misfit_limit))  # a misfit of NaN is not good
-    return outputs, 0, count - good_count
+    is_good = outputs["misfit"] <= loaded.validity.misfit_limit  # false for NaN
+    return outputs, 0, count - int(np.count_nonzero(is_good))
 
 
 def _infer_single_press(
     loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]
 ) -> tuple[dict[str, Rows], int, int]:
-    """Run the model for one press in bound memory, which is faster than `session.run`.
+    """Run the model for one press in memory that is bound to its session, which is faster than `session.run`.
 
     Args:
         loaded: The model.
@@ -444,9 +440,11 @@ def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
         outputs: Outputs of the model for these presses, each of shape (n, width).
     """
     correlations = np.zeros_like(outputs["contact"])  # the flags do not depend on the correlations
+    # These are the attributes of Contacts in their order: three for the contact, three standard deviations, the misfit
+    # and three correlations.
     parts = [outputs["contact"], outputs["contact_std"], outputs["misfit"], correlations]
-    columns = np.concatenate(parts, axis=1).T  # one row for each attribute of Contacts
-    contacts = Contacts(*columns)
+    attributes = np.concatenate(parts, axis=1).T  # shape (10, n)
+    contacts = Contacts(*attributes)
     texts = [",".join(flags) for flags in loaded.validity.batch_flags(contacts)]
     return np.array(texts, dtype=object)[:, np.newaxis]
 

@@ -44,7 +44,7 @@ def openapi_document(routes: Iterable[Route], store: ModelStore) -> Json:
 
 
 def _path_item(path: str, route: Route) -> Json:
-    """Return the description of a path, which contains its parameters, its method, the request body and the responses.
+    """Return the OpenAPI description of a path: its parameters, its method, the request body and the responses.
 
     Args:
         path: Template of the path.
@@ -94,8 +94,8 @@ def _schemas(routes: Iterable[Route]) -> dict[str, Any]:
     schemas: dict[str, Any] = {}
     for schema in used:
         if isinstance(schema.content, type):
-            _, derived = msgspec.json.schema_components([schema.content], ref_template=REFERENCE)
-            schemas |= derived
+            _, derived_schemas = msgspec.json.schema_components([schema.content], ref_template=REFERENCE)
+            schemas |= derived_schemas
         else:
             schemas[schema.name] = schema.content
     return schemas

@@ -74,7 +74,7 @@ def _first_request(served: list[LoadedVersion]) -> str:
     """Return the section of the page that shows how to send a press, as HTML; empty if no model is loaded."""
     if not served:
         return ""
-    loaded = served[0]
+    loaded = served[0]  # the example uses any model
     path = f"v2/models/{quote(loaded.metadata.name, safe='')}"
     meanings = "".join(
         f"<dt><code>{name}</code></dt><dd>{escape(OUTPUT_MEANINGS[name])}</dd>" for name in loaded.outputs

@@ -81,8 +81,8 @@ def error_response(error: Exception) -> Response:
     token is missing or wrong, the header `WWW-Authenticate` names the required authentication.
     """
     http_status, _ = statuses(error)  # the second status is that of gRPC
-    error_class = type(error).__name__
-    response = refusal(http_status, client_message(error), error_class)
+    error_type = type(error).__name__  # for the log
+    response = refusal(http_status, client_message(error), error_type)
     if isinstance(error, errors.WrongMethod):
         response.headers.append((b"allow", error.allowed.encode()))
     if isinstance(error, errors.TokenError):
@@ -113,18 +113,18 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
     if encoding in (b"", b"identity"):
         return body
     if encoding not in _WINDOW_BITS:
-        raise errors.UnknownEncoding(f"Content-Encoding {_shown(encoding)}: expected gzip, deflate or identity")
+        raise errors.UnknownEncoding(f"Content-Encoding {_quoted(encoding)}: expected gzip, deflate or identity")
     decompressor = zlib.decompressobj(_WINDOW_BITS[encoding])
     try:
         plain = decompressor.decompress(body, limit + 1)  # one byte more shows that the limit is exceeded
     except zlib.error as error:
         raise errors.RequestError(
-            f"the body is not {_shown(encoding)}, as its Content-Encoding states: {error}"
+            f"the body is not {_quoted(encoding)}, as its Content-Encoding states: {error}"
         ) from error
     if len(plain) > limit:
         raise errors.TooLarge(f"the body unpacks to more than {limit} bytes; send smaller batches")
     if not decompressor.eof or decompressor.unused_data:
-        raise errors.RequestError(f"the body ends before, or goes on after, the end of its {_shown(encoding)} data")
+        raise errors.RequestError(f"the body ends before, or goes on after, the end of its {_quoted(encoding)} data")
     return plain
 
 
@@ -141,6 +141,7 @@ def compress(body: bytes, accepted: bytes) -> tuple[bytes, bytes]:
     if len(body) < MIN_COMPRESSED_BYTES:
         return body, b""
     encodings = _accepted_encodings(accepted)
+    # The lowest level is used, because it is the fastest. Without a time stamp, equal bodies give equal bytes.
     if b"gzip" in encodings:
         return gzip.compress(body, compresslevel=1, mtime=0), b"gzip"
     if b"deflate" in encodings:
@@ -163,6 +164,6 @@ def _accepted_encodings(header: bytes) -> set[bytes]:
     return names
 
 
-def _shown(encoding: bytes) -> str:
+def _quoted(encoding: bytes) -> str:
     """Return the name of an encoding for an error message."""
     return repr(encoding.decode("latin-1"))[:50]

@@ -15,9 +15,9 @@ from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.metrics import CONTENT_TYPE, Metrics
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol import describe
+from isocharge.serve.network.protocol.infer_body import InferBody
 from isocharge.serve.network.protocol.inference import (
     FLAGS,
-    InferBody,
     answer_inference,
     read_infer,
     read_object,
@@ -261,8 +261,10 @@ def _infer(request: Request) -> Response:
     """
     loaded = request.loaded
     header_length = request.headers.get(b"inference-header-content-length")
+    # answer_inference calls `read` and `write_answer` itself, because it measures and counts them.
     read = partial(read_infer, request.body, header_length, loaded, request.service.limits.batch)
     plain_body, json_length = answer_inference(loaded, read, write_answer)
+
     accepted_encodings = request.headers.get(b"accept-encoding", b"")
     body, encoding = compress(plain_body, accepted_encodings)
 
