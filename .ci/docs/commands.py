@@ -27,7 +27,7 @@ def write_page(path: Path) -> None:
         context = typer.Context(command, info_name=name, terminal_width=WIDTH, max_content_width=WIDTH)
         sections.append(f"## {name}\n\n```text\n{command.get_help(context)}\n```\n")
     text = "\n".join(sections)
-    if not path.exists() or path.read_text("utf-8") != text:
+    if not path.exists() or path.read_text("utf-8") != text:  # Sphinx does not read an unchanged page again
         path.parent.mkdir(exist_ok=True)
         path.write_text(text, "utf-8")
 
@@ -35,8 +35,9 @@ def write_page(path: Path) -> None:
 def _commands(group: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield each command of a group and of its subgroups, and the words that call this command."""
     for name in group.list_commands(None):
-        _, command, _ = group.resolve_command(None, [name])
-        if hasattr(command, "list_commands"):
+        _name, command, _remaining_args = group.resolve_command(None, [name])
+        is_group = hasattr(command, "list_commands")
+        if is_group:
             yield from _commands(command, (*words, name))
         else:
             yield (*words, name), command

@@ -105,10 +105,13 @@ def add_whole_pages(app: Any, error: Exception | None) -> None:
 
 def setup(app: Any) -> None:
     """Write the pages of the reference, and connect the functions of this module to the events of Sphinx."""
-    names = reference.modules()
-    reference.check_docstrings(names)
-    reference.write_pages(names, ROOT / REFERENCE)
+    # The pages must exist before Sphinx looks for the sources.
+    module_names = reference.modules()
+    reference.check_docstrings(module_names)
+    reference.write_pages(module_names, ROOT / REFERENCE)
     commands.write_page(ROOT / f"{COMMANDS}.md")
+
+    # Napoleon has the priority 500. It runs between the conversion to reStructuredText and the list of attributes.
     app.connect("source-read", add_contents)
     app.connect("autodoc-skip-member", reference.is_of_scikit_learn)
     app.connect("autodoc-process-docstring", reference.plain_text, priority=400)

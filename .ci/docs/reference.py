@@ -9,6 +9,7 @@ from typing import Any
 
 PUBLIC_PACKAGES = ("isocharge.serve", "isocharge.simulate", "isocharge.train")
 ATTRIBUTE = re.compile(r":ivar (?P<names>[^:]+): ?(?P<text>.*)")
+UNINDENTED_EXAMPLE = re.compile(r"^(from \w+ import|>>>|\w+ = \w+\()", re.MULTILINE)
 DOTTED = re.compile(r"`(isocharge(?:\.\w+)+)`")
 
 
@@ -32,12 +33,17 @@ def check_docstrings(names: list[str]) -> None:
         SystemExit: If a name or an example is wrong.
     """
     for name in names:
-        if re.search(r"^(from \w+ import|>>>|\w+ = \w+\()", import_module(name).__doc__ or "", re.MULTILINE):
+        module = import_module(name)
+        if UNINDENTED_EXAMPLE.search(module.__doc__ or ""):
             sys.exit(f"{name}: expected the example in the docstring indented, after an empty line")
-        for dotted in DOTTED.findall(Path(str(import_module(name).__file__)).read_text("utf-8")):
-            home, _, attribute = dotted.rpartition(".")
-            if dotted not in names and not (home in names and hasattr(import_module(home), attribute)):
-                sys.exit(f"{name}: expected a module or an attribute of one, got `{dotted}`")
+
+        source = Path(str(module.__file__)).read_text("utf-8")
+        for dotted_name in DOTTED.findall(source):
+            module_name, _, attribute = dotted_name.rpartition(".")
+            is_module = dotted_name in names
+            is_attribute = module_name in names and hasattr(import_module(module_name), attribute)
+            if not is_module and not is_attribute:
+                sys.exit(f"{name}: expected a module or an attribute of one, got `{dotted_name}`")
 
 
 def write_pages(names: list[str], folder: Path) -> None:
@@ -51,8 +57,8 @@ def write_pages(names: list[str], folder: Path) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
-        lines = [
-            ":orphan:",
+        page = [
+            ":orphan:",  # Sphinx then accepts that the page is in no table of contents
             "",
             name,
             "=" * len(name),
@@ -61,13 +67,16 @@ def write_pages(names: list[str], folder: Path) -> None:
             "   :members:",
             "   :show-inheritance:",
         ]
-        if hasattr(import_module(name), "__all__"):  # the index refers to the module that defines a public name
-            lines += ["   :imported-members:", "   :no-index:"]
-        _write(folder / f"{name}.rst", lines)
-    lines = ["Modules", "=======", "", "The public names are those of these packages:", ""]
-    lines += [f"* :doc:`{name}`" for name in PUBLIC_PACKAGES]
-    lines += ["", "All modules:", "", *(f"* :doc:`{name}`" for name in names)]
-    _write(folder / "index.rst", lines)
+        if hasattr(import_module(name), "__all__"):
+            # The page shows the public names, but the index refers to the modules that define them.
+            page += ["   :imported-members:", "   :no-index:"]
+        _write(folder / f"{name}.rst", page)
+
+    list_page = ["Modules", "=======", "", "The public names are those of these packages:", ""]
+    list_page += [f"* :doc:`{name}`" for name in PUBLIC_PACKAGES]
+    list_page += ["", "All modules:", ""]
+    list_page += [f"* :doc:`{name}`" for name in names]
+    _write(folder / "index.rst", list_page)
 
 
 def _write(path: Path, lines: list[str]) -> None:
@@ -88,20 +97,26 @@ def is_of_scikit_learn(_app: Any, _kind: str, name: str, _object: Any, skip: boo
 def plain_text(_app: Any, kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
     """Convert a docstring in plain text, in which names have backticks, to reStructuredText.
 
-    Indented lines after a blank line become code.
+    Indented lines after a blank line become code, up to the next line that is not indented. Sphinx calls this function
+    for each docstring and expects the result in the same list.
+
+    Args:
+        kind: Kind of the documented object, such as "data" for a constant.
+        lines: Lines of the docstring, which are replaced by the converted lines.
     """
-    shown = []
+    converted = []
     is_code = False
     for previous_line, line in zip(["", *lines], lines, strict=False):
-        if line.strip():
+        if line.strip():  # a blank line does not end the code
             was_code = is_code
-            is_code = line.startswith("    ") and (was_code or not previous_line.strip())
+            follows_blank_line = not previous_line.strip()
+            is_code = line.startswith("    ") and (was_code or follows_blank_line)
             if is_code and not was_code:
-                shown += ["::", ""]
-        shown.append(line if is_code else _escaped(line))
+                converted += ["::", ""]  # begins a block of code
+        converted.append(line if is_code else _escaped(line))
     if kind in ("attribute", "data"):
-        shown.insert(0, "\\ ")  # otherwise, Sphinx would interpret text before a colon in the first line as a type
-    lines[:] = shown
+        converted.insert(0, "\\ ")  # otherwise, Sphinx would interpret text before a colon in the first line as a type
+    lines[:] = converted
 
 
 def list_attributes(_app: Any, _kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
@@ -109,24 +124,29 @@ def list_attributes(_app: Any, _kind: str, _name: str, _object: Any, _options: A
 
     Napoleon writes a field `:ivar NAMES: text` for each attribute. If there are several names, as in `x_mm, y_mm`,
     Sphinx would interpret the first name as a type. The fields `:vartype NAME:`, which contain the types, are omitted.
+    Sphinx calls this function for each docstring and expects the result in the same list.
+
+    Args:
+        lines: Lines of the docstring, which are replaced by the converted lines.
     """
-    shown: list[str] = []
-    in_attributes = False
+    converted: list[str] = []
+    is_in_list = False
     for line in lines:
-        attribute = ATTRIBUTE.match(line)
         if line.startswith(":vartype "):
             continue
-        if attribute:
-            if not in_attributes:
-                shown += [":Attributes:", ""]
-            in_attributes = True
-            shown.append(f"    * **{attribute['names']}**: {attribute['text']}")
-        elif in_attributes and (not line.strip() or line.startswith(" ")):
-            shown.append(f"      {line.lstrip()}".rstrip())
+        attribute = ATTRIBUTE.match(line)
+        is_continuation = not line.strip() or line.startswith(" ")  # of the description of an attribute
+        if attribute is not None:
+            if not is_in_list:
+                converted += [":Attributes:", ""]
+            is_in_list = True
+            converted.append(f"    * **{attribute['names']}**: {attribute['text']}")
+        elif is_in_list and is_continuation:
+            converted.append(f"      {line.lstrip()}".rstrip())
         else:
-            in_attributes = False
-            shown.append(line)
-    lines[:] = shown
+            is_in_list = False
+            converted.append(line)
+    lines[:] = converted
 
 
 def _escaped(line: str) -> str:

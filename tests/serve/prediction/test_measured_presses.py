@@ -179,7 +179,7 @@ def test_missing_press_file_is_refused(tmp_path, name):
 def test_row_words_of_a_message():
     assert row_words([3], "line") == "line 3"
     assert row_words([3, 5], "row") == "rows 3, 5"
-    assert row_words(range(1, 6), "line", most=3) == "lines 1, 2, 3 and 2 more"
+    assert row_words(range(1, 6), "line", max_listed=3) == "lines 1, 2, 3 and 2 more"
 
 
 def test_arrays_of_different_lengths_are_refused():
