@@ -188,11 +188,11 @@ def test_lasting_drift_is_followed(mine, problem, film):
     assert force_error_percent < 5.5
 
 
-def test_following_an_unchanged_film_hardly_increases_the_errors(mine, problem, film):
-    """A drift of each gain by 1 % is possible, which adds 0.75 % to the force errors."""
+def test_following_an_unchanged_film_hardly_increases_the_position_errors(mine, problem, film):
+    """Drifts of the gains and other unknowns of the film are possible, which add 1.3 % to the force errors."""
     _, followed_errors = follow(mine, problem, film, [1.0] * 80)
     _, calibrated_errors = follow(mine, problem, film, [1.0] * 80, before_touch=reset_film_before_each)
-    allowed = np.hypot(1.05 * rms_errors(calibrated_errors), [0.0, 0.75])
+    allowed = np.hypot(1.07 * rms_errors(calibrated_errors), [0.0, 1.35])
     np.testing.assert_array_less(rms_errors(followed_errors), allowed)
 
 
@@ -242,8 +242,12 @@ def test_gain_that_changes_late_is_not_taken_for_a_change_of_pretension(mine, pr
     rng = np.random.default_rng(4)
     charge = problem.noise.add(film(1.0).charges(draw_contacts(rng, problem.domain, 360)), rng)
     charge[300:, 0] *= 0.985
-    pretensions_MPa = []
+    changes_MPa = []
+    stds_MPa = []
+    calibrated_MPa = follower.film.pretension_MPa
     for number, row in enumerate(charge):
         follower.observe_touch(PeakFrame(follower.predictor.predict(row), row), 5.0 * number)
-        pretensions_MPa.append(follower.film.pretension_MPa)
-    assert np.ptp(pretensions_MPa[299:]) < 0.1
+        changes_MPa.append(follower.film.pretension_MPa - calibrated_MPa)
+        stds_MPa.append(follower.film.pretension_std_MPa)
+    assert np.ptp(changes_MPa[299:]) < 0.25
+    assert np.all(np.abs(changes_MPa[299:]) < 2.0 * np.array(stds_MPa[299:]))
