@@ -304,7 +304,7 @@ def _energy_norm(elastic: ElasticFilm, field: Array, step: Array, residual: Arra
 
 
 def _guard_tension(elastic: ElasticFilm, relative_residual: float) -> float:
-    """Return the tension that is added to the tangent far from the equilibrium, where a film may be compressed.
+    """Return the tension that is added to the tangent, because a flat film without pretension has no stiffness.
 
     The tension is proportional to the relative residual, and at most `GUARD_TENSION` times the tension that the load
     induces. It is zero if the relative residual is at most `GUARD_BELOW`.
