@@ -16,11 +16,13 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
+from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.errors import ConfigError
 from isocharge.common.progress import second_thread
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve.model.charge_series import FILE as CHARGES_FILE
-from isocharge.simulate import Dataset, Sensor
+from isocharge.serve.model.charge_series import ChargeSeries
+from isocharge.simulate import Dataset, NoiseModel, Sensor
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
@@ -28,11 +30,14 @@ from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.config import DefaultSizes, FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.descent import Descent, TrainingStage
+from isocharge.train.training.exact_search import error_cautions
 from isocharge.train.training.fitted import Fitted, Provenance
 from isocharge.train.training.folded_network import FoldedNetwork
+from isocharge.train.training.linear_targets import LinearTargets, TargetBatch
 from isocharge.train.training.losses import (
     CORRELATION_WEIGHT,
     distillation_loss,
+    linear_target_loss,
     robust_correlation_loss,
     validation_score,
     warm_up_loss,
@@ -55,6 +60,10 @@ _log = logging.getLogger(__name__)
 WARM_UP_FRACTION = 0.15
 """Fraction of the steps that use the warm-up loss, dimensionless."""
 
+LINEAR_TARGET_FRACTION = 0.7
+"""Fraction of the steps in which the network of a sensor with more than `FEW_ELECTRODES` electrodes learns from linear
+targets, including the warm-up. With three and four electrodes, these targets do not reduce the errors."""
+
 ROUNDED_FRACTION = 0.25
 """Number of steps after the hidden weights are rounded, relative to the number of steps before, dimensionless."""
 
@@ -65,7 +74,8 @@ N_STD_PRESSES = 30_000
 def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run: ResumableRun | None = None) -> Fitted:
     """Train a network on presses, fold it into the form of a release, and calibrate its standard deviations.
 
-    A warning is logged if two contacts of the requested domain have the same charges.
+    A warning is logged if two contacts of the requested domain have the same charges, and if the errors of the network
+    are clearly larger than the errors of an exact search.
 
     Args:
         source: A dataset, simulated or measured, or other training data, for example of a student.
@@ -89,8 +99,15 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
     # The threshold of the alarm needs many good presses, so all measured presses are used, not only those for the test.
     split = trained.split
     good_presses = data.presses.within(split.domain.radius) if data.presses.measured else split.test
+    network = _fold_and_calibrate(trained, settings.training)
+    cautions = split.cautions
+    noise = settings.training.noise_model
+    if data.teacher is None and _is_noise_known(data, noise):
+        for caution in error_cautions(network, split.test, split.field, noise, settings.training.seed):
+            _log.warning("%s", caution)
+            cautions = (*cautions, caution)
     return Fitted(
-        network=_fold_and_calibrate(trained, settings.training),
+        network=network,
         sensor=data.sensor,
         probes=data.probes,
         domain=split.domain,
@@ -98,9 +115,9 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
         test=split.test if data.test is None else data.test,
         good=good_presses,
         sha256=data.sha256,
-        provenance=_provenance(data, split, settings),
+        provenance=_provenance(data, split.folded_charges, cautions, settings),
         requested_domain=data.domain,
-        cautions=split.cautions,
+        cautions=cautions,
         outside=trained.outside,
     )
 
@@ -124,25 +141,40 @@ def _fold_and_calibrate(trained: "TrainedNetwork", config: TrainingConfig) -> Fo
         return with_correlation(network, train, noise, config.seed)
 
 
-def _provenance(data: TrainingData, split: Split, config: FitConfig) -> Provenance:
-    """Return the provenance of the training data with the settings of the training.
+def _is_noise_known(data: TrainingData, noise: NoiseModel) -> bool:
+    """Return whether the charges of the presses get noise with known standard deviations greater than zero.
 
-    If two contacts of the requested domain have the same charges, the charges of all presses are added as a file.
+    Measured charges already have noise, whose standard deviations are not known. A training without noise has the
+    standard deviation zero.
 
     Args:
         data: Training data.
-        split: The split of the presses, with its cautions.
+        noise: Noise of the training.
+    """
+    return not data.presses.measured and noise.white > 0.0
+
+
+def _provenance(
+    data: TrainingData, folded_charges: ChargeSeries | None, cautions: tuple[str, ...], config: FitConfig
+) -> Provenance:
+    """Return the provenance of the training data with the settings of the training.
+
+    Args:
+        data: Training data.
+        folded_charges: Charges of all presses, which are added as a file, if two contacts of the requested domain have
+            the same charges; None otherwise.
+        cautions: Sentences about the limits of the network.
         config: Settings of the training.
     """
     made_with: dict[str, object] = {"config": config.to_dict(), "torch": torch.__version__}
-    if split.cautions:
-        made_with["cautions"] = list(split.cautions)
+    if cautions:
+        made_with["cautions"] = list(cautions)
     if data.teacher is not None:
         made_with["teacher"] = data.teacher.label
     made_with.update(data.provenance.made_with)
     files = dict(data.provenance.files)
-    if split.folded_charges is not None:
-        files[CHARGES_FILE] = split.folded_charges.to_bytes()
+    if folded_charges is not None:
+        files[CHARGES_FILE] = folded_charges.to_bytes()
     return replace(data.provenance, made_with=made_with, files=files)
 
 
@@ -214,7 +246,19 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
 
         # Second thread: train the misfit perceptron. This thread: train the contact perceptron
         misfit_training = executor.submit(train_misfit)
-        stage = contact_stage(network, split.train, split.validation, training.noise_model, training, data.teacher)
+        linear_targets = None
+        has_many_electrodes = network.n_electrode > FEW_ELECTRODES
+        if has_many_electrodes and data.teacher is None and _is_noise_known(data, training.noise_model):
+            linear_targets = LinearTargets.of(split.train, split.field, training.noise_model)
+        stage = contact_stage(
+            network,
+            split.train,
+            split.validation,
+            training.noise_model,
+            training,
+            teacher=data.teacher,
+            linear_targets=linear_targets,
+        )
         train_perceptron(stage, network.contact, config, run)
         outside = misfit_training.result()
     return TrainedNetwork(network.eval(), split, outside)
@@ -292,11 +336,16 @@ def contact_stage(
     validation: LabelledPresses,
     noise: Noise,
     config: TrainingConfig,
+    *,
     teacher: Teacher | None = None,
+    linear_targets: LinearTargets | None = None,
 ) -> TrainingStage:
     """Return the training of the contact perceptron on charges with fresh noise.
 
-    Before the training, the linear part of the perceptron is fitted by least squares.
+    Before the training, the linear part of the perceptron is fitted by least squares. The training begins with a
+    warm-up. If there are linear targets, the mean of the network learns from them in the warm-up and until
+    `LINEAR_TARGET_FRACTION` of the steps. The remaining steps minimise the likelihood of the contacts, or the distance
+    from the teacher's answers.
 
     Args:
         network: The network, whose contact perceptron is trained.
@@ -305,29 +354,30 @@ def contact_stage(
         noise: Noise that is added to the charges in every step.
         config: Number of steps, batch size and seed.
         teacher: Model whose answers are learned; None to learn the contacts of the presses.
+        linear_targets: Targets of the presses of `train` for the first phases; None to use only the contacts.
     """
     domain = network.domain
     steps = config.contact_step_count(network.n_electrode)
     warm_up_steps = round(WARM_UP_FRACTION * steps)
     charge = as_tensor(train.charge)
-    target = as_tensor(domain.to_unit(train.contact))
+    unit_contact = as_tensor(domain.to_unit(train.contact))
     # Measured charges have noise of their own.
     validation_charge = as_tensor(validation.charge if validation.measured else validation.noisy(noise, config.seed))
     validation_target = as_tensor(domain.to_unit(validation.contact))
     batch = min(config.batch, len(charge))
     noisy_charge = with_fresh_noise(charge, noise, torch.Generator().manual_seed(config.seed))
-    network.contact.fit_linear_part(network.inputs(noisy_charge), target)
+    network.contact.fit_linear_part(network.inputs(noisy_charge), unit_contact)
+
+    linear_steps = round(LINEAR_TARGET_FRACTION * steps)
 
     def loss(step: int, random: torch.Generator) -> Tensor:
-        """Return the loss of a random batch with new noise.
-
-        The first steps use the warm-up loss. The later steps use the loss of mean and standard deviations plus the loss
-        of the correlations. If there is a teacher network, the targets are the outputs of the teacher for the same
-        charges.
-        """
+        """Return the loss of a random batch with new noise, in the phase to which the step belongs."""
         rows = torch.randint(len(charge), (batch,), generator=random)
+        if linear_targets is not None and step < linear_steps:
+            return linear_loss(linear_targets.draw(rows, random), unit_contact[rows], is_warm_up=step < warm_up_steps)
+
         noisy_batch = with_fresh_noise(charge[rows], noise, random)
-        contact = target[rows]
+        contact = unit_contact[rows]
         mean, log_std, angles = network.posterior_with_angles(noisy_batch)
         is_warm_up = step < warm_up_steps
         if teacher is None:
@@ -339,10 +389,27 @@ def contact_stage(
             if is_warm_up:
                 return warm_up_loss(mean, log_std, teacher_mean)
             posterior_loss = distillation_loss(mean, log_std, teacher_mean, teacher_log_std)
+        return posterior_loss + correlation_loss(angles, contact - mean, log_std)
 
-        # Errors in units of their standard deviations, from which the correlations are learned
-        deviation = (contact - mean) * torch.exp(-log_std)
-        return posterior_loss + CORRELATION_WEIGHT * robust_correlation_loss(angles, deviation)
+    def linear_loss(linear_batch: TargetBatch, contact: Tensor, *, is_warm_up: bool) -> Tensor:
+        """Return the loss of a batch with linear targets.
+
+        Args:
+            linear_batch: Charges, targets and factors of the noise.
+            contact: True unit coordinates, shape (n, 3).
+            is_warm_up: Whether the step belongs to the warm-up.
+        """
+        mean, log_std, angles = network.posterior_with_angles(linear_batch.charge)
+        if is_warm_up:
+            return warm_up_loss(mean, log_std, linear_batch.target)
+        # The errors grow with the noise. The division gives the errors that charges with their usual noise cause.
+        error = (contact - mean) / linear_batch.noise_factor
+        mean_and_std_loss = linear_target_loss(mean, log_std, linear_batch.target, error)
+        return mean_and_std_loss + correlation_loss(angles, error, log_std)
+
+    def correlation_loss(angles: Tensor, error: Tensor, log_std: Tensor) -> Tensor:
+        """Return the weighted loss of the correlations, which are learned from errors in standard deviations."""
+        return CORRELATION_WEIGHT * robust_correlation_loss(angles, error * torch.exp(-log_std))
 
     def score() -> tuple[float, str]:
         """Return the loss on the validation presses, and a text with the errors."""

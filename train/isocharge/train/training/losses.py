@@ -33,8 +33,8 @@ Where two errors are nearly proportional to each other, a square would cause gra
 diverges."""
 
 
-def with_fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor:
-    """Add normally distributed noise to charges.
+def fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor:
+    """Draw normally distributed noise for charges.
 
     Args:
         charge: Charges without noise, any shape, pC.
@@ -42,12 +42,17 @@ def with_fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> T
         random: Random number generator.
 
     Returns:
-        Charges with noise, same shape, pC.
+        The noise, same shape as the charges, pC.
     """
     white = torch.as_tensor(noise.white, dtype=torch.float32)
     gain = torch.as_tensor(noise.gain, dtype=torch.float32)
     sigma = torch.hypot(white, gain * charge)
-    return charge + sigma * torch.randn(charge.shape, generator=random)
+    return sigma * torch.randn(charge.shape, generator=random)
+
+
+def with_fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor:
+    """Return charges with noise that is drawn by `fresh_noise`. The arguments are those of `fresh_noise`."""
+    return charge + fresh_noise(charge, noise, random)
 
 
 def warm_up_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
@@ -61,9 +66,9 @@ def warm_up_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
         log_std: Logarithms of their standard deviations, shape (n, 3).
         target: True unit coordinates, shape (n, 3).
     """
-    squares = (mean - target) ** 2
-    std_loss = log_std + 0.5 * squares.detach() * torch.exp(-2.0 * log_std)
-    return (WARM_UP_MEAN_WEIGHT * squares + WARM_UP_STD_WEIGHT * std_loss).sum(dim=1).mean()
+    error = mean - target
+    std_loss = _std_loss(log_std, error)
+    return (WARM_UP_MEAN_WEIGHT * error**2 + WARM_UP_STD_WEIGHT * std_loss).sum(dim=1).mean()
 
 
 def likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
@@ -81,26 +86,61 @@ def likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
 def weighted_likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
     """Compute a loss with the same minimum as `likelihood_loss`, in which uncertain presses count more.
 
-    The gradient of a Gaussian likelihood with respect to the mean is divided by the variance. Where a network
-    overestimates the standard deviation, it therefore learns the mean slowly (Seitzer et al., 2022, arXiv 2203.09168).
-    In this loss, the squared errors of the mean are multiplied by the estimated standard deviation to the power of `2 *
-    STD_EXPONENT`. The mean of these weights over the presses is 1. The standard deviations have the gradient of the
-    likelihood.
-
     Args:
         mean: Estimated unit coordinates, shape (n, 3).
         log_std: Logarithms of their standard deviations, shape (n, 3).
         target: True unit coordinates, shape (n, 3).
     """
-    squared_error = (mean - target) ** 2
-    # Loss of the mean, in which the standard deviations are constants: the weight is std^(2 STD_EXPONENT).
+    return (_weighted_mean_loss(mean, log_std, target) + _std_loss(log_std, mean - target)).sum(dim=1).mean()
+
+
+def linear_target_loss(mean: Tensor, log_std: Tensor, target: Tensor, error: Tensor) -> Tensor:
+    """Compute the loss of `weighted_likelihood_loss` for a mean that learns from targets which follow the noise.
+
+    Args:
+        mean: Estimated unit coordinates, shape (n, 3).
+        log_std: Logarithms of their standard deviations, shape (n, 3).
+        target: Unit coordinates that the mean should have, shape (n, 3).
+        error: Errors of the mean to which the standard deviations are fitted, shape (n, 3).
+    """
+    return (_weighted_mean_loss(mean, log_std, target) + _std_loss(log_std, error)).sum(dim=1).mean()
+
+
+def _weighted_mean_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
+    """Compute the weighted squared errors of the mean.
+
+    The gradient of a Gaussian likelihood with respect to the mean is divided by the variance. Where a network
+    overestimates the standard deviation, it therefore learns the mean slowly (Seitzer et al., 2022, arXiv 2203.09168).
+    In this loss, the squared errors of a Gaussian likelihood are multiplied by the estimated standard deviation to the
+    power of `2 * STD_EXPONENT`. The mean of these factors over the presses is 1. The standard deviations are constants
+    in this loss.
+
+    Args:
+        mean: Estimated unit coordinates, shape (n, 3).
+        log_std: Logarithms of their standard deviations, shape (n, 3).
+        target: Unit coordinates that the mean should have, shape (n, 3).
+
+    Returns:
+        Loss of every coordinate, shape (n, 3).
+    """
     fixed_log_std = log_std.detach()
-    mean_of_weights = torch.exp(2.0 * STD_EXPONENT * fixed_log_std).mean(dim=0)
-    weight_over_variance = torch.exp((2.0 * STD_EXPONENT - 2.0) * fixed_log_std) / mean_of_weights
-    mean_loss = 0.5 * weight_over_variance * squared_error
-    # Loss of the standard deviations, in which the errors are constants
-    std_loss = log_std + 0.5 * squared_error.detach() * torch.exp(-2.0 * log_std)
-    return (std_loss + mean_loss).sum(dim=1).mean()
+    mean_of_factors = torch.exp(2.0 * STD_EXPONENT * fixed_log_std).mean(dim=0)
+    # The factor std^(2 STD_EXPONENT), divided by the variance of the Gaussian likelihood
+    weight = torch.exp((2.0 * STD_EXPONENT - 2.0) * fixed_log_std) / mean_of_factors
+    return 0.5 * weight * (mean - target) ** 2
+
+
+def _std_loss(log_std: Tensor, error: Tensor) -> Tensor:
+    """Compute the negative logarithm of a Gaussian likelihood in which only the standard deviations are variables.
+
+    Args:
+        log_std: Logarithms of the standard deviations, shape (n, 3).
+        error: Errors of the mean, shape (n, 3), which are constants in this loss.
+
+    Returns:
+        Loss of every coordinate, shape (n, 3).
+    """
+    return log_std + 0.5 * error.detach() ** 2 * torch.exp(-2.0 * log_std)
 
 
 def robust_correlation_loss(angles: Tensor, deviation: Tensor) -> Tensor:

@@ -1,0 +1,84 @@
+"""Targets of the contact network for sensors with many electrodes, compared with SciPy's least squares."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import least_squares
+
+from isocharge.simulate import Domain, NoiseModel
+from isocharge.simulate.forward.charge_map import FunctionMap
+from isocharge.train import LabelledPresses
+from isocharge.train.training.linear_targets import (
+    LARGEST_LINEAR_STD,
+    MAX_NOISE_FACTOR,
+    LinearTargets,
+)
+
+DOMAIN = Domain(10.0, (0.1, 2.0))
+ELECTRODE_PLACES = 8.0 * np.array([[1, 0], [0, 1], [-1, 0], [0, -1], [0.2, 0.1], [0.9, 0.9]])
+CONTACT = np.array([[3.0, -2.0, 1.0], [-6.0, 4.0, 0.3], [0.5, 0.0, 1.8]])
+
+
+def bell_charges(contact):
+    """Return charges that decrease with the distance from six electrodes, shape (n, 6), pC."""
+    distance = np.linalg.norm(contact[:, None, :2] - ELECTRODE_PLACES, axis=2)
+    return 1e4 * contact[:, 2:] ** 0.7 / (1.0 + (distance / 8.0) ** 2)
+
+
+CHARGE_MAP = FunctionMap(bell_charges, tuple("ABCDEF"), DOMAIN)
+
+
+def targets_of(noise, contact=CONTACT):
+    """Return the targets of presses on the bell-shaped map."""
+    return LinearTargets.of(LabelledPresses(contact, bell_charges(contact)), CHARGE_MAP, noise)
+
+
+def nonlinear_estimate(charge, noise_std):
+    """Return the contact in unit coordinates with the smallest sum of squared residuals, found by SciPy."""
+
+    def residuals(unit):
+        contact = DOMAIN.to_contact(unit[None])
+        return (bell_charges(contact)[0] - charge) / noise_std
+
+    return least_squares(residuals, np.zeros(3), xtol=1e-13, ftol=1e-13, gtol=1e-13).x
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.001], ids=["white noise", "white noise and noise of the gains"])
+def test_targets_are_the_least_squares_estimates_of_the_charges_with_noise(gain):
+    noise = NoiseModel("small", white=1.0, gain=gain)
+    targets = targets_of(noise)
+    batch = targets.draw(torch.arange(len(CONTACT)), torch.Generator().manual_seed(3))
+    noise_std = noise.sigma(bell_charges(CONTACT))
+    estimates = [nonlinear_estimate(charge, std) for charge, std in zip(batch.charge.numpy(), noise_std, strict=True)]
+    change = np.array(estimates) - DOMAIN.to_unit(CONTACT)
+    assert np.abs(change).max() > 1e-3  # the noise changes the estimates clearly
+    np.testing.assert_allclose(batch.target - targets.contact, change, rtol=0.05, atol=2e-5)
+
+
+def test_the_noise_is_enlarged_until_the_contact_would_be_too_uncertain_for_a_linear_estimate():
+    """The standard deviations of the enlarged noise are compared with many draws."""
+    noise = NoiseModel("large", white=30.0, gain=0.002)
+    targets = targets_of(noise)
+    factor = targets.noise_factor.numpy()[:, 0]
+    assert np.all((factor > 1.0) & (factor <= MAX_NOISE_FACTOR))
+    rows = torch.arange(len(CONTACT)).repeat(20_000)
+    batch = targets.draw(rows, torch.Generator().manual_seed(4))
+    drawn_noise = (batch.charge - targets.charge[rows]).double().numpy().reshape(-1, *targets.charge.shape)
+    expected_std = factor[:, None] * noise.sigma(bell_charges(CONTACT))
+    np.testing.assert_allclose(drawn_noise.std(axis=0), expected_std, rtol=0.02)
+
+    changes = (batch.target - targets.contact[rows]).double().numpy().reshape(-1, len(CONTACT), 3)
+    largest_std = changes.std(axis=0).max(axis=1)
+    assert np.all(largest_std < 1.02 * LARGEST_LINEAR_STD)
+    is_limited = factor < MAX_NOISE_FACTOR
+    assert np.any(is_limited)
+    np.testing.assert_allclose(largest_std[is_limited], LARGEST_LINEAR_STD, rtol=0.02)
+
+
+def test_a_press_with_an_uncertain_contact_keeps_its_contact_as_the_target_and_its_noise():
+    noise = NoiseModel("very large", white=2_000.0, gain=0.0)
+    targets = targets_of(noise)
+    assert torch.all(targets.noise_factor == 1.0)
+    batch = targets.draw(torch.tensor([2, 0]), torch.Generator().manual_seed(5))
+    assert torch.equal(batch.target, targets.contact[[2, 0]])
+    assert not torch.equal(batch.charge, targets.charge[[2, 0]])

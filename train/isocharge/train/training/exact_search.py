@@ -1,0 +1,50 @@
+"""Comparison of a trained network with an exact search for the contacts.
+
+The search finds the contact whose charges are nearest to the measured charges (maximum likelihood). If the noise is
+small, no estimator has a smaller rms error (Kay 1993, 7.5). If the charges hardly determine a contact, the errors of a
+good network are smaller than those of the search. A network with much larger errors than the search was trained too
+briefly, or has too few weights for its sensor.
+"""
+
+import numpy as np
+
+from isocharge.common.contact_errors import ContactErrorStatistics
+from isocharge.simulate import ChargeMap, NoiseModel
+from isocharge.simulate.identifiability.nearest_contact import nearest_contact
+from isocharge.train.data.presses import LabelledPresses
+from isocharge.train.training.folded_network import FoldedNetwork
+
+MAX_ERROR_RATIO = 1.08
+"""Largest rms error of a good network, relative to the rms error of the exact search, dimensionless."""
+
+MAX_PRESSES = 2_000
+"""Largest number of presses on which network and search are compared."""
+
+
+def error_cautions(
+    network: FoldedNetwork, presses: LabelledPresses, charge_map: ChargeMap, noise: NoiseModel, seed: int
+) -> tuple[str, ...]:
+    """Return a caution if the errors of a network are much larger than the errors of an exact search.
+
+    Args:
+        network: The trained network.
+        presses: Simulated presses that were not used in the training.
+        charge_map: Map from contacts to charges, in which the search is made.
+        noise: Noise that is added to the charges.
+        seed: Seed of the noise.
+    """
+    compared = presses[np.arange(len(presses)) < MAX_PRESSES]
+    charge = compared.noisy(noise, seed)
+    network_contact, _, _ = network.predict(charge)
+    # The search starts at the true contacts, so that it ends at the nearest solution.
+    search_contact, _ = nearest_contact(charge_map, noise, charge, compared.contact)
+    network_errors = ContactErrorStatistics.of(network_contact, compared.contact)
+    search_errors = ContactErrorStatistics.of(search_contact, compared.contact)
+    position_ratio = network_errors.position_rms_mm / search_errors.position_rms_mm
+    force_ratio = network_errors.force_rms_percent / search_errors.force_rms_percent
+    if max(position_ratio, force_ratio) <= MAX_ERROR_RATIO:
+        return ()
+    return (
+        f"the rms errors of the network are {position_ratio:.2f} (position) and {force_ratio:.2f} (force) times those "
+        "of an exact search; more training.steps or a wider network.hidden may reduce them",
+    )

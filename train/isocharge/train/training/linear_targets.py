@@ -1,0 +1,122 @@
+"""Targets of the contact network that follow the noise of the charges.
+
+A press at the contact c has the charges Q(c) + n, where n is the noise. A network that minimises the squared errors
+learns the posterior mean of the contact. If the noise is small, the posterior mean is the generalised least squares
+estimate (Aitken 1936), which is linear in the noise:
+
+    m = c + A n,   A = (J' W J + P)^-1 J' W.
+
+Here J contains the derivatives of the charges with respect to the contact, W is the inverse of the covariance of the
+noise, and P is the inverse of the covariance of all contacts.
+
+The target m has two advantages over the contact c. First, m is nearly a function of the charges, while c also contains
+the scatter of a single draw of the noise. Second, A does not depend on the size of the noise. Therefore the network can
+learn from larger noise, which shows it more clearly how its estimate has to change with the charges. Both matter for
+sensors with many electrodes: three directions of their charges are caused by a change of the contact, and the network
+has to learn that the noise in all other directions has no influence on the estimate.
+
+The estimate is only linear in the noise if the contact hardly changes within the noise. The target of every other press
+is its contact, and its noise is not enlarged.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from isocharge.simulate import ChargeMap
+from isocharge.train.data.channel_noise import Noise
+from isocharge.train.data.presses import LabelledPresses
+from isocharge.train.training.losses import fresh_noise
+from isocharge.train.training.network import as_tensor
+
+LARGEST_LINEAR_STD = 0.02
+"""Standard deviation of the contact up to which the estimate counts as linear in the noise, in unit coordinates.
+
+The noise is not enlarged beyond this standard deviation, either.
+"""
+
+MAX_NOISE_FACTOR = 5.0
+"""Largest factor by which the noise of a press is enlarged, dimensionless."""
+
+UNIT_PRECISION = 3.0
+"""Inverse of the variance of a unit coordinate, which is distributed uniformly between -1 and 1."""
+
+
+class TargetBatch(NamedTuple):
+    """Presses with noise, and what the network learns from them.
+
+    Attributes:
+        charge: Charges with noise, shape (n, n_electrode), pC.
+        target: Unit coordinates that the mean of the network should have, shape (n, 3).
+        noise_factor: Factor by which the noise was enlarged, shape (n, 1).
+    """
+
+    charge: Tensor
+    target: Tensor
+    noise_factor: Tensor
+
+
+@dataclass(frozen=True)
+class LinearTargets:
+    """Presses without noise, and the linear estimates of their contacts.
+
+    Attributes:
+        charge: Charges without noise, shape (n, n_electrode), pC.
+        contact: Contacts in unit coordinates, shape (n, 3).
+        gain: The matrices A, shape (n, 3, n_electrode), 1/pC; zero for presses whose estimate is not linear.
+        noise_factor: Factor by which the noise of each press is enlarged, shape (n, 1).
+        noise: Noise of the charges.
+    """
+
+    charge: Tensor
+    contact: Tensor
+    gain: Tensor
+    noise_factor: Tensor
+    noise: Noise
+
+    @classmethod
+    def of(cls, presses: LabelledPresses, charge_map: ChargeMap, noise: Noise) -> "LinearTargets":
+        """Compute the linear estimates of presses.
+
+        Args:
+            presses: Presses without noise.
+            charge_map: Map from contacts to charges, which gives the derivatives J and the unit coordinates.
+            noise: Noise of the charges.
+        """
+        domain = charge_map.domain
+        derivatives = charge_map.derivatives(presses.contact)
+        noise_std = noise.sigma(presses.charge)
+        whitened_jacobian = derivatives * domain.scale / noise_std[:, :, None]  # W^(1/2) J, shape (n, n_electrode, 3)
+        transposed = whitened_jacobian.swapaxes(1, 2)
+        precision = transposed @ whitened_jacobian + UNIT_PRECISION * np.eye(3)  # J' W J + P, shape (n, 3, 3)
+        gain = np.linalg.solve(precision, transposed / noise_std[:, None, :])
+
+        # The inverse of the precision is the covariance of the contact. Its diagonal contains the variances.
+        contact_variance = np.linalg.inv(precision).diagonal(axis1=1, axis2=2)
+        largest_std = np.sqrt(contact_variance.max(axis=1))
+        is_linear = largest_std <= LARGEST_LINEAR_STD
+        gain[~is_linear] = 0.0
+        noise_factor = np.clip(LARGEST_LINEAR_STD / largest_std, 1.0, MAX_NOISE_FACTOR)
+        return cls(
+            charge=as_tensor(presses.charge),
+            contact=as_tensor(domain.to_unit(presses.contact)),
+            gain=as_tensor(np.asarray(gain, dtype=float)),
+            noise_factor=as_tensor(np.asarray(noise_factor[:, None], dtype=float)),
+            noise=noise,
+        )
+
+    def draw(self, rows: Tensor, random: torch.Generator) -> TargetBatch:
+        """Add new noise to the charges of some presses, and compute the targets.
+
+        Args:
+            rows: Numbers of the presses, shape (n,).
+            random: Random number generator.
+        """
+        charge = self.charge[rows]
+        noise_factor = self.noise_factor[rows]
+        noise = noise_factor * fresh_noise(charge, self.noise, random)
+        change = (self.gain[rows] @ noise[:, :, None])[:, :, 0]  # A n, shape (n, 3)
+        return TargetBatch(charge + noise, self.contact[rows] + change, noise_factor)
