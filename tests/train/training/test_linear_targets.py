@@ -57,7 +57,7 @@ def test_targets_are_the_least_squares_estimates_of_the_charges_with_noise(gain)
 
 def test_the_noise_is_enlarged_until_the_contact_would_be_too_uncertain_for_a_linear_estimate():
     """The standard deviations of the enlarged noise are compared with many draws."""
-    noise = NoiseModel("large", white=30.0, gain=0.002)
+    noise = NoiseModel("large", white=15.0, gain=0.002)
     targets = targets_of(noise)
     factor = targets.noise_factor.numpy()[:, 0]
     assert np.all((factor > 1.0) & (factor <= MAX_NOISE_FACTOR))

@@ -32,7 +32,7 @@ from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.losses import fresh_noise
 from isocharge.train.training.network import as_tensor
 
-LARGEST_LINEAR_STD = 0.02
+LARGEST_LINEAR_STD = 0.012
 """Standard deviation of the contact up to which the estimate counts as linear in the noise, in unit coordinates.
 
 The noise is not enlarged beyond this standard deviation, either.
