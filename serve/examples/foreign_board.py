@@ -2,9 +2,10 @@
 What does my board send?
 ========================
 
-A board sends frames that no device file describes: a sync byte, a counter, three channels of 24 bits, and a checksum.
-This example recognises the frames from their bytes and prints the section ``[frames]`` of a device file. The command
-``isocharge serve doctor --port PORT --write board.toml`` does the same at a port, and also examines the channels.
+This example recognises the frames of an unknown board from their bytes. Each frame consists of a sync byte, a counter,
+three channels of 24 bits, and a checksum. The example prints the section ``[frames]`` of a device file, but writes no
+file. To connect a real board, use the command ``isocharge serve doctor --port PORT --write board.toml``. It recognises
+the frames at a port, examines the channels, and writes the device file.
 """
 
 import matplotlib.pyplot as plt
@@ -29,7 +30,7 @@ parser = device_from_table({"frames": found}, "board").parser()
 values = np.array([frame.values for data in frames for frame in parser.feed(data)])
 print(f"{len(values)} of {len(frames)} frames are read, channels near {np.median(values, axis=0).round(-3)}")
 
-# The picture shows one row for each frame, and the name and the type of each field below its bytes.
+# The picture has one row for each frame. The labels below the bytes are the name and the type of each field.
 fields = [{"name": "sync", "type": "u8"}, *found["fields"], {"name": found["checksum"], "type": "u8"}]
 tick_positions = []
 tick_labels = []

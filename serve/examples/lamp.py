@@ -2,8 +2,9 @@
 How do I switch a lamp by touch?
 ================================
 
-The loop receives one record for each frame of a board and acts on it. ``python serve/examples/lamp.py /dev/ttyACM0``
-reads a board at a port for twenty seconds. Without a port, a simulated sensor is used.
+This example switches a lamp with each hard press. Its loop receives one record for each frame of a board.
+``python serve/examples/lamp.py /dev/ttyACM0`` reads the board at this port for twenty seconds. Without a port, the
+example uses a simulated sensor.
 """
 
 import sys
@@ -32,9 +33,9 @@ times_s = []
 forces_N = []
 lamp_states = []
 is_on = False
-has_switched = False  # whether this touch has switched the lamp
-for record in stream(chunks, Predictor("three-25um-biaxial")):  # the first half second is the tare
-    # The flag `stress` means that the film will have a dent. The contact is correct nevertheless.
+has_switched = False  # whether the present touch has already switched the lamp
+for record in stream(chunks, Predictor("three-25um-biaxial")):  # the tare is measured in the first half second
+    # The flag `stress` means that the press leaves a dent in the film. The contact itself is correct.
     is_reliable = record.contact and not set(record.flags) - {"stress"}
     is_hard_press = is_reliable and record.force_N > HARD_PRESS_N
     if is_hard_press and not has_switched:

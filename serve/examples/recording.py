@@ -2,9 +2,9 @@
 How do I look at a recording?
 =============================
 
-``isocharge serve stream --record`` writes the bytes of a board and the records into a file, and ``isocharge serve
-plot`` draws this file. In Python, a recording returns its records as they were written. A structure declares which
-fields are read.
+A recording is a file with the bytes of a board and the records that were computed from them. The command ``isocharge
+serve stream --record FILE`` writes a recording, and ``isocharge serve plot FILE`` draws it. This example writes a
+recording and reads its records in Python. The class ``Touch`` declares which fields of the records are read.
 """
 
 import tempfile
@@ -23,7 +23,7 @@ FRAMES = 4000
 
 
 class Touch(Struct):
-    """The fields that are read of each record. The position is None if nothing touches."""
+    """Fields that are read from each record. The position is None if nothing touches the film."""
 
     contact: bool
     x_mm: float | None

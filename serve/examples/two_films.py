@@ -2,8 +2,9 @@
 How do I read two films at once?
 ================================
 
-Each film has a stream of its own, with its own model, tare and name. Here the films are on two fingertips, and a pinch
-is the time in which both films are touched. With two ports, run each stream in a thread or a process of its own.
+Each film has its own stream, with its own model, tare and name. In this example, the films are on the thumb and the
+index finger of a hand. A pinch is a time in which both films are touched. With two boards, run the stream of each port
+in its own thread or process.
 """
 
 from itertools import islice

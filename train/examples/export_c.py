@@ -2,8 +2,9 @@
 How do I get the model into a microcontroller?
 ==============================================
 
-As C99 without dependencies: a folder with the network, the signal chain of a board and a self-test. Its answers are
-those of ONNX Runtime to some units in the last place, ten thousand times less than the error by noise.
+The function ``export_c`` writes a model as C99 without dependencies. The folder contains the network, the signal chain
+of a board, and a self-test. This example compiles the network and calls it from Python. The positions computed in C
+differ from those of ONNX Runtime by less than 0.00001 mm. The error that noise causes is thousands of times larger.
 """
 
 import ctypes
@@ -28,16 +29,28 @@ for name in ("four-25um-biaxial", "four-25um-biaxial-student"):
         compiler = ("cc", "-std=c99", "-O2", "-shared", "-fPIC", "-o", library)
         subprocess.run([*compiler, folder / "isocharge_model.c", "-lm"], check=True)
         predict = ctypes.CDLL(str(library)).isocharge_predict
-    answer = (ctypes.c_float * 7)()
-    answers = []
+    answer = (ctypes.c_float * 7)()  # x, y, force, their standard deviations, misfit
+    positions = []
     for row in charge.tolist():
         predict((ctypes.c_float * 4)(*row), answer)
-        answers.append(answer[:2])
-    by_runtime = np.stack(Predictor(name).predict_batch(charge)[:2], axis=1)
-    error, difference = (np.hypot(*(np.array(answers) - other).T) for other in (contact[:, :2], by_runtime))
-    print(f"{name}: {np.median(error):.3f} mm from the press, {difference.max():.1e} mm from ONNX Runtime")
-    for values, style in ((error, "-"), (difference.clip(1e-9), ":")):
-        plt.plot(np.sort(values), np.linspace(0.0, 1.0, len(values)), style, label=name if style == "-" else None)
-plt.gca().set(xscale="log", xlabel="mm: from the press, and dotted from ONNX Runtime", ylabel="share of presses")
+        positions.append(answer[:2])
+    c_position = np.array(positions)
+    runtime_position = np.stack(Predictor(name).predict_batch(charge)[:2], axis=1)
+    error = np.hypot(*(c_position - contact[:, :2]).T)
+    difference = np.hypot(*(c_position - runtime_position).T)
+    print(
+        f"{name}: median position error {np.median(error):.3f} mm, largest difference from ONNX Runtime "
+        f"{difference.max():.1e} mm"
+    )
+    share = np.linspace(0.0, 1.0, len(error))
+    (line,) = plt.plot(np.sort(error), share, label=f"{name}: error")
+    plt.plot(
+        np.sort(difference.clip(1e-9)),
+        share,
+        ":",
+        color=line.get_color(),
+        label=f"{name}: difference from ONNX Runtime",
+    )
+plt.gca().set(xscale="log", xlabel="distance of the positions, mm", ylabel="share of presses")
 plt.legend()
 plt.show()

@@ -2,8 +2,9 @@
 How do I train a model of my sensor?
 ====================================
 
-``fit``, look at the errors, ``release`` if they are good. The settings here take fewer steps and fewer charges
-for the misfit than the usual ones, and the errors are larger.
+The function ``fit`` trains a network on presses, ``evaluate`` measures its errors, and ``release`` writes the model
+folder. This example writes the folder only if the errors are small enough. The training takes fewer steps and fewer
+examples of the misfit than a training with the default settings, and its errors are therefore larger.
 """
 
 import tempfile
@@ -25,7 +26,7 @@ with tempfile.TemporaryDirectory() as temporary:
     errors = evaluate(fitted)
     print(f"position {errors['position_rms_mm']:.3f} mm rms, force {errors['force_rms_percent']:.2f} % rms")
     if errors["position_rms_mm"] > 0.5:
-        raise SystemExit("not good enough to release")
+        raise SystemExit("the position error is too large to release the model")
     model = release(fitted, folder / "models" / "mine", errors=errors)
     predictor = Predictor(model.folder)
 
@@ -35,9 +36,12 @@ error = np.hypot(answers.x_mm - samples.x_mm, answers.y_mm - samples.y_mm)
 figure, axes = plt.subplots(figsize=(6.4, 4.6), layout="constrained")
 axes.loglog(samples.force_N, error, ".", ms=2, alpha=0.4, label="presses")
 order = np.argsort(samples.force_N)
-for part in np.array_split(order, 12):
-    axes.loglog(np.median(samples.force_N[part]), np.median(error[part]), "o", color="C1")
+for group in np.array_split(order, 12):  # twelve groups with similar forces
+    axes.loglog(np.median(samples.force_N[group]), np.median(error[group]), "o", color="C1")
 axes.set(
-    xlabel="force, N", ylabel="position error, mm", ylim=(1e-3, None), title="noise matters most for light touches"
+    xlabel="force, N",
+    ylabel="position error, mm",
+    ylim=(1e-3, None),
+    title="light presses have large errors",
 )
 plt.show()

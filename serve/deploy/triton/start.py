@@ -1,8 +1,9 @@
-"""Starts Triton from the wheel `nvidia-pytriton` for a folder of models, with the backend `onnxruntime` of this folder.
+"""Start Triton from the wheel `nvidia-pytriton` for a folder of models, with the backend `onnxruntime` of this folder.
 
     python serve/deploy/triton/start.py models --port 8000
 
-Runs in an environment of its own: pip install nvidia-pytriton onnxruntime. The process becomes the server.
+The script needs an environment of its own, in which `pip install nvidia-pytriton onnxruntime` has been run. The process
+of the script becomes the server.
 """
 
 import argparse
@@ -16,17 +17,18 @@ HERE = Path(__file__).parent
 
 
 def create_backends_folder(pytriton: Path) -> Path:
-    """Create a folder with the two backends that Triton needs, and return its path. An older folder is replaced.
+    """Create a folder with the two backends that Triton needs, and return the path of this folder.
 
-    The folder contains the Python backend of the wheel, the stub program that runs the backend in the Python version of
-    this environment, and the backend `onnxruntime` that is beside this script.
+    An older folder is replaced. The folder contains the Python backend of the wheel, and the backend `onnxruntime` that
+    is beside this script. The Python backend includes a stub program, which runs the backend in the Python version of
+    this environment.
 
     Args:
         pytriton: Folder of the installed package `pytriton`.
     """
     folder = Path(sys.prefix) / "triton-backends"
     shutil.rmtree(folder, ignore_errors=True)
-    # The files are copied, because Triton does not follow links.
+    # The files are copied, because Triton does not follow symbolic links.
     shutil.copytree(pytriton / "tritonserver/backends/python", folder / "python")
     python_version = f"{sys.version_info.major}.{sys.version_info.minor}"
     stub = pytriton / "tritonserver/python_backend_stubs" / python_version / "triton_python_backend_stub"
@@ -40,7 +42,7 @@ def server_command(pytriton: Path, options: argparse.Namespace) -> list[str]:
 
     Args:
         pytriton: Folder of the installed package `pytriton`.
-        options: Options of the command line: models, host, port, and grpc_port, which is None for no gRPC.
+        options: Options of the command line: `models`, `host`, `port` and `grpc_port`. `grpc_port` is None for no gRPC.
     """
     backends_folder = create_backends_folder(pytriton)
     command = [
@@ -59,7 +61,7 @@ def server_command(pytriton: Path, options: argparse.Namespace) -> list[str]:
 
 
 def server_environment(pytriton: Path) -> dict[str, str]:
-    """Return the environment variables of this process, with the folders of Triton first in the search paths.
+    """Return the environment variables of this process, with the folders for Triton first in the search paths.
 
     Args:
         pytriton: Folder of the installed package `pytriton`.
@@ -77,7 +79,7 @@ def server_environment(pytriton: Path) -> dict[str, str]:
 
 
 def main() -> None:
-    """Parse the command line, and replace this process by Triton."""
+    """Parse the command line, and replace this process by the Triton server."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", type=Path, help="folder of models: NAME/config.pbtxt, NAME/VERSION/model.onnx")
     parser.add_argument("--host", default="127.0.0.1")

@@ -1,8 +1,8 @@
-"""A backend `onnxruntime` for Triton, written in Python: it runs the `model.onnx` of a version without changes.
+"""A backend for Triton, written in Python, with the name `onnxruntime`. The backend runs the `model.onnx` of a model.
 
-Triton's own backend of this name is a library, which the containers of Triton contain and the wheel `nvidia-pytriton`
-does not contain. The folder of this file is copied into Triton's folder of backends, beside `python`. The configuration
-of a model needs no entry for the backend.
+The containers of Triton contain a library as the backend of this name, but the wheel `nvidia-pytriton` does not. The
+folder of this file is copied into the folder of the backends of Triton, beside the folder `python`. The configuration
+file of a model therefore needs no changes.
 """
 
 import json
@@ -13,7 +13,7 @@ import triton_python_backend_utils as pb_utils
 
 
 class TritonPythonModel:
-    """One version of one model. Triton calls the methods."""
+    """One version of one model. Triton creates the object and calls its methods."""
 
     @staticmethod
     def auto_complete_config(config):
@@ -21,10 +21,10 @@ class TritonPythonModel:
         return config
 
     def initialize(self, args):
-        """Open an onnxruntime session for the model, with one thread, because a press takes microseconds.
+        """Open a session of onnxruntime for the model. One thread is enough, because a press takes microseconds.
 
         Args:
-            args: Folder (`model_repository`), version and configuration of the model, as Triton passes them.
+            args: Folder of the model (`model_repository`), version and configuration, as Triton passes them by name.
         """
         options = ort.SessionOptions()
         options.intra_op_num_threads = 1
@@ -38,11 +38,11 @@ class TritonPythonModel:
         self._input_name = input_tensor["name"]
 
     def execute(self, requests):
-        """Return a response to each request. An error affects only the response to its request."""
+        """Return a response to each request. If a request fails, only its response contains the error."""
         return [self._respond(request) for request in requests]
 
     def _respond(self, request):
-        """Run the model on the charges of a request, and return the requested outputs or the error as a response."""
+        """Run the model on the charges of a request. The response contains the requested outputs, or the error."""
         output_names = list(request.requested_output_names())
         try:
             charges = pb_utils.get_input_tensor_by_name(request, self._input_name).as_numpy()

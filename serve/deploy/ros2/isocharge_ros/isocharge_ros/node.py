@@ -1,4 +1,4 @@
-"""A ROS 2 node that publishes the contacts of a film. The parameters of the node are model, port, device and wait_s."""
+"""A ROS 2 node that publishes the contacts of a film. The node has the parameters listed in `DEFAULT_PARAMETERS`."""
 
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped, WrenchStamped
@@ -16,14 +16,14 @@ NANOSECONDS_PER_SECOND = 10**9
 X_WITH_Y = 1
 Y_WITH_X = 6
 DIAGONAL = slice(0, 36, 7)
-"""Positions in a covariance of 6 rows and 6 columns (x, y, z and three rotations), which is stored row by row."""
+"""Positions in a covariance matrix of x, y, z and three rotations, which is a list of 36 numbers, row by row."""
 
 
 class TouchNode(Node):
     """Node that publishes the wrench and the pose of each contact."""
 
     def __init__(self):
-        """Create the publishers."""
+        """Create one publisher for wrenches and one publisher for poses."""
         super().__init__("isocharge")
         self.wrench_publisher = self.create_publisher(WrenchStamped, "/isocharge/wrench", qos_profile_sensor_data)
         self.pose_publisher = self.create_publisher(
@@ -32,25 +32,25 @@ class TouchNode(Node):
 
     def publish(self, record):
         """Publish the wrench of a prediction record and, if something touches the film, the pose of the contact."""
-        if record.force_N is None:  # the board has sent a value that is no number
+        if record.force_N is None:  # the force is unknown, for example because the board has sent a value that is NaN
             return
-        record_values = contact_of(record.json_values)  # with the tracked contact, if contacts are tracked
+        record_values = contact_of(record.json_values)  # a tracked contact replaces the contact of the frame
         self.publish_wrench(record_values, record)
-        has_contact = record.contact
-        if has_contact:
+        if record.contact:
             self.publish_pose(record_values, record)
 
     def publish_wrench(self, record_values, record):
-        """Publish the load of the probe on the film, N and N m.
+        """Publish the load of the probe on the film as a wrench, in N and N m.
 
-        A press of force F at (x, y) has the force (0, 0, -F) and the torque (-y F, x F, 0) about the origin.
+        If a probe presses with the force F at (x, y), the wrench has the force (0, 0, -F) and the torque (-y F, x F, 0)
+        about the origin.
 
         Args:
             record_values: Values of the record by name, in which a tracked contact replaces the contact of the frame.
             record: The record, which has the time and the coordinate frame.
         """
         force_N = record_values["force_N"]
-        # Without a contact, the force is 0 and there is no position.
+        # Without a contact, there is no position. The force is then 0, so any position gives the torque 0.
         x_m = 1e-3 * (record_values["x_mm"] or 0.0)
         y_m = 1e-3 * (record_values["y_mm"] or 0.0)
 
@@ -61,7 +61,7 @@ class TouchNode(Node):
         self.wrench_publisher.publish(message)
 
     def publish_pose(self, record_values, record):
-        """Publish the position of the contact with its covariance, m and m^2.
+        """Publish the position of the contact and its covariance as a pose, in m, m^2 and rad^2.
 
         Args:
             record_values: Values of the record by name, in which a tracked contact replaces the contact of the frame.
@@ -83,7 +83,7 @@ class TouchNode(Node):
         self.pose_publisher.publish(message)
 
     def with_header(self, message, record):
-        """Set the frame and the time of a message to those of a record, and return the message."""
+        """Copy the coordinate frame and the time of a record into the header of a message, and return the message."""
         time_ns = time_of({"timestamp": record.timestamp})  # checks that ROS 2 can express the time
         seconds, nanoseconds = divmod(time_ns, NANOSECONDS_PER_SECOND)
         message.header.frame_id = record.frame_id
@@ -106,7 +106,7 @@ def main():
         with Port(parameters["port"], wait=parameters["wait_s"], reconnect=True, request=device.request) as port:
             for record in stream(port, predictor, device):
                 node.publish(record)
-                if not rclpy.ok():  # another process has stopped the node
+                if not rclpy.ok():  # ROS 2 has stopped the node
                     break
     except KeyboardInterrupt:  # Ctrl-C is the usual way to stop the node
         pass

@@ -1,4 +1,4 @@
-"""Start the node: `ros2 launch isocharge_ros film.launch.py parameters:=my_film.yaml`."""
+"""Launch file of the node: `ros2 launch isocharge_ros film.launch.py parameters:=my_film.yaml`."""
 
 from pathlib import Path
 
@@ -8,11 +8,14 @@ from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-USUAL = str(Path(get_package_share_directory("isocharge_ros")) / "config" / "film.yaml")
+DEFAULT_PARAMETER_FILE = str(Path(get_package_share_directory("isocharge_ros")) / "config" / "film.yaml")
 
 
 def generate_launch_description():
-    parameters = DeclareLaunchArgument("parameters", default_value=USUAL, description="file of the node's parameters")
+    """Return the description of the node, which ROS 2 starts, and starts again whenever the node has ended."""
+    parameters = DeclareLaunchArgument(
+        "parameters", default_value=DEFAULT_PARAMETER_FILE, description="file of the node's parameters"
+    )
     node = Node(
         package="isocharge_ros",
         executable="node",
