@@ -33,7 +33,7 @@ def undo(measurement, charge_pC, seed, *, hum=True):
     rng = np.random.default_rng(seed + 1000)
     output = measurement(charge_pC)
     gain = measurement.gain * (1 + 0.002 * rng.uniform(-1, 1, 3))
-    tau = measurement.tau * (1 + 0.005 * rng.uniform(-1, 1, 3))
+    tau = measurement.leak_time * (1 + 0.005 * rng.uniform(-1, 1, 3))
     chain = SignalChain(Chain(gain_pC=1 / gain, limit_pC=1499.9, hum=HumRule() if hum else None, tau_s=tau), 3)
     charges, contact = [], []
     for k, row in enumerate(output):
@@ -77,7 +77,7 @@ def steady_presses(level, seed, table, tau_error=0.0, press_s=1.2):
     rng, names = np.random.default_rng(seed), ("A", "B", "C", "D")
     measurement = replace(load_amplifier(level), gain_mismatch=0.0).start(4, RATE_HZ, rng)
     if "leak" in table:
-        tau = measurement.tau * (1.0 + tau_error * rng.standard_normal(4))
+        tau = measurement.leak_time * (1.0 + tau_error * rng.standard_normal(4))
         table = table | {"leak": {"tau_s": dict(zip(names, tau.tolist(), strict=True))}}
     t = np.arange(round(press_s * RATE_HZ)) / RATE_HZ
     rise = np.clip(np.minimum(t, press_s - t) / 0.1, 0.0, 1.0)[:, None]

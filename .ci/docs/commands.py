@@ -19,7 +19,11 @@ This page contains the help of every command. It is generated from the declarati
 
 
 def write_page(path: Path) -> None:
-    """Write the page with the help of all commands."""
+    """Write the page with the help of all commands, unless the page already has this content.
+
+    Args:
+        path: Path of the page.
+    """
     root = typer.main.get_command(app)
     sections = [INTRODUCTION]
     for words, command in _commands(root, ("isocharge",)):
@@ -27,14 +31,24 @@ def write_page(path: Path) -> None:
         context = typer.Context(command, info_name=name, terminal_width=WIDTH, max_content_width=WIDTH)
         sections.append(f"## {name}\n\n```text\n{command.get_help(context)}\n```\n")
     text = "\n".join(sections)
-    if not path.exists() or path.read_text("utf-8") != text:  # Sphinx does not read an unchanged page again
+    # Sphinx does not read the page again if its file is not changed.
+    if not path.exists() or path.read_text("utf-8") != text:
         path.parent.mkdir(exist_ok=True)
         path.write_text(text, "utf-8")
 
 
 def _commands(group: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield each command of a group and of its subgroups, and the words that call this command."""
+    """Yield each command of a group and of its subgroups, together with the words that call this command.
+
+    Args:
+        group: A group of Typer.
+        words: Words that call the group, such as ("isocharge", "serve").
+
+    Yields:
+        Words of a command, and the command.
+    """
     for name in group.list_commands(None):
+        # Commands are imported only when they are needed. `resolve_command` imports the command.
         _name, command, _remaining_args = group.resolve_command(None, [name])
         is_group = hasattr(command, "list_commands")
         if is_group:

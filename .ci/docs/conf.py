@@ -1,6 +1,6 @@
-"""Configuration of the site: the pages, the example scripts with their pictures, and a reference of all modules.
+"""Configuration of the site, which contains the pages, the example scripts with their pictures, and a reference.
 
-The source folder of the site is the folder of the project. Links between pages therefore work both on the site and
+The source folder of the site is the folder of the project. Links between the pages therefore work on the site and also
 where the code is hosted.
 
 Example of a build:
@@ -26,7 +26,7 @@ PORTIONS = ("simulate", "train", "serve")
 HOME, REFERENCE, GALLERY, COMMANDS = "README", "build/reference", "build/gallery", "build/commands"
 PLAYGROUND = "serve/docs/playground"
 NAVIGATION: dict[tuple[tuple[str, Any], ...], Any] = {}
-"""Navigation of the pages of modules, by the options with which the theme requests it."""
+"""Navigation of the pages of modules, by the options with which the theme requests the navigation."""
 
 project = "isocharge"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
@@ -70,7 +70,12 @@ sphinx_gallery_conf = {
 
 
 def add_contents(_app: Any, page: str, source: list[str]) -> None:
-    """Append the table of contents to the first page, and insert links into the page about the playground."""
+    """Append the table of contents to the first page, and insert links into the page about the playground.
+
+    Args:
+        page: Name of the page that Sphinx has read.
+        source: List with the text of the page, which is changed in place.
+    """
     if page == HOME:
         source[0] += (ROOT / ".ci" / "docs" / "contents.md").read_text("utf-8")
     if page == PLAYGROUND:
@@ -80,23 +85,38 @@ def add_contents(_app: Any, page: str, source: list[str]) -> None:
 def share_navigation(_app: Any, page: str, _template: str, context: dict[str, Any], _doctree: Any) -> None:
     """Use the same navigation for all pages of modules.
 
-    These pages are in one folder and in no table of contents, so their navigation is the same. Its computation would
-    take more time than the rest of a page.
+    The pages of modules are in one folder and in no table of contents. The navigation of these pages is therefore the
+    same. The navigation is computed only once, because the computation takes more time than the rest of a page.
+
+    Args:
+        page: Name of the page that Sphinx writes.
+        context: Values for the template of the page. Its function `toctree`, which computes the navigation, is
+            replaced.
     """
     if page.startswith(f"{REFERENCE}/isocharge") and "toctree" in context:
-        compute = context["toctree"]
-        context["toctree"] = lambda **options: _navigation(compute, tuple(sorted(options.items())))
+        compute_navigation = context["toctree"]
+        context["toctree"] = lambda **options: _shared_navigation(compute_navigation, tuple(sorted(options.items())))
 
 
-def _navigation(compute: Any, options: tuple[tuple[str, Any], ...]) -> Any:
-    """Return the navigation of a page of a module for some options. It is computed for the first page only."""
+def _shared_navigation(compute_navigation: Any, options: tuple[tuple[str, Any], ...]) -> Any:
+    """Return the navigation of the pages of modules. The navigation is computed for the first page only.
+
+    Args:
+        compute_navigation: Function of Sphinx that computes the navigation.
+        options: Names and values of the options of this function.
+    """
     if options not in NAVIGATION:
-        NAVIGATION[options] = compute(**dict(options))
+        NAVIGATION[options] = compute_navigation(**dict(options))
     return NAVIGATION[options]
 
 
 def add_whole_pages(app: Any, error: Exception | None) -> None:
-    """Add the playground to the site, and copy the first page to the file name that web servers expect."""
+    """Add the playground to the site, and copy the first page to the file name that web servers expect.
+
+    Args:
+        app: The application of Sphinx.
+        error: Error that ended the build; None after a successful build.
+    """
     if error is None:
         folder = Path(app.outdir)
         shutil.copy(folder / f"{HOME}.html", folder / "index.html")
@@ -104,14 +124,15 @@ def add_whole_pages(app: Any, error: Exception | None) -> None:
 
 
 def setup(app: Any) -> None:
-    """Write the pages of the reference, and connect the functions of this module to the events of Sphinx."""
+    """Write the pages that are generated, and connect the functions for the site to the events of Sphinx."""
     # The pages must exist before Sphinx looks for the sources.
     module_names = reference.modules()
     reference.check_docstrings(module_names)
     reference.write_pages(module_names, ROOT / REFERENCE)
     commands.write_page(ROOT / f"{COMMANDS}.md")
 
-    # Napoleon has the priority 500. It runs between the conversion to reStructuredText and the list of attributes.
+    # A function with a smaller priority runs earlier. Napoleon, with the priority 500, must run after the conversion of
+    # plain text to reStructuredText, and before the attributes are listed.
     app.connect("source-read", add_contents)
     app.connect("autodoc-skip-member", reference.is_of_scikit_learn)
     app.connect("autodoc-process-docstring", reference.plain_text, priority=400)

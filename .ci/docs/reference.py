@@ -14,17 +14,17 @@ DOTTED = re.compile(r"`(isocharge(?:\.\w+)+)`")
 
 
 def modules() -> list[str]:
-    """Return the names of all modules of isocharge except private ones."""
+    """Return the names of all modules of isocharge except private modules, in alphabetical order."""
     packages = [import_module(name) for name in ("isocharge", "isocharge.cli")]
     names = {entry.name for package in packages for entry in walk_packages(package.__path__, f"{package.__name__}.")}
     return sorted(name for name in names if "._" not in name)
 
 
 def check_docstrings(names: list[str]) -> None:
-    """Check the names and the examples in the docstrings of modules.
+    """Check the names and the examples in the source of modules.
 
-    A dotted name in backticks must be a module or an attribute of a module. An example must be indented, because only
-    indented lines are shown as code.
+    A dotted name in backticks, such as `isocharge.serve.stream`, must be a module or an attribute of a module. An
+    example in the docstring of a module must be indented, because only indented lines are shown as code.
 
     Args:
         names: Names of the modules.
@@ -49,7 +49,7 @@ def check_docstrings(names: list[str]) -> None:
 def write_pages(names: list[str], folder: Path) -> None:
     """Write a page for each module, and one page that lists all modules.
 
-    The pages of the modules are in no table of contents, because every page of the site would repeat such a table.
+    The pages of the modules are in no table of contents, because every page of the site would repeat that table.
 
     Args:
         names: Names of the modules.
@@ -87,18 +87,22 @@ def _write(path: Path, lines: list[str]) -> None:
 
 
 def is_of_scikit_learn(_app: Any, _kind: str, name: str, _object: Any, skip: bool, _options: Any) -> bool:
-    """Return whether a member is omitted from the reference.
+    """Return whether a member of a class or module is omitted from the reference.
 
-    Members that scikit-learn generates are omitted, because scikit-learn documents them.
+    The methods `set_..._request`, which scikit-learn generates, are omitted, because scikit-learn documents them.
+
+    Args:
+        name: Name of the member.
+        skip: Whether Sphinx omits the member anyway.
     """
     return skip or (name.startswith("set_") and name.endswith("_request"))
 
 
 def plain_text(_app: Any, kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
-    """Convert a docstring in plain text, in which names have backticks, to reStructuredText.
+    """Convert a docstring from plain text, in which names are in backticks, to reStructuredText.
 
-    Indented lines after a blank line become code, up to the next line that is not indented. Sphinx calls this function
-    for each docstring and expects the result in the same list.
+    Indented lines after a blank line become a block of code, which ends before the next line that is not indented.
+    Sphinx calls this function for each docstring and expects the result in the same list.
 
     Args:
         kind: Kind of the documented object, such as "data" for a constant.
@@ -112,10 +116,11 @@ def plain_text(_app: Any, kind: str, _name: str, _object: Any, _options: Any, li
             follows_blank_line = not previous_line.strip()
             is_code = line.startswith("    ") and (was_code or follows_blank_line)
             if is_code and not was_code:
-                converted += ["::", ""]  # begins a block of code
+                converted += ["::", ""]  # the mark of reStructuredText for the beginning of a block of code
         converted.append(line if is_code else _escaped(line))
     if kind in ("attribute", "data"):
-        converted.insert(0, "\\ ")  # otherwise, Sphinx would interpret text before a colon in the first line as a type
+        # Without an escaped space at the beginning, Sphinx would interpret text before a colon as a type.
+        converted.insert(0, "\\ ")
     lines[:] = converted
 
 
@@ -135,13 +140,13 @@ def list_attributes(_app: Any, _kind: str, _name: str, _object: Any, _options: A
         if line.startswith(":vartype "):
             continue
         attribute = ATTRIBUTE.match(line)
-        is_continuation = not line.strip() or line.startswith(" ")  # of the description of an attribute
+        continues_description = not line.strip() or line.startswith(" ")  # of the previous attribute
         if attribute is not None:
             if not is_in_list:
                 converted += [":Attributes:", ""]
             is_in_list = True
             converted.append(f"    * **{attribute['names']}**: {attribute['text']}")
-        elif is_in_list and is_continuation:
+        elif is_in_list and continues_description:
             converted.append(f"      {line.lstrip()}".rstrip())
         else:
             is_in_list = False
@@ -150,8 +155,10 @@ def list_attributes(_app: Any, _kind: str, _name: str, _object: Any, _options: A
 
 
 def _escaped(line: str) -> str:
-    """Return a line in which the characters outside backticks have no special meaning in reStructuredText."""
-    parts = line.split("`")  # every second part is a quoted name
+    """Escape the characters outside backticks that have a special meaning in reStructuredText."""
+    # The parts between the backticks are alternately plain text and quoted names. A backslash is put before each
+    # special character of the plain text: an asterisk, a bar, a backslash, or an underscore at the end of a word.
+    parts = line.split("`")
     parts[::2] = [re.sub(r"([*|\\]|_(?=\W|$))", r"\\\1", part) for part in parts[::2]]
     # A quoted name that is followed by a letter, as in `press`es, must be separated from the letter by a backslash.
     return re.sub(r"(`[^`]*`)(?=\w)", r"\1\ ", "`".join(parts))

@@ -20,7 +20,7 @@ charge_map = ChargeSpline.of(ForwardMap.build(sensor, Circle(1.0), radius=9.0, f
 touch = np.array([[2.0, -3.0, force]])
 charge = charge_map.charges(touch)
 fix = Triangulation(charge_map).locate(charge, force)
-print(f"pressed at {touch[0, :2]}, the contours meet at {fix.contact[0, :2].round(4)} mm")
+print(f"position of the press: {touch[0, :2]} mm; the contours meet at {fix.contact[0, :2].round(4)} mm")
 
 figure, axes = plt.subplots(figsize=(6.0, 6.0), layout="constrained")
 field = ContourField(charge_map, force)

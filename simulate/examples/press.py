@@ -2,8 +2,8 @@
 What does a press do to the film?
 =================================
 
-A press of 1 N by a circular probe of 1 mm radius deflects a film of 25 um by almost 3 mm. The press stretches the film,
-the stress polarises the film, and each electrode collects a charge.
+A press of 1 N by a circular probe of 1 mm radius deflects a film of 25 um by almost 3 mm. The press stretches the film.
+The resulting stress polarises the film, and each electrode collects a charge.
 """
 
 import matplotlib.pyplot as plt

@@ -22,4 +22,7 @@ if __name__ == "__main__":
     if len(sys.argv) > 2:  # the address of a Dask scheduler, like tcp://10.0.0.1:8786
         with dask_workers(sys.argv[2]) as cluster:
             other = read_dataset(run_sweep(folder / "cluster", sensor, probes, sweep, executor=cluster))
-        print("the same charges:", bool((other.samples.charge_pC == dataset.samples.charge_pC).all()))
+        print(
+            "equal charges:",
+            bool((other.samples.charge_pC == dataset.samples.charge_pC).all()),
+        )

@@ -2,8 +2,8 @@
 How do thickness and pretension change the charges?
 ===================================================
 
-The stress in a thicker film is smaller. A film with pretension deflects less under the same force. In both cases the
-charges are smaller.
+Under the same force, the stress in a thicker film is smaller, and a film with pretension deflects less. In both cases,
+the electrodes collect smaller charges.
 """
 
 from dataclasses import replace

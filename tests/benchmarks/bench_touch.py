@@ -103,7 +103,7 @@ def stream_records(
     names = predictor.metadata.electrodes
     rng = np.random.default_rng(seed + 1)
     process = amplifier.start(len(names), RATE_Hz, np.random.default_rng(seed))
-    tau_s = process.tau * (1.0 + LEAK_ERROR * rng.uniform(-1.0, 1.0, len(names)))
+    tau_s = process.leak_time * (1.0 + LEAK_ERROR * rng.uniform(-1.0, 1.0, len(names)))
     gain = np.ones(len(names))
     if gain_error:
         gain = process.gain * (1.0 + gain_error * rng.uniform(-1.0, 1.0, len(names)))
@@ -116,7 +116,7 @@ def stream_records(
     if np.isfinite(amplifier.limit):
         table["saturation"] = {"limit_pC": amplifier.limit - 0.1}
     if "memory" in sections and len(names) > 3:
-        table["common_mode"] = {"pC_per_K": dict(zip(names, process.pyro.tolist(), strict=True))}
+        table["common_mode"] = {"pC_per_K": dict(zip(names, process.pyro_charge_per_K.tolist(), strict=True))}
 
     stream = TouchStream(predictor, device_from_table(table | sections, "bench"))
     records: list[PredictionRecord] = []

@@ -60,5 +60,7 @@ def test_table_reports_errors_larger_than_the_radius_as_folds():
     """An error of 33 mm on a disk of 12 mm means that two positions have the same charges."""
     errors = design_module.ErrorMap(np.zeros((2, 2)), np.array([1.0, 33.0]), np.array([1.0, 2.0]))
     found = SimpleNamespace(case=SimpleNamespace(radius=12.0), sensor=load_sensor("three-25um-biaxial"))
-    *_, before, after = design_command._table(SimpleNamespace(before=None, after=errors, **vars(found))).splitlines()
+    *_, before, after = design_command._table(
+        SimpleNamespace(errors_before=None, errors_after=errors, **vars(found))
+    ).splitlines()
     assert (before.split()[-2:], after.split()[-2:]) == (["folds", "folds"], ["2.000", "1.581"])

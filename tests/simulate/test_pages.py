@@ -18,7 +18,7 @@ TABLES = re.findall(r"```toml\n(.*?)```", FILES, re.DOTALL)
 
 def test_example_of_the_package():
     """The five lines of code in the docstring print three charges of several hundred pC."""
-    lines = dedent(isocharge.simulate.__doc__.split("press.\n\n", 1)[1])
+    lines = dedent(isocharge.simulate.__doc__.split("Example:\n\n", 1)[1])
     scope = {}
     exec(compile(lines, "isocharge.simulate", "exec"), scope)
     assert scope["charge"].shape == (3,)

@@ -1,8 +1,8 @@
 """The command `isocharge`, which contains the commands of all stages.
 
-This module is the only one that imports the commands of all stages: simulate, train and serve. Each command has its own
-module, such as `isocharge.cli.simulate.sweep`. Commands write data to standard output and messages to standard error.
-The exit code is 0 for success, 1 for a failure, and 2 for wrong usage or input.
+Only this module imports the commands of all stages: simulate, train and serve. Each command has its own module, such as
+`isocharge.cli.simulate.sweep`. Commands write data to standard output and messages to standard error. The exit code is
+0 for success, 1 for a failure, and 2 for wrong usage or input.
 """
 
 import signal
@@ -41,7 +41,7 @@ app.add_typer(serve_app, name="serve")
 
 
 def _print_version(is_requested: bool) -> None:
-    """Print the version and end the command, if `--version` was given."""
+    """If the option `--version` was given, print the version and end the command."""
     if is_requested:
         show(f"isocharge {package_version()}")
         raise typer.Exit
@@ -57,11 +57,11 @@ def root(
 
 
 def main() -> None:
-    """Run the command line, and end the process with its exit code.
+    """Run the command that the command line names, and end the process with the exit code of the command.
 
-    All errors are turned into exit codes here. SIGTERM ends a command in the same way as Ctrl-C.
+    Each error is printed on stderr and converted to an exit code. SIGTERM ends a command in the same way as Ctrl-C.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # this handler raises KeyboardInterrupt
     open_closed_streams()
     try:
         with warnings_to_stderr():

@@ -1,4 +1,6 @@
-"""Modules that simulate, train, serve and the commands share: errors, files, tables, progress and resumable runs.
+"""Modules that are shared by the packages `simulate`, `train`, `serve` and `cli`.
+
+The modules handle errors, files, tables of numbers, progress and resumable runs, among others.
 
 These modules do not import any other package of isocharge.
 """

@@ -1,7 +1,7 @@
-"""Activation functions of hidden layers, and the names of these functions in NumPy, PyTorch, ONNX and C.
+"""Activation functions of hidden layers, and the names of the functions in NumPy, PyTorch, ONNX and C.
 
-The dictionary `ACTIVATIONS` contains all of these functions. The configuration of a training, the evaluations of a
-network, the ONNX export and the C export read it.
+The dictionary `ACTIVATIONS` contains all activation functions. Training, the evaluation of networks, the ONNX export
+and the C export look up the activation functions in this dictionary.
 """
 
 from collections.abc import Callable
@@ -16,10 +16,11 @@ class Activation:
     """An activation function, which is applied to each output of a hidden layer.
 
     Attributes:
-        name: Name in configurations and files.
-        numpy_function: The function for NumPy arrays of any shape and float type.
-        torch_name: Name of the function in `torch.nn.functional`. It is a text because only training needs PyTorch.
-        onnx_operator: ONNX operator with one input, one output and no attributes.
+        name: Name of the activation function in configurations and files.
+        numpy_function: Implementation for NumPy arrays of any shape and float type.
+        torch_name: Name of the function in `torch.nn.functional`. The attribute is a text, and not the function itself,
+            because only training needs PyTorch.
+        onnx_operator: Name of the ONNX operator, which has one input, one output and no attributes.
         c_source: C99 source of the function `static float <c_function>(float x)`, in single precision.
     """
 

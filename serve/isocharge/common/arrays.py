@@ -1,4 +1,4 @@
-"""Types of arrays in signatures."""
+"""Types of the NumPy arrays that appear in the signatures of functions."""
 
 from typing import Any
 

@@ -1,4 +1,8 @@
-"""Input features of a network: logarithms of the charges, or inverse hyperbolic sines of charges of both signs."""
+"""Computation of the input features of a network from charges.
+
+The features are logarithms of positive charges. If the charges can have both signs, the features are inverse hyperbolic
+sines of the charges.
+"""
 
 from dataclasses import dataclass
 
@@ -9,16 +13,18 @@ from isocharge.common.arrays import Array
 
 @dataclass(frozen=True)
 class ChargeFeatures:
-    """Function that computes the inputs of the first layer of a network from charges Q.
+    """Function that computes the features of charges Q, which are the inputs of the first layer of a network.
 
-    For positive charges the function is ln(clip(Q) / typical). If charges can have both signs, the function is
-    asinh(clip(Q) / typical) - mean. This function is linear for small charges and logarithmic for large charges.
+    If all charges are positive, the features are ln(clip(Q) / typical). If the charges can have both signs, the
+    features are asinh(clip(Q) / typical) - mean. The function asinh is linear for small arguments and logarithmic for
+    large arguments.
 
     Attributes:
-        typical_pC: Charge by which each charge is divided, shape (n_electrode,), pC, positive.
-        low_pC: Smallest charge, to which smaller ones are clipped, shape () or (n_electrode,), pC.
-        high_pC: Largest charge, to which larger ones are clipped, shape () or (n_electrode,), pC.
-        mean: Mean of the inverse hyperbolic sines, shape (n_electrode,), or None for positive charges.
+        typical_pC: Charge by which the charge of each electrode is divided, shape (n_electrode,), pC, positive.
+        low_pC: Lower limit to which smaller charges are clipped, shape () or (n_electrode,), pC.
+        high_pC: Upper limit to which larger charges are clipped, shape () or (n_electrode,), pC.
+        mean: Mean of the inverse hyperbolic sines over the training presses, shape (n_electrode,); None if all charges
+            are positive.
     """
 
     typical_pC: Array
@@ -28,11 +34,18 @@ class ChargeFeatures:
 
     @property
     def n_electrode(self) -> int:
-        """Number of charges of a press."""
+        """Number of electrodes, and therefore of charges of a press."""
         return self.typical_pC.size
 
     def evaluate(self, charge_pC: Array) -> Array:
-        """Compute the features of charges (pC) of shape (..., n_electrode). The features have the same shape."""
+        """Compute the features of charges.
+
+        Args:
+            charge_pC: Charges, shape (..., n_electrode), pC.
+
+        Returns:
+            Features, of the same shape, dimensionless.
+        """
         ratio = np.clip(charge_pC, self.low_pC, self.high_pC) / self.typical_pC
         if self.mean is None:
             return np.asarray(np.log(ratio))

@@ -1,4 +1,4 @@
-"""Chebyshev series in position and force, which describe the charges of all contacts on a film."""
+"""Chebyshev series that describe a quantity, such as a charge, as a function of position and force."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,77 +9,89 @@ from numpy.polynomial import chebyshev
 from isocharge.common.arrays import Array, Integers
 
 CHUNK_SIZE = 4096
-"""Number of contacts that are evaluated at a time, which limits the memory."""
+"""Number of points at which a series is evaluated at the same time, which limits the memory."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """A sum of products of Chebyshev polynomials in three coordinates, each from -1 to 1.
+    """A sum of products of Chebyshev polynomials in three coordinates: x, y and the logarithm of the force.
+
+    Each coordinate is scaled to the range from -1 to 1.
 
     Attributes:
-        coefficients: Shape (degree + 1, degree + 1, force_degree + 1, n_electrode). The first three axes are the
-            degrees of the polynomials in x, in y and in the logarithm of the force.
+        coefficients: Coefficients of the products, shape (degree + 1, degree + 1, force_degree + 1, n_electrode). The
+            first three axes are the degrees of the polynomials in x, in y and in the logarithm of the force.
     """
 
     coefficients: Array
 
-    def values(self, coordinates: Array) -> Array:
+    def values_and_derivatives(self, coordinates: Array) -> Array:
         """Evaluate the series and its derivatives with respect to the three coordinates.
 
-        The series is evaluated in chunks of `CHUNK_SIZE` points. For each chunk, the terms are first summed over the
-        polynomials in x and y. They are then summed over the polynomials in the logarithm of the force.
+        The points are processed in chunks of at most `CHUNK_SIZE` points. For each chunk, the terms of the series are
+        first summed over the polynomials in x and y, and then over the polynomials in the logarithm of the force.
 
         Args:
-            coordinates: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.
+            coordinates: Scaled coordinates of n points, shape (n, 3). Coordinates outside [-1, 1] are clipped.
 
         Returns:
-            Values and derivatives, shape (n, 4, n_electrode): the value, then the three derivatives.
+            Values and derivatives, shape (n, 4, n_electrode). The second axis contains the value and the derivatives
+            with respect to x, y and the logarithm of the force.
         """
         _, n_y, n_force, n_electrode = self.coefficients.shape
-        n_chunk = len(coordinates) // CHUNK_SIZE + 1  # at least one; no chunk is longer than CHUNK_SIZE
+        n_chunk = len(coordinates) // CHUNK_SIZE + 1  # at least one chunk, even for no points
         evaluated_chunks = []
         for chunk in np.array_split(coordinates, n_chunk):
             position_terms, force_terms = chebyshev_terms(chunk, degree=n_y - 1, force_degree=n_force - 1)
 
-            # Sum over the terms in x and y: (points, n_term) @ (n_term, n_force * 4 * n_electrode). The factor 4 stands
-            # for the value and its three derivatives.
+            # Sum over the products of polynomials in x and y: (points, n_term) @ (n_term, n_force * 4 * n_electrode).
+            # The factor 4 stands for the value and its three derivatives.
             force_coefficients = position_terms @ self._term_coefficients
             force_coefficients = force_coefficients.reshape(len(chunk), n_force, 4 * n_electrode)
 
-            # Sum over the terms in the force: (points, 1, n_force) @ (points, n_force, 4 * n_electrode).
+            # Sum over the polynomials in the logarithm of the force:
+            # (points, 1, n_force) @ (points, n_force, 4 * n_electrode).
             evaluated = force_terms[:, None, :] @ force_coefficients
             evaluated_chunks.append(evaluated[:, 0, :])
         return np.concatenate(evaluated_chunks).reshape(len(coordinates), 4, n_electrode)
 
     @cached_property
     def _term_coefficients(self) -> Array:
-        """Coefficients of the series and of its derivatives, with one row for each product of polynomials in x and y.
+        """Coefficients of the series and of its three derivatives.
 
-        The shape is (n_term, (force_degree + 1) * 4 * n_electrode).
+        The shape is (n_term, (force_degree + 1) * 4 * n_electrode). Each row belongs to one product of polynomials in x
+        and y.
         """
         derivatives = [_derivative(self.coefficients, axis) for axis in range(3)]
         series_and_derivatives = np.stack([self.coefficients, *derivatives])
         degree = self.coefficients.shape[0] - 1
         x_degree, y_degree = position_degrees(degree)  # degrees in x and y of each product, shape (n_term,)
 
-        terms = series_and_derivatives[:, x_degree, y_degree]  # shape (4, n_term, force_degree + 1, n_electrode)
-        terms_first = terms.transpose(1, 2, 0, 3)  # shape (n_term, force_degree + 1, 4, n_electrode)
+        coefficients = series_and_derivatives[:, x_degree, y_degree]  # (4, n_term, force_degree + 1, n_electrode)
+        terms_first = coefficients.transpose(1, 2, 0, 3)  # shape (n_term, force_degree + 1, 4, n_electrode)
         return np.asarray(terms_first.reshape(len(x_degree), -1))
 
 
 def position_degrees(degree: int) -> tuple[Integers, Integers]:
-    """Return the degrees in x and in y of all terms whose total degree is at most `degree`, each of shape (n_term,)."""
-    single = np.arange(degree + 1)
-    total = np.add.outer(single, single)
-    x_degree, y_degree = np.nonzero(total <= degree)
+    """Return the degrees in x and in y of all products of polynomials whose total degree is at most `degree`.
+
+    Args:
+        degree: Largest sum of the degrees in x and in y.
+
+    Returns:
+        The degree in x and the degree in y of each product, each of shape (n_term,).
+    """
+    degrees = np.arange(degree + 1)
+    total_degree = np.add.outer(degrees, degrees)
+    x_degree, y_degree = np.nonzero(total_degree <= degree)
     return x_degree, y_degree
 
 
 def chebyshev_terms(coordinates: Array, degree: int, force_degree: int) -> tuple[Array, Array]:
-    """Evaluate all products of Chebyshev polynomials that occur in a series.
+    """Evaluate the Chebyshev polynomials that occur in a series.
 
     Args:
-        coordinates: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.
+        coordinates: Scaled coordinates of n points, shape (n, 3). Coordinates outside [-1, 1] are clipped.
         degree: Largest total degree in x and y.
         force_degree: Largest degree in the logarithm of the force.
 
@@ -98,7 +110,15 @@ def chebyshev_terms(coordinates: Array, degree: int, force_degree: int) -> tuple
 
 
 def _derivative(coefficients: Array, axis: int) -> Array:
-    """Return the coefficients of the derivative with respect to one coordinate, padded with zeros to the same shape."""
+    """Return the coefficients of the derivative of a series with respect to one coordinate.
+
+    Args:
+        coefficients: Coefficients of the series; see `Series`.
+        axis: Axis of the coordinate.
+
+    Returns:
+        Coefficients of the derivative, padded with zeros to the shape of `coefficients`.
+    """
     padding = [(0, 0)] * coefficients.ndim
     padding[axis] = (0, 1)
     return np.pad(chebyshev.chebder(coefficients, axis=axis), padding)

@@ -12,25 +12,41 @@ from isocharge.common.statistics import rms
 
 
 def position_error(contact: Array, truth: Array) -> Array:
-    """Return the distances between estimated and true positions, shape (n,), mm, from contacts of shape (n, 3)."""
+    """Compute the distance between the estimated and the true position of each contact.
+
+    Args:
+        contact: Estimated contacts (x, y, F), shape (n, 3), mm and N.
+        truth: True contacts, of the same shape and units.
+
+    Returns:
+        Distances, shape (n,), mm.
+    """
     return np.asarray(np.hypot(contact[:, 0] - truth[:, 0], contact[:, 1] - truth[:, 1]))
 
 
 def force_error_percent(contact: Array, truth: Array) -> Array:
-    """Return the relative errors of estimated forces, shape (n,), %, from contacts of shape (n, 3)."""
+    """Compute the relative error of the estimated force of each contact.
+
+    Args:
+        contact: Estimated contacts (x, y, F), shape (n, 3), mm and N.
+        truth: True contacts, of the same shape and units.
+
+    Returns:
+        Relative errors, shape (n,), %, positive if the estimated force is larger than the true force.
+    """
     return np.asarray(100.0 * (contact[:, 2] / truth[:, 2] - 1.0))
 
 
 @dataclass(frozen=True)
 class ContactErrorStatistics:
-    """Medians, root mean squares and percentiles of the errors of contacts.
+    """Medians, root mean squares and percentiles of the errors of estimated contacts.
 
     Attributes:
         presses: Number of presses.
         position_median_mm: Median of the distance from the true position, mm.
-        position_rms_mm: Root mean square of this distance, mm.
-        position_p95_mm: 95th percentile of this distance, mm.
-        position_p99_mm: 99th percentile of this distance, mm.
+        position_rms_mm: Root mean square of the distance from the true position, mm.
+        position_p95_mm: 95th percentile of the distance from the true position, mm.
+        position_p99_mm: 99th percentile of the distance from the true position, mm.
         force_median_percent: Median of the absolute relative error of the force, %.
         force_rms_percent: Root mean square of the relative error of the force, %.
         force_p99_percent: 99th percentile of the absolute relative error of the force, %.
@@ -47,9 +63,11 @@ class ContactErrorStatistics:
 
     @classmethod
     def of(cls, contact: Array, truth: Array) -> "ContactErrorStatistics":
-        """Compute the statistics of the errors.
+        """Compute the statistics of the errors of estimated contacts.
 
-        Estimated and true contacts (x, y, F) have the shape (n, 3), mm and N.
+        Args:
+            contact: Estimated contacts (x, y, F), shape (n, 3), mm and N.
+            truth: True contacts, of the same shape and units.
         """
         position_mm = position_error(contact, truth)
         force_percent = np.abs(force_error_percent(contact, truth))

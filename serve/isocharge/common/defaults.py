@@ -1,6 +1,6 @@
-"""Defaults that several packages share: the presses of a sweep, and the largest batch.
+"""Default values that several packages share, such as the range of the presses in a sweep and the largest batch.
 
-This module imports no other module, so that `--help` shows the defaults without delay.
+This module imports no other module. The help texts of the commands can therefore show the defaults without delay.
 """
 
 DEFAULT_RADIUS = 8.0

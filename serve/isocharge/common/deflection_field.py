@@ -1,15 +1,16 @@
-"""Deflection of a round film under a round probe, as a table over force and distance from the centre, and its file.
+"""Deflection of a round film under a round probe, and the file that stores the deflection.
 
-The film is round and elastically isotropic, so that every press is a rotated press on the x axis. A disk automorphism
-maps rings around the origin to rings around the probe,
+The deflection is a table over the force and the distance of the probe from the centre of the film. The film is
+elastically isotropic, so every press is a rotated press on the x axis. The points of the table lie on rings. A disk
+automorphism maps rings around the origin to rings around the probe,
 
     z -> (z + c) / (1 + c z),  c = tanh((atanh(p + r) + atanh(p - r)) / 2),
 
 where z = x + i y is a point, p is the distance of the probe from the centre and r is the radius of the probe, all in
-film radii. The deflection is smooth on these rings, so that a few hundred numbers describe the deflection of one press.
-The deflection of a membrane is proportional to the cube root of the force. Between two forces of the table, the
-deflection divided by this cube root is therefore interpolated over the logarithm of the force. The package `simulate`
-writes the file, and the live page of `serve` shows the deflection.
+film radii. The deflection varies smoothly over these rings. A few hundred numbers are therefore sufficient for the
+deflection of one press. The deflection of a membrane is proportional to the cube root of the force. Between two forces
+of the table, the deflection divided by the cube root of the force is therefore interpolated over the logarithm of the
+force. The package `simulate` writes the file, and the live page of `serve` shows the deflection.
 """
 
 import base64
@@ -42,16 +43,16 @@ MAX_NUMBERS = 1 << 18
 
 @dataclass(frozen=True)
 class DeflectionField:
-    """Deflection of one film under one probe.
+    """Deflection of one film under one probe, as a table.
 
     Attributes:
-        film: Properties of the film by `FILM_KEYS`.
+        film: Properties of the film, with the keys `FILM_KEYS`.
         probe_radius_mm: Radius of the round probe, mm.
         force_N: Forces in increasing order, N.
         distance_mm: Distances of the probe from the centre in increasing order from 0, mm.
-        rings: Radii of the rings before the automorphism, from 0 to 1, in film radii.
+        rings: Radii of the rings around the origin, before the automorphism, from 0 to 1, in film radii.
         deflection_mm: Deflections, shape (forces, distances, rings, angles), mm, positive in the direction of the push.
-            The angles range from 0 (outwards) to pi. The other half is the mirror image.
+            The angles range from 0 (outwards) to pi. The other half of the film is the mirror image.
     """
 
     film: Mapping[str, float]
@@ -62,12 +63,16 @@ class DeflectionField:
     deflection_mm: Array
 
     def fits(self, film: Any) -> bool:
-        """Return whether the film that a sensor file describes has the same properties as the film of this field."""
+        """Return whether a film has the same properties as the film of this deflection field.
+
+        Args:
+            film: The film as a sensor file describes it. If it is not a table, the result is False.
+        """
         return is_same_film(film, self.film)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of the file."""
-        scale_mm = float(np.max(self.deflection_mm)) or 1.0  # any positive scale for a field of zeros
+        """Return the content of the file in which the deflection field is stored."""
+        scale_mm = float(np.max(self.deflection_mm)) or 1.0  # if all deflections are 0, any positive scale is correct
         steps = np.round(np.clip(self.deflection_mm / scale_mm, 0.0, 1.0) * N_STEPS).astype("<u2")
         return {
             "isocharge_deflection": VERSION,
@@ -83,39 +88,39 @@ class DeflectionField:
 
 
 def is_same_film(film: Any, properties: Mapping[str, float]) -> bool:
-    """Return whether the properties of a film are equal to expected properties, up to rounding.
+    """Return whether the properties of a film are equal to expected properties, except for rounding errors.
 
     Args:
-        film: The film as a sensor file describes it. The result is False for anything that is not a table.
-        properties: Expected properties by `FILM_KEYS`.
+        film: The film as a sensor file describes it. If it is not a table, the result is False.
+        properties: Expected properties, with the keys `FILM_KEYS`.
     """
     if not isinstance(film, Mapping):
         return False
-    film_properties = {"pretension_MPa": 0.0, **film}
+    film_properties = {"pretension_MPa": 0.0, **film}  # the pretension is 0 if the file omits it
     return all(_is_close(film_properties.get(key), properties[key]) for key in FILM_KEYS)
 
 
 def _is_close(given: object, value: float) -> bool:
-    """Return whether `given` is a number that is equal to `value` up to rounding."""
+    """Return whether `given` is a number that is equal to `value`, except for rounding errors."""
     return isinstance(given, int | float) and math.isclose(given, value, rel_tol=1e-6, abs_tol=1e-12)
 
 
 def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, rings: Array, angles: int) -> Complexes:
-    """Compute the points of a deflection field for a probe on the x axis.
+    """Compute the points at which a deflection field contains the deflection, for a probe on the x axis.
 
     Rings around the origin are mapped to rings around the probe by the disk automorphism
 
         z -> (z + c) / (1 + c z),  c = tanh((atanh(p + r) + atanh(p - r)) / 2),
 
-    where p is the distance of the probe from the centre and r is its radius, both in film radii. With this shift c, a
-    circle around the origin becomes the edge of the probe.
+    where p is the distance of the probe from the centre and r is the radius of the probe, both in film radii. This
+    value of the shift c maps a circle around the origin to the edge of the probe.
 
     Args:
         radius_mm: Radius of the film, mm.
         probe_radius_mm: Radius of the probe, mm.
         distance_mm: Distance of the probe from the centre, mm.
-        rings: Radii of the rings before the automorphism, shape (rings,), in film radii.
-        angles: Number of angles from 0 to pi.
+        rings: Radii of the rings around the origin, before the automorphism, shape (rings,), in film radii.
+        angles: Number of angles, which range from 0 to pi.
 
     Returns:
         Points x + i y, shape (rings, angles), mm.
@@ -133,11 +138,14 @@ def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, ring
 def read_deflection_field(path: Path) -> DeflectionField:
     """Read a deflection field from its file.
 
+    Args:
+        path: The file.
+
     Raises:
         InputError: If the file cannot be read, is damaged, or has an unsupported version.
     """
     file = read_json(path, "a deflection field", InputError, _File)
-    ratio = np.frombuffer(file.deflection, "<u2").reshape(file.shape) / N_STEPS
+    ratio = np.frombuffer(file.deflection, "<u2").reshape(file.shape) / N_STEPS  # to the largest deflection
     return DeflectionField(
         film=file.film,
         probe_radius_mm=file.probe_radius_mm,
@@ -153,9 +161,10 @@ Increasing = Annotated[tuple[Finite, ...], Meta(min_length=1)]
 
 
 class _File(Struct):
-    """Content of the file.
+    """Content of the file of a deflection field.
 
-    The key `deflection` contains the deflections divided by the largest deflection, encoded in base64.
+    The key `deflection` contains 16-bit integers in base64. Each integer is a deflection divided by `scale_mm`, in
+    steps of 1 / `N_STEPS`.
     """
 
     isocharge_deflection: Annotated[int, Meta(ge=VERSION, le=VERSION, description=f"the version {VERSION}")]
@@ -169,13 +178,13 @@ class _File(Struct):
     deflection: bytes
 
     def __post_init__(self) -> None:
-        """Check that the values of the keys are consistent.
+        """Check that the values of the keys are consistent with each other.
 
-        The film must have exactly the expected properties. The numbers along each axis of the table must increase.
-        There must be one deflection for each combination of force, distance, ring and angle.
+        The film must have exactly the keys `FILM_KEYS`. The forces, the distances and the rings must increase. There
+        must be one deflection for each combination of force, distance, ring and angle.
 
         Raises:
-            WrongKey: For the first key whose value is wrong.
+            WrongKey: If the value of a key is wrong. The error names the first such key.
         """
         if set(self.film) != set(FILM_KEYS):
             raise WrongKey("film", f"the keys {', '.join(FILM_KEYS)}", list(self.film))
@@ -193,5 +202,5 @@ class _File(Struct):
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Shape of the table: numbers of forces, distances, rings and angles."""
+        """Shape of the table: the numbers of forces, of distances, of rings and of angles."""
         return len(self.force_N), len(self.distance_mm), len(self.rings), self.angles

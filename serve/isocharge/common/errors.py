@@ -1,8 +1,9 @@
-"""The exceptions of isocharge. Each class also inherits from the built-in exception with the most similar meaning.
+"""The exceptions of isocharge.
 
-A message states what was expected, what was given, where, and what to do. `isocharge.cli.main` maps the exceptions to
-exit codes: 2 for wrong input, and 1 for everything else. `isocharge.serve.network.protocol.response` maps the
-exceptions to HTTP and gRPC statuses.
+Each class also inherits from the built-in exception with the most similar meaning. A message states what was expected,
+what was given, where the error is, and what the user can do. `isocharge.cli.main` maps the exceptions to exit codes,
+which are 2 for wrong input and 1 for all other errors. `isocharge.serve.network.protocol.response` maps the exceptions
+to HTTP and gRPC statuses.
 """
 
 from collections.abc import Iterator
@@ -15,38 +16,41 @@ MAX_VALUE_CHARACTERS = 200
 
 
 def cut(text: str) -> str:
-    """Cut a text after `MAX_VALUE_CHARACTERS` characters, and make it printable, for an error message."""
+    """Shorten a text to `MAX_VALUE_CHARACTERS` characters and make it printable, for an error message."""
     if len(text) <= MAX_VALUE_CHARACTERS:
         return printable(text)
     return printable(text[:MAX_VALUE_CHARACTERS]) + "..."
 
 
 def shown(value: object) -> str:
-    """Return the repr of a value for an error message, cut after `MAX_VALUE_CHARACTERS` characters."""
+    """Return the `repr` of a value, shortened to `MAX_VALUE_CHARACTERS` characters, for an error message."""
     try:
         return cut(repr(value))
-    except (RecursionError, ValueError):  # nested too deeply, or an int with more digits than Python prints
+    except (RecursionError, ValueError):  # the value is nested too deeply, or is an int with too many digits
         return f"a {type(value).__name__} that is too large to print"
 
 
 class IsochargeError(Exception):
-    """Base class of all errors that isocharge raises on purpose."""
+    """Base class of all exceptions that isocharge defines."""
 
     def __str__(self) -> str:
-        """Return the message in printable characters, because messages contain names from files and boards."""
+        """Return the message in printable characters.
+
+        A message may contain text from files and boards, and such text may contain characters that a terminal executes.
+        """
         return printable_lines(super().__str__())
 
 
 class InputError(IsochargeError, ValueError):
-    """An input, such as an argument or a file, is not valid. Nothing was computed."""
+    """An input, such as an argument or a file, is not valid."""
 
 
 class SensorError(InputError):
-    """A sensor description is wrong: an unknown key, an electrode outside the film, or an impossible material."""
+    """A sensor description is wrong, for example because an electrode lies outside the film."""
 
 
 class SceneError(InputError):
-    """A press is impossible: a probe outside the film, a negative force, or an unknown notation of the probe."""
+    """A press cannot be simulated, for example because the probe lies outside the film or the force is negative."""
 
 
 class ConfigError(InputError):
@@ -54,31 +58,31 @@ class ConfigError(InputError):
 
 
 class ChargeError(InputError):
-    """Charges cannot be used with the model: a wrong number of charges, NaN, or an infinite charge."""
+    """Charges cannot be used with a model, for example because a charge is missing or is not finite."""
 
 
 class PressError(InputError):
-    """Measured presses cannot be used: a wrong column, a value that is no number, or a force that is not positive."""
+    """Measured presses cannot be used, for example because a column is missing or a force is not positive."""
 
 
 class DeviceError(InputError):
-    """A device description is wrong: an unknown key, an unknown checksum, or fields that do not fill the frame."""
+    """A device description is wrong, for example because it contains an unknown key or an unknown checksum."""
 
 
 class RecordingError(InputError):
-    """A file is not a recording, or is damaged."""
+    """A file is not a recording, or the recording is damaged."""
 
 
 class DatasetError(InputError):
-    """A folder is not a dataset, or is damaged."""
+    """A folder is not a dataset, or the dataset is damaged."""
 
 
 class ModelError(InputError):
-    """A model is missing, damaged, or of another format."""
+    """A model is missing, is damaged, or has an unsupported format."""
 
 
 class ModelNotFound(ModelError):
-    """The server has no model with this name and version."""
+    """The server has no model with the requested name and version."""
 
 
 class RequestError(InputError):
@@ -86,11 +90,11 @@ class RequestError(InputError):
 
 
 class UnknownPath(RequestError):
-    """The server has no resource with this path."""
+    """The server has no resource at the path of a request."""
 
 
 class WrongMethod(RequestError):
-    """The method of a request is not allowed for its path.
+    """The HTTP method of a request is not allowed for the path of the request.
 
     Attributes:
         allowed: Names of the allowed methods, for the header `Allow`.
@@ -102,15 +106,15 @@ class WrongMethod(RequestError):
 
 
 class TooLarge(RequestError):
-    """A request is larger than the limits of the server."""
+    """A request is larger than the server allows."""
 
 
 class TooMany(RequestError):
-    """More calls are open than the limits of the server allow."""
+    """More calls are open than the server allows."""
 
 
 class UnknownEncoding(RequestError):
-    """The body of a request has a compression that the server does not support."""
+    """The body of a request is compressed by a method that the server does not support."""
 
 
 class TokenError(IsochargeError, PermissionError):
@@ -118,7 +122,7 @@ class TokenError(IsochargeError, PermissionError):
 
 
 class OriginError(IsochargeError, PermissionError):
-    """A request was sent by a page of another site."""
+    """A request was sent by a web page of another site."""
 
 
 class ListenError(IsochargeError, OSError):
@@ -126,11 +130,11 @@ class ListenError(IsochargeError, OSError):
 
 
 class OutputExists(IsochargeError, FileExistsError):
-    """The output exists already and is not overwritten."""
+    """An output file or folder exists already. It is not overwritten."""
 
 
 class OutputError(IsochargeError, OSError):
-    """An output cannot be written. No part of it remains."""
+    """An output file or folder cannot be written."""
 
 
 class SolveError(IsochargeError, ArithmeticError):
@@ -138,7 +142,7 @@ class SolveError(IsochargeError, ArithmeticError):
 
 
 class WorkersLost(IsochargeError, ConnectionError):
-    """Worker processes or a cluster have ended, do not respond, or run another version of isocharge."""
+    """Worker processes have ended, do not respond, or run another version of isocharge."""
 
 
 class TrainingError(IsochargeError, ArithmeticError):
@@ -154,11 +158,11 @@ class PortLost(PortError):
 
 
 class NoFramesError(PortError):
-    """The bytes of a port contain no frames of a known format."""
+    """The bytes from a port contain no frames of a known format."""
 
 
 class PressCheckError(IsochargeError, RuntimeError):
-    """The presses that a check expects were not made, or they do not distinguish the channels."""
+    """The presses that a check needs were not made, or do not distinguish the channels."""
 
 
 class TareError(IsochargeError, RuntimeError):
@@ -166,12 +170,23 @@ class TareError(IsochargeError, RuntimeError):
 
 
 class MissingExtra(IsochargeError, ImportError):
-    """A part of isocharge needs packages that are not installed; the message names the install command."""
+    """A part of isocharge needs packages that are not installed.
+
+    The message contains the command that installs the packages.
+    """
 
 
 @contextmanager
 def error_prefix(where: str, kind: type[IsochargeError]) -> Iterator[None]:
-    """Prefix the message of each error of class `kind` that the block raises with the text `where`."""
+    """Add a text in front of the message of each error that the `with` block raises.
+
+    Args:
+        where: Text that is added, for example the name of a file and a colon.
+        kind: Class of the errors whose messages are changed. All other exceptions are not changed.
+
+    Raises:
+        kind: If the block raises an error of this class. The new error has the longer message.
+    """
     try:
         yield
     except kind as error:

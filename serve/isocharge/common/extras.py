@@ -1,4 +1,4 @@
-"""Packages of the extras in pyproject.toml, and the error for an extra that is not installed."""
+"""Packages of the extras in pyproject.toml, and the error that is raised if an extra is not installed."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,13 +22,14 @@ PACKAGES = {
 
 @contextmanager
 def require(*extras: str) -> Iterator[None]:
-    """Raise an error that names the install command if an import inside this context finds no package of the extras.
+    """Convert a failed import in the `with` block to an error that contains the command to install the extras.
 
     Args:
         extras: Names of the extras in pyproject.toml. `PACKAGES` contains the packages of each extra.
 
     Raises:
-        MissingExtra: If a package of the extras is not installed. The error of any other failed import is not changed.
+        MissingExtra: If an import in the block fails because a package of the extras is not installed. If an import
+            fails for any other reason, its error is not changed.
 
     Example:
         >>> with require("simulate"):
@@ -36,9 +37,9 @@ def require(*extras: str) -> Iterator[None]:
     """
     try:
         yield
-    except (ModuleNotFoundError, MissingExtra) as error:  # a `require` inside the block raises MissingExtra
+    except (ModuleNotFoundError, MissingExtra) as error:  # another `require` inside the block raises MissingExtra
         missing_module = error.name or ""
-        package = missing_module.partition(".")[0]
+        package = missing_module.partition(".")[0]  # for example "google" for the module "google.protobuf"
         is_package_of_extras = any(package in PACKAGES[extra] for extra in extras)
         if not is_package_of_extras:
             raise

@@ -1,4 +1,7 @@
-"""Reading and writing of files. A written file or folder exists either completely or not at all."""
+"""Reading and writing of files and folders.
+
+A file or folder that is written appears under its name only when it is complete.
+"""
 
 import errno
 import hashlib
@@ -20,22 +23,28 @@ MAX_LINE_CHARACTERS = 1 << 20
 """Largest number of characters of a line in a text that is read line by line."""
 
 READ_FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
-"""Flags for opening a file without waiting for the writer of a pipe. Flags that a system does not have are left out."""
+"""Flags for opening a file without waiting for the writer of a pipe, as far as the system has these flags."""
 
 WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
-"""Flags for creating a file that must not exist."""
+"""Flags for creating a file that must not exist already."""
 
 
 def sha256_of(data: bytes) -> str:
-    """Return the SHA-256 checksum in hexadecimal digits."""
+    """Return the SHA-256 checksum of data in hexadecimal digits."""
     return hashlib.sha256(data).hexdigest()
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file for reading, without waiting for the writer of a pipe.
+    """Open a regular file for reading, and refuse pipes, devices and folders.
+
+    The function does not wait for the writer of a pipe.
+
+    Args:
+        path: The file.
 
     Raises:
-        OSError: If the file cannot be opened, or is a pipe, a device or a folder. Its `strerror` states the reason.
+        OSError: If the file cannot be opened, or is a pipe, a device or a folder. The attribute `strerror` of the
+            exception states the reason.
     """
     descriptor = os.open(path, READ_FLAGS)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -45,32 +54,36 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_whole(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
-    """Read the bytes of a regular file.
+    """Read all bytes of a regular file.
 
     Args:
         path: The file. A pipe or a device is refused, because reading it might never end.
-        max_bytes: Largest size, bytes.
+        max_bytes: Largest size of the file, bytes.
 
     Raises:
-        OSError: If the file cannot be read, is not a regular file, or is larger than `max_bytes`. Its `strerror` states
-            the reason.
+        OSError: If the file cannot be read, is not a regular file, or is larger than `max_bytes`. The attribute
+            `strerror` of the exception states the reason.
     """
-    too_large = OSError(errno.EFBIG, f"larger than {max_bytes} bytes", str(path))
     with open_regular(path) as file:
         if os.fstat(file.fileno()).st_size > max_bytes:
-            raise too_large
-        data = file.read(max_bytes + 1)  # the file may have grown in the meantime
-    if len(data) > max_bytes:
-        raise too_large
+            raise _too_large_error(path, max_bytes)
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:  # the file has grown since its size was determined
+        raise _too_large_error(path, max_bytes)
     return data
 
 
+def _too_large_error(path: Path, max_bytes: int) -> OSError:
+    """Return the exception for a file that is larger than `max_bytes`."""
+    return OSError(errno.EFBIG, f"larger than {max_bytes} bytes", str(path))
+
+
 def bounded_lines(file: TextIO, max_characters: int = MAX_LINE_CHARACTERS) -> Iterator[str]:
-    """Yield the lines of a text, each with its line end.
+    """Yield the lines of a text file, each with its line end, and refuse lines that are too long.
 
     Args:
-        file: The text.
-        max_characters: Largest number of characters of a line.
+        file: The text file, which is open for reading.
+        max_characters: Largest number of characters of a line, including its line end.
 
     Raises:
         ValueError: If a line is longer than `max_characters`, or cannot be decoded.
@@ -82,13 +95,16 @@ def bounded_lines(file: TextIO, max_characters: int = MAX_LINE_CHARACTERS) -> It
 
 
 def read_needed(path: Path, error: type[IsochargeError], advice: str, max_bytes: int = MAX_FILE_BYTES) -> bytes:
-    """Read the bytes of a regular file. If the file cannot be read, raise an error that states what to do.
+    """Read all bytes of a regular file. If the file cannot be read, raise an error of a given class with advice.
 
     Args:
         path: The file.
         error: Class of the error.
-        advice: What the user can do, for the error message.
-        max_bytes: Largest size, bytes.
+        advice: Text for the error message that states what the user can do.
+        max_bytes: Largest size of the file, bytes.
+
+    Raises:
+        error: If the file cannot be read, is not a regular file, or is larger than `max_bytes`.
     """
     try:
         return read_whole(path, max_bytes)
@@ -97,7 +113,11 @@ def read_needed(path: Path, error: type[IsochargeError], advice: str, max_bytes:
 
 
 def refuse_existing(path: Path) -> None:
-    """Raise OutputExists if a file or a folder exists at the path."""
+    """Check that no file and no folder exists at the path of an output.
+
+    Raises:
+        OutputExists: If a file or a folder exists at the path.
+    """
     if path.exists():
         raise OutputExists(f"{path} is already there and is not overwritten; choose another output or remove it")
 
@@ -105,11 +125,14 @@ def refuse_existing(path: Path) -> None:
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file under a temporary name, flush it to disk, and then rename it.
 
-    A reader therefore sees either the complete old file or the complete new file.
+    A program that reads the file therefore reads either the complete old content or the complete new content.
 
     Args:
         path: The file. An existing file is replaced.
-        data: Content of the file.
+        data: New content of the file.
+
+    Raises:
+        OSError: If the file cannot be written. The old file then remains unchanged.
     """
     temporary = _temporary_path(path)
     try:
@@ -119,17 +142,20 @@ def write_whole(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         temporary.replace(path)
     finally:
-        temporary.unlink(missing_ok=True)  # the file only exists under this name if an error occurred
+        temporary.unlink(missing_ok=True)  # a file with the temporary name only exists if an error occurred
 
 
 class AtomicWriter:
-    """Writer of a new file that appends data completely or not at all.
+    """Writer of a new file. Each call of `write` appends its data either completely or not at all.
 
-    The writer has the methods of a binary file that MCAP and text writers use.
+    The class has those methods of a binary file that MCAP and text writers use.
     """
 
     def __init__(self, path: Path) -> None:
         """Create the file.
+
+        Args:
+            path: The file. It must not exist.
 
         Raises:
             OutputExists: If the file exists already.
@@ -141,9 +167,19 @@ class AtomicWriter:
         self._size = 0  # number of bytes that complete calls of `write` have written
 
     def write(self, data: bytes) -> int:
-        """Append data to the file. If an OSError is raised, the file is unchanged.
+        """Append data to the file.
 
-        Data of an earlier call that was interrupted, for example by Ctrl-C, are overwritten.
+        If an earlier call was interrupted, for example by Ctrl-C, the incomplete data of the earlier call are
+        overwritten.
+
+        Args:
+            data: The data to append.
+
+        Returns:
+            Number of bytes of the data.
+
+        Raises:
+            OSError: If the data cannot be written. The file is then unchanged.
         """
         unwritten = memoryview(data)
         try:
@@ -158,31 +194,34 @@ class AtomicWriter:
         return len(data)
 
     def tell(self) -> int:
-        """Return the number of bytes that were written."""
+        """Return the number of bytes that complete calls of `write` have written."""
         return self._size
 
     def flush(self) -> None:
         """Do nothing, because no data are buffered."""
 
     def close(self) -> None:
-        """Remove the data of an interrupted call, and close the file."""
+        """Remove the incomplete data of an interrupted call of `write`, and close the file."""
         os.ftruncate(self._descriptor, self._size)
         os.close(self._descriptor)
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Create a file under a temporary name, and rename it at the end of the block. After an error nothing remains.
+    """Provide a temporary path at which the `with` block creates a new file or folder.
+
+    At the end of the block, the file or folder is renamed to its final path. If the block raises an exception, the file
+    or folder is removed.
 
     Args:
-        path: The final path of the file.
+        path: The final path of the file or folder.
 
     Yields:
-        Temporary path in the same folder, where the block creates a file or a folder.
+        Temporary path in the same parent folder, at which the block creates the file or folder.
 
     Raises:
         OutputExists: If `path` exists already, or another process creates it in the meantime.
-        OutputError: If the file cannot be written.
+        OutputError: If the file or folder cannot be written.
     """
     refuse_existing(path)
     temporary = _temporary_path(path)
@@ -190,25 +229,27 @@ def new_file(path: Path) -> Iterator[Path]:
         with as_output_errors(path):
             yield temporary
             flush_to_disk(temporary)
-            refuse_existing(path)  # another process may have created it in the meantime
+            refuse_existing(path)  # another process may have created the path in the meantime
             temporary.rename(path)
             flush_to_disk(path.parent)
     finally:
-        # Neither a folder nor a file has this name any more, unless an error occurred.
-        shutil.rmtree(temporary, ignore_errors=True)  # if it is a folder
+        # After an error, the temporary path is still a folder or a file, and is removed.
+        shutil.rmtree(temporary, ignore_errors=True)  # does nothing for a file
         with suppress(OSError):
-            temporary.unlink()  # if it is a file
+            temporary.unlink()  # fails if the path does not exist any more
 
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Create a folder under a temporary name, and rename it at the end of the block. After an error nothing remains.
+    """Create a folder under a temporary name, and rename it to its final name at the end of the `with` block.
+
+    If the block raises an exception, the folder is removed.
 
     Args:
-        path: The folder. Missing parent folders are created, too.
+        path: The final path of the folder. Missing parent folders are created, too.
 
     Yields:
-        The temporary folder, in which the block writes.
+        Path of the temporary folder, into which the block writes files.
 
     Raises:
         OutputExists: If `path` exists already, or another process creates it in the meantime.
@@ -220,34 +261,39 @@ def new_folder(path: Path) -> Iterator[Path]:
             temporary.mkdir(parents=True)
             yield temporary
     finally:
-        remove_empty(missing_parents)  # after an error they are empty; otherwise they contain the new folder
+        remove_empty(missing_parents)  # they are only empty after an error; otherwise they contain the new folder
 
 
 def _temporary_path(path: Path) -> Path:
+    """Return a hidden path with a random name in the same folder as `path`."""
     return path.with_name(f".{secrets.token_hex(4)}.draft")
 
 
 @contextmanager
 def as_output_errors(path: Path, advice: str = "choose another output") -> Iterator[None]:
-    """Convert an OSError that the block raises to an OutputError.
+    """Convert an OSError that the `with` block raises to an OutputError.
 
     Args:
-        path: The output, for the error message.
-        advice: What the user can do, for the error message.
+        path: Path of the output, for the error message.
+        advice: Text for the error message that states what the user can do.
+
+    Raises:
+        OutputError: If the block raises an OSError that is neither an error of isocharge nor a broken pipe.
     """
     try:
         yield
     except OSError as error:
-        # Errors of isocharge have their own message already, and a broken pipe is not an error of this output.
+        # An error of isocharge already has a message for the user. A broken pipe is not an error of this output.
         if isinstance(error, IsochargeError | BrokenPipeError):
             raise
         raise OutputError(f"{path} cannot be written: {error.strerror or error}; {advice}") from error
 
 
 def remove_empty(folders: Iterable[Path]) -> None:
-    """Remove those of the given folders that are empty. All other folders remain unchanged.
+    """Remove the given folders, except for folders that contain files or other folders.
 
-    Inner folders must come before outer folders.
+    Args:
+        folders: The folders. Inner folders must come before outer folders. Paths that do not exist are ignored.
     """
     for folder in folders:
         if folder.is_dir() and not any(folder.iterdir()):
@@ -255,9 +301,13 @@ def remove_empty(folders: Iterable[Path]) -> None:
 
 
 def flush_to_disk(path: Path) -> None:
-    """Flush a folder or a file to disk, so that renames or contents survive a power failure.
+    """Flush a file or a folder to disk, so that its content survives a power failure.
 
-    The function does nothing on Windows, where a folder cannot be opened.
+    For a folder, the names of its files are flushed. The function does nothing on Windows, where a folder cannot be
+    opened.
+
+    Args:
+        path: The file or the folder.
     """
     is_windows = not hasattr(os, "O_DIRECTORY")
     if is_windows:

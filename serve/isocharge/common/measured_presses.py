@@ -1,15 +1,16 @@
-"""Measured presses: charges of a film under presses. For each press, the position, the force or both are known.
+"""Measured presses: presses on a film whose charges were measured.
 
-A file of presses is CSV or Parquet with the columns `x_mm`, `y_mm`, `force_N` and one column for each electrode (pC),
-in any order. An empty cell stands for an unknown value. A file may have four further columns:
+For each press, the position, the force or both may also be known. A file of presses is a CSV or Parquet file with the
+columns `x_mm`, `y_mm`, `force_N` and one column for the charges of each electrode in pC. The columns may be in any
+order. An empty cell stands for an unknown value. The file may have four further columns:
 
     position_std_mm      standard deviation of x and of y, mm
     force_std            standard deviation of the force relative to the force: 0.01 is 1 %
     temperature_C        temperature of the ring of the film, degrees Celsius
     film_temperature_C   temperature of the film itself, or of the air at its surface, degrees Celsius
 
-All other columns are ignored if the names of the electrodes are given. `isocharge serve predict` reads these files,
-too.
+If the names of the electrodes are given, all other columns are ignored. If no names are given, all columns without
+another meaning are assumed to be electrodes. `isocharge serve predict` also reads files of presses.
 """
 
 from collections.abc import Collection, Sequence
@@ -83,29 +84,31 @@ MAX_NAME_CHARACTERS = 1_000
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPresses:
-    """Charges and contacts of n measured presses.
+    """Charges, positions and forces of n measured presses.
 
-    Two objects are equal if they have the same values and electrodes, even if they come from different lines of a file.
+    Two objects are equal if their values and the names of their electrodes are equal. The attribute `lines` is not
+    compared.
 
     Attributes:
-        contact: x_mm, y_mm and force_N, shape (n, 3); NaN if unknown. Either both x and y are known, or neither.
+        contact: Position and force (x_mm, y_mm, force_N) of each press, shape (n, 3); NaN if unknown. Either both x and
+            y are known, or neither.
         charge_pC: Touch charges, shape (n, electrodes), pC; NaN if unknown. At least one charge of each press is known.
         position_std_mm: Standard deviation of x and of y, shape (n,), mm.
         force_std: Standard deviation of the force relative to the force, shape (n,), dimensionless.
         electrodes: Names of the electrodes, in the order of the charges.
-        lines: Number of each press in its file, for messages: the line of a CSV file, or the row of a Parquet file. If
-            there is no file, the presses are numbered from 1.
-        ignored: Columns of the file that were not read.
-        temperature_C: Temperature of the ring of the film, shape (n,), degrees Celsius; NaN if unknown, None if it is
-            unknown for all presses.
-        film_temperature_C: Temperature of the film or of the air at its surface, shape (n,), degrees Celsius. An
-            unknown temperature is NaN. If all temperatures are unknown, the attribute is None. It is only allowed
-            together with `temperature_C`.
+        lines: Number of the line of each press in a CSV file, or number of the row in a Parquet file, for messages. If
+            the presses do not come from a file, they are numbered from 1.
+        ignored: Names of the columns of the file that were not read.
+        temperature_C: Temperature of the ring of the film, shape (n,), degrees Celsius; NaN if unknown. If all
+            temperatures are unknown, the attribute may be None.
+        film_temperature_C: Temperature of the film or of the air at its surface, shape (n,), degrees Celsius; NaN if
+            unknown. If all temperatures are unknown, the attribute may be None. Known temperatures of the film are only
+            allowed if `temperature_C` is also given.
         row_noun: What `lines` counts, for messages: "line", "row" or "press".
 
     Raises:
-        PressError: If the shapes do not fit each other, or a value is not allowed. The message names the line and the
-            column.
+        PressError: If the arrays have inconsistent shapes, or a value is not allowed. For a wrong value, the message
+            names the line and the column.
     """
 
     contact: Array
@@ -128,7 +131,11 @@ class MeasuredPresses:
         return len(self.lines)
 
     def __getitem__(self, rows: int | slice | Sequence[int] | Integers | Booleans) -> "MeasuredPresses":
-        """Return the presses that an index, several indices, a slice or a mask selects."""
+        """Return the selected presses.
+
+        Args:
+            rows: Index of one press, indices of several presses, a slice, or a mask of shape (n,).
+        """
         indices = np.atleast_1d(np.arange(len(self))[rows])
         return replace(
             self,
@@ -143,12 +150,12 @@ class MeasuredPresses:
 
     @property
     def placed(self) -> Booleans:
-        """Whether both the position and the force of each press are known, shape (n,)."""
+        """Mask of the presses whose position and force are both known, shape (n,)."""
         return np.asarray(np.isfinite(self.contact).all(axis=1))
 
     @property
     def knows_temperature(self) -> bool:
-        """Whether the temperature of at least one press is known."""
+        """Whether the temperature of the ring is known for at least one press."""
         return self.temperature_C is not None and not bool(np.isnan(self.temperature_C).all())
 
     @property
@@ -166,14 +173,14 @@ class MeasuredPresses:
         )
 
     def of_electrodes(self, electrodes: Sequence[str], owner: str) -> "MeasuredPresses":
-        """Return the same presses with the charges of some electrodes, in the given order.
+        """Return the same presses with only the charges of the given electrodes, in the given order.
 
         Args:
             electrodes: Names of the electrodes.
-            owner: Object that has these electrodes, for the error message, such as "the model".
+            owner: Object to which the electrodes belong, for the error message, such as "the model".
 
         Raises:
-            PressError: If one of the electrodes is missing.
+            PressError: If the presses contain no charges of one of the electrodes.
         """
         names = tuple(electrodes)
         missing = [name for name in names if name not in self.electrodes]
@@ -187,15 +194,15 @@ class MeasuredPresses:
 
     @property
     def columns(self) -> dict[str, Array]:
-        """Columns of a file of these presses by their names, each of shape (n,).
+        """Columns of a file that contains these presses, by the names of the columns, each of shape (n,).
 
-        A column of temperatures is omitted if it would be empty for every press.
+        A column of temperatures is omitted if the temperatures of all presses are unknown.
         """
         columns = dict(zip(CONTACT, self.contact.T, strict=True))  # x_mm, y_mm and force_N
         columns |= dict(zip(self.electrodes, self.charge_pC.T, strict=True))
         columns |= {"position_std_mm": self.position_std_mm, "force_std": self.force_std}
 
-        # The comparisons with None are only needed by type checkers.
+        # The comparisons with None are redundant, but type checkers need them.
         if self.temperature_C is not None and self.knows_temperature:
             columns[TEMPERATURE] = self.temperature_C
         if self.film_temperature_C is not None and self.knows_film_temperature:
@@ -203,7 +210,11 @@ class MeasuredPresses:
         return columns
 
     def _check_shapes(self) -> None:
-        """Raise PressError if an array does not have one row for each press, or one charge for each electrode."""
+        """Check that all arrays have one row for each press, and that there is one charge for each electrode.
+
+        Raises:
+            PressError: If an array has another shape.
+        """
         press_count = len(self.lines)
         expected_shapes: dict[str, tuple[int, ...]] = {
             "contact": (press_count, len(CONTACT)),
@@ -221,8 +232,13 @@ class MeasuredPresses:
                 raise PressError(f"{name}: expected an array of shape {shape}, got {given_shape}")
 
     def _check_values(self) -> None:
-        """Raise PressError if a number is not allowed, if only one of x and y is given, or if no charge is given."""
-        # The columns have the same rules as in a file, except that all standard deviations must be known.
+        """Check the values of all presses.
+
+        Raises:
+            PressError: If a number is not allowed, if only one of x and y is known, or if no charge of a press is
+                known. Also if the temperature of the film is known, but the temperature of the ring is not.
+        """
+        # The columns have the same rules as the columns of a file, except that all standard deviations must be known.
         rules = PRESS_RULES | dict.fromkeys(self.electrodes, CHARGE_RULE)
         for name in UNCERTAINTY:
             rules[name] = replace(rules[name], may_be_empty=False)
@@ -245,9 +261,17 @@ class MeasuredPresses:
             f"expected a charge of one electrode or more, got none; fill it in or remove the {self.row_noun}",
         )
 
-    def _refuse_first(self, refused: Booleans, reason: str) -> None:
-        """Raise PressError for the first press that a mask selects, if it selects any."""
-        rows = np.flatnonzero(refused)
+    def _refuse_first(self, is_refused: Booleans, reason: str) -> None:
+        """Raise an error if a mask selects at least one press.
+
+        Args:
+            is_refused: The mask, shape (n,).
+            reason: Text after the number of the press in the error message.
+
+        Raises:
+            PressError: For the first selected press.
+        """
+        rows = np.flatnonzero(is_refused)
         if rows.size:
             raise PressError(f"{self.row_noun} {self.lines[rows[0]]}: {reason}")
 
@@ -262,16 +286,16 @@ def read_presses(
     """Read a file of measured presses.
 
     Args:
-        path: CSV in UTF-8, with or without byte order mark; or Parquet, if its name ends in `.parquet`. It may have up
-            to `MAX_ROWS` presses.
-        electrodes: Names of the electrodes, in the requested order of the charges. If absent, all columns without
-            another meaning are electrodes.
-        position_std_mm: Standard deviation of x and of y where the file has none, mm.
-        force_std: Standard deviation of a force where the file has none, relative to the force.
+        path: The file, with up to `MAX_ROWS` presses. It is read as Parquet if its name ends in `.parquet`, and
+            otherwise as CSV in UTF-8, with or without a byte order mark.
+        electrodes: Names of the electrodes, in the requested order of the charges. If None, all columns without another
+            meaning are electrodes.
+        position_std_mm: Standard deviation of x and of y for presses for which the file states none, mm.
+        force_std: Standard deviation of the force for presses for which the file states none, relative to the force.
 
     Raises:
-        PressError: If the file cannot be used. The message names file, line and column, what was expected, what was
-            given and what to do.
+        PressError: If the file cannot be used. The message names the file, the line and the column, and states what was
+            expected, what was given and what the user can do.
         MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
     path = Path(path)
@@ -295,7 +319,7 @@ def read_presses(
     if press_count == 0:
         raise PressError(f"{path}: expected one press or more below the header, got none")
 
-    # Columns that the file does not have become NaN. Missing standard deviations get their default values.
+    # Columns that the file does not have are filled with NaN. Missing standard deviations get their default values.
     absent_column = np.full(press_count, np.nan)
     values = {name: columns.values.get(name, absent_column) for name in (*electrode_names, *PRESS_RULES)}
     for name, std in default_stds.items():
@@ -316,28 +340,35 @@ def read_presses(
 
 
 def _none_if_unknown(temperature_C: Array) -> Array | None:
-    """Return a column of temperatures, shape (n,), degrees Celsius, or None if all temperatures are NaN."""
+    """Return a column of temperatures unchanged; return None instead if all temperatures are unknown.
+
+    Args:
+        temperature_C: Temperatures, shape (n,), degrees Celsius; NaN if unknown.
+    """
     return None if np.isnan(temperature_C).all() else temperature_C
 
 
 def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
-    """Return the names of the columns without another meaning, which are assumed to be electrodes.
+    """Return the names of all columns that are not in `PRESS_RULES`. These columns are assumed to be electrodes.
+
+    Args:
+        table: The table with the header of the file.
 
     Raises:
-        PressError: If the name of a column has several characters and is similar to a name in `PRESS_RULES`. The
-            column is then probably misspelt.
+        PressError: If the name of a column has several characters and is similar to a name in `PRESS_RULES`. The name
+            is then probably misspelt.
     """
     electrodes = tuple(name for name in table.header if name and name not in PRESS_RULES)
-    long_names = [name for name in electrodes if len(name) > 1]
+    long_names = [name for name in electrodes if len(name) > 1]  # short names such as "F" are common electrode names
     table.refuse_similar_names(long_names, PRESS_RULES)
     return electrodes
 
 
 def read_press_list(path: Path) -> Array:
-    """Read the presses that a machine makes, in their order.
+    """Read the positions and forces of presses that a machine will make, in their order.
 
     Args:
-        path: CSV or Parquet file with the columns x_mm, y_mm and force_N; see `read_presses`. Other columns are
+        path: CSV or Parquet file with the columns x_mm, y_mm and force_N; see `read_presses`. All other columns are
             ignored.
 
     Returns:
@@ -356,7 +387,7 @@ def read_press_list(path: Path) -> Array:
         raise PressError(f"{path}: expected one press or more below the header, got none")
     contact = np.column_stack([columns.values[name] for name in CONTACT])
     with error_prefix(f"{path}, ", PressError):
-        # The object is created only because it checks the contacts. Its other values are arbitrary valid values.
+        # The object is created only because its constructor checks the contacts. Its other values are arbitrary.
         MeasuredPresses(
             contact=contact,
             charge_pC=np.zeros((press_count, 1)),
@@ -370,7 +401,9 @@ def read_press_list(path: Path) -> Array:
 
 
 def write_presses(path: Path, presses: MeasuredPresses) -> None:
-    """Write presses to a file from which `read_presses` reads the same numbers. An existing file is replaced.
+    """Write presses to a file. An existing file is replaced.
+
+    All numbers are written with all digits, so `read_presses` reads the same numbers from the file.
 
     Args:
         path: The file. Its format is Parquet if its name ends in `.parquet`, and otherwise CSV.
@@ -387,19 +420,19 @@ def write_presses(path: Path, presses: MeasuredPresses) -> None:
 
 
 def presses_text(presses: MeasuredPresses) -> str:
-    """Return the CSV text that `write_presses` writes."""
+    """Return the text that `write_presses` writes to a CSV file."""
     return csv_text(presses.columns)
 
 
 def row_words(rows: Sequence[int], row_noun: str, max_listed: int = 10) -> str:
-    """Return the lines or rows of presses in a file as text for a message, as in "line 3" or "rows 3, 4 and 12 more".
+    """List the lines or rows of presses for a message, for example as "line 3" or "rows 3, 4 and 12 more".
 
     Args:
-        rows: Numbers of the presses in their file.
-        row_noun: What the numbers count, such as "line", "row" or "press".
-        max_listed: Largest number of presses that are listed. The message only counts the others.
+        rows: Numbers of the lines or rows of the presses in their file.
+        row_noun: What the numbers count: "line", "row" or "press".
+        max_listed: Largest number of presses that are listed. If there are more presses, the text counts the others.
     """
-    plural = f"{row_noun}es" if row_noun.endswith("s") else f"{row_noun}s"
+    plural = f"{row_noun}es" if row_noun.endswith("s") else f"{row_noun}s"  # "presses" and "lines"
     noun = row_noun if len(rows) == 1 else plural
     listed = ", ".join(map(str, rows[:max_listed]))
     if len(rows) <= max_listed:
@@ -408,7 +441,14 @@ def row_words(rows: Sequence[int], row_noun: str, max_listed: int = 10) -> str:
 
 
 def _check_electrodes(electrodes: Collection[str]) -> None:
-    """Raise PressError if names of electrodes cannot be the names of columns in a file of presses."""
+    """Check that the names of electrodes can be the names of columns in a file of presses.
+
+    Args:
+        electrodes: Names of the electrodes.
+
+    Raises:
+        PressError: If there are no names, if there are too many names, or if one of the names is not allowed.
+    """
     are_different = len(set(electrodes)) == len(electrodes)
     has_empty_name = any(name == "" for name in electrodes)
     if not electrodes or not are_different or has_empty_name:

@@ -1,8 +1,9 @@
-"""Names and labels of models.
+"""Types of the names and labels of models.
 
-A name is safe in paths, URLs, pages and config.pbtxt. A label is `NAME/VERSION`, as prediction records carry it. A
-label has one slash and no `..`, so it cannot name a path outside of the user's repositories. A foreign file that
-contains a label can therefore only select one of the user's own models.
+The name of a model consists of characters that are safe in paths, URLs, web pages and the file config.pbtxt. The label
+of a model is `NAME/VERSION`. A label contains one slash and no path component `..`. A label can therefore not be the
+path of a folder outside the repositories of the user. A file from an untrusted source, such as a recording, can only
+select a model in these repositories.
 """
 
 import re

@@ -1,8 +1,8 @@
-"""Reader of the arrays of an npz file that may come from an untrusted source.
+"""Reading of the arrays of an npz file that may come from an untrusted source.
 
-An npz file is a zip archive with one entry in NumPy's npy format for each array. The declared sizes, the compression
-method and the size of the LZMA dictionary are checked before anything is decompressed. A small file therefore cannot
-request much memory. No Python object is ever unpickled.
+An npz file is a zip archive. The archive contains one entry in NumPy's npy format for each array. The declared sizes,
+the compression method and the size of the LZMA dictionary are checked before any entry is decompressed. A small file
+can therefore not cause the allocation of much memory. Arrays that contain pickled Python objects are refused.
 """
 
 import io
@@ -33,7 +33,7 @@ MAX_LZMA_DICTIONARY_BYTES = 16 << 20
 """Largest dictionary of an entry that is compressed with LZMA, bytes. The default of Python is 8 MiB."""
 
 READ_BYTES = 4096
-"""Number of bytes that are decompressed at a time, because a decompressor may return far more than was requested."""
+"""Number of bytes that are requested in one call, because a decompressor may return far more than was requested."""
 
 COMPRESSION_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA)
 """Compression methods that are accepted. NumPy and this project use no others."""
@@ -67,26 +67,29 @@ def npz_arrays(data: bytes, names: Iterable[str] | None = None) -> dict[str, np.
 
     Args:
         data: Bytes of the file.
-        names: Names of the arrays to read; all if absent.
+        names: Names of the arrays that are read. If None, all arrays are read.
+
+    Returns:
+        The arrays by name.
 
     Raises:
-        ValueError: If the file is too large when it is unpacked, or an entry is not an array of numbers or text.
+        ValueError: If an array is missing, the arrays are too large, or an entry is not an array of numbers or text.
         Exception: One of `DAMAGED_FILE_ERRORS`, if the data are damaged.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = _checked_entries(archive)
-        selected = list(entries) if names is None else list(names)
-        missing = [name for name in selected if name not in entries]
-        if missing:
-            raise ValueError(f"the array {missing[0]!r} is missing")
+        selected_names = list(entries) if names is None else list(names)
+        missing_names = [name for name in selected_names if name not in entries]
+        if missing_names:
+            raise ValueError(f"the array {missing_names[0]!r} is missing")
 
-        # These are the sizes that the archive declares. `_decompress` checks that no entry is longer.
-        unpacked_bytes = sum(entries[name].file_size for name in selected)
+        # Add up the sizes that the archive declares. `_decompress` checks that no entry is longer than declared.
+        unpacked_bytes = sum(entries[name].file_size for name in selected_names)
         if unpacked_bytes > MAX_UNPACKED_BYTES:
             raise ValueError(f"the arrays unpack to more than {MAX_UNPACKED_BYTES} bytes")
 
         arrays = {}
-        for name in selected:
+        for name in selected_names:
             if entries[name].compress_type == zipfile.ZIP_LZMA:
                 _check_lzma_dictionary(data, entries[name])
             arrays[name] = _parse_npy(_decompress(archive, entries[name]), name)
@@ -94,15 +97,15 @@ def npz_arrays(data: bytes, names: Iterable[str] | None = None) -> dict[str, np.
 
 
 def finite_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int | None, ...]) -> Array:
-    """Return an array of a file as float64.
+    """Return an array of a file as float64, and check its shape and its values.
 
     Args:
         arrays: Arrays of the file, by name.
         name: Name of the array.
-        shape: Expected shape; None stands for any length of at least one.
+        shape: Expected shape. The length None stands for any length of at least one.
 
     Raises:
-        ValueError: If the array is missing, has another shape, or does not hold finite real numbers.
+        ValueError: If the array is missing, has another shape, or contains values that are not finite real numbers.
     """
     if name not in arrays:
         raise ValueError(f"the array {name!r} is missing")
@@ -119,14 +122,27 @@ def finite_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int |
 
 
 def _has_shape(array: np.ndarray, shape: tuple[int | None, ...]) -> bool:
-    """Return whether an array has the given shape, in which None stands for any length of at least one."""
+    """Return whether an array has the expected shape and is not empty.
+
+    Args:
+        array: The array.
+        shape: Expected shape. The length None stands for any length of at least one.
+    """
     if array.ndim != len(shape):
         return False
     return all(length > 0 and expected in (None, length) for length, expected in zip(array.shape, shape, strict=True))
 
 
 def finite_number(arrays: Mapping[str, np.ndarray], name: str) -> float:
-    """Return the finite number in an array without dimensions; raise ValueError if the array contains none."""
+    """Return the number in an array without dimensions.
+
+    Args:
+        arrays: Arrays of the file, by name.
+        name: Name of the array.
+
+    Raises:
+        ValueError: If the array is missing, has dimensions, or does not contain a finite real number.
+    """
     return float(finite_array(arrays, name, ()))
 
 
@@ -150,10 +166,14 @@ def text_item(arrays: Mapping[str, np.ndarray], name: str) -> str:
 
 
 def _checked_entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """Return the entries of an archive by the names of their arrays.
+    """Check the entries of an archive, and return the entries by the names of their arrays.
+
+    Args:
+        archive: The npz file.
 
     Raises:
-        ValueError: If there are too many entries, two entries with the same name, or an unknown compression method.
+        ValueError: If there are too many entries, two entries with the same name, or an entry with a compression method
+            that is not accepted.
     """
     infos = archive.infolist()
     if len(infos) > MAX_ENTRIES:
@@ -161,7 +181,7 @@ def _checked_entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     entries: dict[str, zipfile.ZipInfo] = {}
     for info in infos:
         name = info.filename.removesuffix(".npy")
-        short_name = name[:100]  # for messages, because the name comes from an untrusted source
+        short_name = name[:100]  # for messages, because a name from an untrusted source may be very long
         if name in entries:
             raise ValueError(f"the array {short_name!r} is there twice")
         if info.compress_type not in COMPRESSION_METHODS:
@@ -171,17 +191,17 @@ def _checked_entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _check_lzma_dictionary(data: bytes, entry: zipfile.ZipInfo) -> None:
-    """Check that an entry that is compressed with LZMA does not request a large dictionary.
+    """Check that the LZMA dictionary of an entry is not too large, because the decompressor allocates its size.
 
     An entry consists of its header, its name, an extra field and its content. The content of an LZMA entry begins with
     the LZMA properties, which contain the size of the dictionary (APPNOTE.TXT of the zip format, 5.8.8).
 
     Args:
         data: Bytes of the archive.
-        entry: The entry.
+        entry: Entry that is compressed with LZMA.
 
     Raises:
-        ValueError: If the dictionary is too large.
+        ValueError: If the dictionary is larger than `MAX_LZMA_DICTIONARY_BYTES`.
     """
     name_length, extra_length = _LOCAL_HEADER.unpack_from(data, entry.header_offset)
     content_offset = entry.header_offset + _LOCAL_HEADER.size + name_length + extra_length
@@ -193,14 +213,15 @@ def _check_lzma_dictionary(data: bytes, entry: zipfile.ZipInfo) -> None:
 
 
 def _decompress(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytearray:
-    """Decompress an entry, and check that it is not longer than the archive declares.
+    """Decompress an entry, and check that the entry is not longer than the archive declares.
 
     Args:
-        archive: The archive.
+        archive: The archive that contains the entry.
         entry: The entry.
 
     Raises:
-        ValueError: If the entry is longer than declared. Decompression stops at the declared length.
+        ValueError: If the entry is longer than declared. Decompression stops as soon as the declared length is
+            exceeded.
     """
     content = bytearray()
     with archive.open(entry) as file:
@@ -212,14 +233,15 @@ def _decompress(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytearray:
 
 
 def _parse_npy(content: bytearray, name: str) -> np.ndarray:
-    """Return the array in the bytes of an npy file, without a copy of its numbers.
+    """Return the array that the bytes of an npy file contain. The array shares the memory of the bytes.
 
     Args:
         content: Bytes of the npy file.
         name: Name of the array, for error messages.
 
     Raises:
-        ValueError: If the version is not supported, the array has Python objects, or its shape does not fit the bytes.
+        ValueError: If the version of the npy format is not supported, the array contains Python objects, or the shape
+            of the array does not fit the number of bytes.
     """
     # Read the header, which contains the shape, the order of the axes in memory, and the type of the numbers.
     header = io.BytesIO(content[: MAX_HEADER_CHARACTERS + PREAMBLE_BYTES])
@@ -233,7 +255,7 @@ def _parse_npy(content: bytearray, name: str) -> np.ndarray:
     if dtype.hasobject:
         raise ValueError(f"{name}: expected numbers or text, got Python objects")
 
-    # Check that the numbers after the header fill the shape.
+    # Check that the bytes after the header have exactly the size of an array of this shape.
     header_bytes = header.tell()
     number_bytes = len(content) - header_bytes
     number_count = math.prod(shape)

@@ -1,11 +1,14 @@
-"""Parsing of numbers in texts from people and devices."""
+"""Parsing of numbers in texts that were written by people or devices."""
 
 
 def parse_number(text: str) -> float:
-    """Parse a number in ASCII notation, including infinity and NaN.
+    """Parse a number in ASCII characters. Infinity and NaN are also accepted.
 
-    Unlike `float`, the function accepts neither underscores, as in `1_0`, nor digits of other scripts. Other programs
-    do not write numbers in this way.
+    Unlike `float`, the function accepts neither underscores, as in `1_0`, nor digits of other scripts, because other
+    programs do not write numbers in these notations.
+
+    Args:
+        text: The number as text, such as "-1.5e3".
 
     Raises:
         ValueError: If the text is not a number.

@@ -1,12 +1,13 @@
-"""Multilayer perceptron with a skip layer: its definition, and its evaluation with NumPy.
+"""Multilayer perceptron with a skip layer: definition, and evaluation with NumPy.
 
-For inputs x, the hidden layers compute h_l = f(h_(l-1) W_l + b_l) with h_0 = x. The output layer computes
-y = h_L V + c + x S. The activation f follows each hidden layer. The skip layer S maps the inputs linearly to the
-outputs, so that the hidden layers only need to learn the nonlinear part. Leading dimensions of the arrays are batch
-dimensions, so that the weights of several perceptrons can be evaluated in one call.
+For inputs x, the hidden layer l computes h_l = f(h_(l-1) W_l + b_l), where h_0 = x and f is the activation function.
+The output layer computes y = h_L V + c + x S from the result h_L of the last hidden layer. The skip layer S maps the
+inputs linearly to the outputs. The hidden layers therefore only need to learn the nonlinear part of the function.
+Leading dimensions of the arrays are batch dimensions. One call can therefore evaluate several perceptrons with
+different weights.
 
-The definition is generic in the type of its arrays. Training evaluates the perceptron with PyTorch tensors
-(`isocharge.train.training.torch_evaluation`), and the ONNX and C exports write it.
+The definition is generic with respect to the type of the arrays. Training evaluates a perceptron with PyTorch tensors
+(`isocharge.train.training.torch_evaluation`). The ONNX export and the C export write a perceptron to a file.
 """
 
 from collections.abc import Sequence
@@ -26,11 +27,11 @@ Values = TypeVar("Values", Array, Singles)
 
 
 class Layer(NamedTuple, Generic[Weights]):
-    """A linear layer: inputs @ weight + bias.
+    """Weights of a linear layer, which computes inputs @ weight + bias.
 
     Attributes:
-        weight: Shape (..., n_input, n_output).
-        bias: Shape (n_output,); (..., 1, n_output) if there are batch dimensions.
+        weight: Matrix of the layer, shape (..., n_input, n_output).
+        bias: Bias of the layer, shape (n_output,), or shape (..., 1, n_output) if there are batch dimensions.
     """
 
     weight: Weights
@@ -42,10 +43,10 @@ class Perceptron(Generic[Weights]):
     """A multilayer perceptron with a skip layer.
 
     Attributes:
-        hidden: Hidden layers, each followed by the activation, from first to last.
+        hidden: Hidden layers, from the first to the last layer. The activation function follows each hidden layer.
         last: Output layer.
-        skip: Weights from the inputs straight to the outputs, shape (..., n_input, n_output).
-        activation: Activation of the hidden layers.
+        skip: Weights of the skip layer from the inputs directly to the outputs, shape (..., n_input, n_output).
+        activation: Activation function of the hidden layers.
     """
 
     hidden: tuple[Layer[Weights], ...]
@@ -55,15 +56,15 @@ class Perceptron(Generic[Weights]):
 
 
 def evaluate_hidden_layers(layers: Sequence[Layer[Any]], activation: Activation, inputs: Values) -> Values:
-    """Apply hidden layers with NumPy, in the float type of the arrays.
+    """Evaluate hidden layers with NumPy, in the floating-point type of the arrays.
 
     Args:
-        layers: Hidden layers, from first to last.
-        activation: Activation of each layer.
-        inputs: Shape (..., n_input).
+        layers: Hidden layers, from the first to the last layer.
+        activation: Activation function, which is applied after each layer.
+        inputs: Inputs of the first layer, shape (..., n_input).
 
     Returns:
-        Output of the last of these layers, shape (..., n_output).
+        Output of the last layer, shape (..., n_output).
     """
     value = inputs
     for layer in layers:
@@ -72,7 +73,7 @@ def evaluate_hidden_layers(layers: Sequence[Layer[Any]], activation: Activation,
 
 
 def evaluate_output_layer(perceptron: Perceptron[Any], hidden_output: Values, inputs: Values) -> Values:
-    """Apply the output layer and the skip layer with NumPy.
+    """Evaluate the output layer and the skip layer of a perceptron with NumPy.
 
     Args:
         perceptron: The perceptron.
@@ -91,7 +92,7 @@ def evaluate(perceptron: Perceptron[Any], inputs: Values) -> Values:
 
     Args:
         perceptron: The perceptron.
-        inputs: Shape (..., n_input).
+        inputs: Inputs of the perceptron, shape (..., n_input).
 
     Returns:
         Outputs, shape (..., n_output).

@@ -1,9 +1,9 @@
-"""Text that is safe to print on a terminal.
+"""Conversion of text to characters that are safe to print on a terminal.
 
 Names and units from boards, headers of files, metadata of models and contents of recordings may contain characters that
 a terminal executes or hides. Examples are escape sequences that move the cursor or change the title of the window,
-marks that reverse the direction of writing, and characters without width. Such characters are replaced by their escape
-sequences in JSON, as in `\\u001b`, so that JSON remains valid.
+marks that reverse the direction of writing, and characters without width. Such characters are replaced by the escape
+sequences that JSON uses, such as `\\u001b`. A text in JSON therefore remains valid JSON.
 """
 
 IGNORABLE_RANGES = (
@@ -16,10 +16,10 @@ IGNORABLE_RANGES = (
     (0xFFA0, 0xFFA0),
     (0xE0100, 0xE01EF),
 )
-"""First and last code point of characters that `str.isprintable` accepts although they are invisible.
+"""Ranges of invisible characters that `str.isprintable` accepts, each as the first and the last code point.
 
-These characters have the property Default_Ignorable_Code_Point (Unicode 15, DerivedCoreProperties.txt), but they are
-letters or marks, which `str.isprintable` accepts.
+These characters have the property Default_Ignorable_Code_Point (Unicode 15, DerivedCoreProperties.txt). They are
+letters or marks, and `str.isprintable` accepts all letters and marks.
 """
 
 INVISIBLE = frozenset(chr(code) for first, last in IGNORABLE_RANGES for code in range(first, last + 1))
@@ -30,14 +30,17 @@ SHORT_ESCAPES = {"\n": r"\n", "\r": r"\r", "\t": r"\t"}
 
 
 def is_printable(text: str) -> bool:
-    """Return whether a text contains no character that a terminal executes or hides."""
+    """Return whether all characters of a text are visible characters or blanks.
+
+    The result is False if the text contains a character that a terminal would execute or hide.
+    """
     return text.isprintable() and INVISIBLE.isdisjoint(text)
 
 
 def printable(text: str) -> str:
     """Escape all characters of a text that a terminal would execute or hide, including line feeds.
 
-    Use this function for text from other sources within a line, such as the name of a channel.
+    Use this function for text that is inserted into a line, such as the name of a channel.
 
     Example:
         >>> print(printable("A\\x1b[2J\\u202e"))
@@ -49,12 +52,15 @@ def printable(text: str) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """Escape all characters of a text that a terminal would execute or hide, except for line feeds."""
+    """Escape all characters of a text that a terminal would execute or hide, but keep the line feeds."""
     return "\n".join(map(printable, text.split("\n")))
 
 
 def _escape(character: str) -> str:
-    """Return the escape sequence of a character in JSON. A character beyond U+FFFF has two sequences, as in UTF-16."""
+    """Return the escape sequence that JSON uses for a character.
+
+    JSON escapes the code units of UTF-16. A character beyond U+FFFF has two code units, and therefore two sequences.
+    """
     if character in SHORT_ESCAPES:
         return SHORT_ESCAPES[character]
     utf16 = character.encode("utf-16-be", "surrogatepass")  # a single surrogate is accepted, too

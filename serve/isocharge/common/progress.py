@@ -1,7 +1,7 @@
-"""Progress of long computations.
+"""Reporting of the progress of long computations.
 
-A computation reports its progress to a listener. The listener is stored in a context variable, so that functions do not
-need an additional argument to pass it on.
+A computation reports its progress to a function that is called the listener. The listener is stored in a context
+variable. The functions of a computation therefore need no additional argument for the listener.
 """
 
 import threading
@@ -21,7 +21,10 @@ _listener: ContextVar[Listener | None] = ContextVar("progress", default=None)
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Call `listener` with the progress of all work inside the block, in this thread.
+    """Pass the progress that the present thread reports in the `with` block to a listener.
+
+    Args:
+        listener: Function that is called with the arguments of `report` for each report.
 
     Example:
         >>> with listening(lambda title, done, total, note: print(f"{title}: {done} of {total}")):
@@ -37,13 +40,13 @@ def listening(listener: Listener) -> Iterator[None]:
 
 
 def report(title: str, done: int, total: int, note: str = "") -> None:
-    """Report the progress of a piece of work to the listener, if there is one.
+    """Report the progress of a computation to the listener. If there is no listener, do nothing.
 
     Args:
-        title: Title of the work for people, such as "solving the film".
+        title: Title of the computation for the user, such as "solving the film".
         done: Number of finished items.
         total: Number of all items.
-        note: Further text for people.
+        note: Additional text for the user.
     """
     listener = _listener.get()
     if listener:
@@ -52,38 +55,43 @@ def report(title: str, done: int, total: int, note: str = "") -> None:
 
 @contextmanager
 def second_thread() -> Iterator[Executor]:
-    """Run calls in a second thread, and report the progress of these calls to the listener of this thread.
+    """Provide an executor with one thread whose calls report their progress to the listener of the present thread.
 
-    The end of the block waits for all calls. If the block raises an exception, waiting calls are cancelled, and the
-    running call ends with a `CancelledError` at its next report.
+    At the end of the `with` block, the executor waits for all calls. If the block raises an exception, calls that have
+    not started are cancelled, and the running call ends with a `CancelledError` when it next reports its progress.
+
+    Yields:
+        The executor.
     """
     listener = _listener.get()
-    is_stopped = threading.Event()
+    has_failed = threading.Event()  # is set when the block has raised an exception
 
-    def report_until_stopped(title: str, done: int, total: int, note: str) -> None:
-        """Pass the progress on to the listener, or end the running call if the block has raised an exception."""
-        if is_stopped.is_set():
+    def report_unless_failed(title: str, done: int, total: int, note: str) -> None:
+        """Pass the progress on to the listener. If the block has raised an exception, end the running call."""
+        if has_failed.is_set():
             raise CancelledError
         if listener:
             listener(title, done, total, note)
 
     # The listener is a context variable, which a new thread does not inherit. The initializer sets it in the thread.
-    with ThreadPoolExecutor(1, initializer=_listener.set, initargs=(report_until_stopped,)) as executor:
+    with ThreadPoolExecutor(1, initializer=_listener.set, initargs=(report_unless_failed,)) as executor:
         try:
             yield executor
         except BaseException:
-            is_stopped.set()
+            has_failed.set()
             executor.shutdown(wait=False, cancel_futures=True)
             raise  # the end of the `with` block then waits for the running call
 
 
 def track(items: Iterable[Item], title: str, total: int | None = None) -> Iterator[Item]:
-    """Yield the items and report the progress. An item counts as done when the next item is requested.
+    """Yield items, and report the progress after each item.
+
+    An item counts as finished when the caller requests the next item.
 
     Args:
-        items: The items of the work.
-        title: Title of the work for people, such as "solving the film".
-        total: Number of items; it may be absent if the items have a length.
+        items: The items that the caller processes.
+        title: Title of the computation for the user, such as "solving the film".
+        total: Number of items. It may be None if `items` has a length.
     """
     count = len(items) if total is None else total  # type: ignore[arg-type]
     for done, item in enumerate(items, start=1):

@@ -1,10 +1,14 @@
-"""Runs that can be stopped and resumed. The finished parts of a run are stored next to the folder that the run writes.
+"""Runs of long computations that can be stopped and resumed.
+
+The file or folder that a run writes is called the target. The finished parts of a run are stored in the draft, which is
+a folder next to the target. The draft of the target `presses` has the following files.
 
     presses.part/
-        run.json           settings of the run; a run with other settings does not use the folder
-        lock               locked by the running process; the operating system unlocks it if the process is killed
-        parts/<name>       finished part, and <name>.sha256
-        data/<name>        file of the final folder, whose checksum is in parts/
+        run.json              settings of the run; a run with other settings does not use the draft
+        lock                  locked by the running process; the operating system unlocks it if the process is killed
+        parts/<name>          finished part
+        parts/<name>.sha256   checksum of the finished part
+        data/<name>           finished part that is a file of the target; its checksum is also in parts/
 
 A part is used only if its checksum exists and matches. All other parts are computed again.
 """
@@ -46,15 +50,20 @@ MAX_PART_BYTES = 1 << 30
 
 
 class ResumableRun:
-    """Stored parts of a run; see `resume_folder`.
+    """The draft of a run, which stores the finished parts. `resume_folder` and `resume_parts` create it.
 
     Attributes:
-        target: Folder that the run writes.
-        folder: Draft folder, which contains the parts until the run is finished.
-        data: Folder in the draft that becomes the target.
+        target: File or folder that the run writes.
+        folder: Folder of the draft, which contains the parts until the run is finished.
+        data: Folder in the draft that `publish` renames to the target.
     """
 
     def __init__(self, target: Path) -> None:
+        """Store the paths. Nothing is created.
+
+        Args:
+            target: File or folder that the run writes.
+        """
         self.target = target
         self.folder = draft_of(target)
         self.data = self.folder / "data"
@@ -69,8 +78,9 @@ class ResumableRun:
             final: Whether the part is a file of the target.
 
         Raises:
-            OutputError: If the part cannot be written. Parts that were saved before remain.
+            OutputError: If the part cannot be written. Parts that were saved before remain unchanged.
         """
+        # The checksum is written last. A part without a checksum is therefore not finished.
         with output_errors(self.target):
             write_whole(self._path(name, final), data)
             write_whole(self._parts / f"{name}.sha256", sha256_of(data).encode())
@@ -80,14 +90,15 @@ class ResumableRun:
 
         Args:
             name: Name of the part.
-            decode: Function from the bytes of the part to its content. It may raise any error if the part is damaged.
+            decode: Function that converts the bytes of the part to its content. If the part is damaged, the function
+                may raise any exception.
             final: Whether the part is a file of the target.
 
         Returns:
-            The content; None if the part is not finished. If the part is damaged, a warning is logged and the result
+            The content; None if the part is not finished. If the part is damaged, a warning is logged, and the result
             is None.
         """
-        # The file with the checksum is written after the part. A part without this file is not finished.
+        # A part without a checksum is not finished, because `save` writes the checksum last.
         try:
             checksum = read_whole(self._parts / f"{name}.sha256").decode()
         except (OSError, UnicodeDecodeError):
@@ -103,19 +114,20 @@ class ResumableRun:
             return None
 
     def storing_executor(self, name: str, executor: Executor | None = None) -> Executor:
-        """Return an executor that stores the results of its tasks as parts of the run, and loads finished parts.
+        """Return an executor that stores the result of each task as a part of the run.
 
-        The results must be arrays of numbers. The tasks are numbered in the order of their submission. A resumed run
-        must therefore submit the same tasks in the same order.
+        If an earlier run has stored the result of a task, the result is loaded instead. The results must be arrays of
+        numbers. The parts are numbered in the order in which the tasks are submitted. A resumed run must therefore
+        submit the same tasks in the same order.
 
         Args:
-            name: Beginning of the names of the parts.
-            executor: Executor that runs the tasks; None runs the tasks in this process.
+            name: Text with which the names of the parts begin.
+            executor: Executor that computes the tasks. If None, the tasks are computed in this process.
         """
         return _StoringExecutor(self, name, executor)
 
     def is_empty(self) -> bool:
-        """Return whether no part is finished."""
+        """Return whether the draft contains no finished part."""
         return not any(self._parts.glob("*.sha256"))
 
     def _path(self, name: str, final: bool) -> Path:
@@ -123,7 +135,7 @@ class ResumableRun:
         return (self.data if final else self._parts) / name
 
     def prepare(self) -> None:
-        """Create the folders, and remove files that a killed process had not finished writing."""
+        """Create the folders of the draft, and remove incomplete files that a killed process has left."""
         with output_errors(self.target):
             for folder in (self._parts, self.data):
                 folder.mkdir(exist_ok=True)
@@ -131,41 +143,58 @@ class ResumableRun:
                     incomplete_file.unlink()
 
     def publish(self) -> None:
-        """Rename the folder `data` to the target, and remove the draft.
+        """Rename the folder `data` of the draft to the target, and remove the rest of the draft.
 
-        The folders are flushed to disk, so that the data and the renaming survive a power failure.
+        The folders are flushed to disk, so that the files and their new names survive a power failure.
+
+        Raises:
+            OutputExists: If the target exists.
+            OutputError: If the folder cannot be renamed.
         """
         with output_errors(self.target):
             flush_to_disk(self.data)
             refuse_existing(self.target)
             self.data.rename(self.target)
-            with suppress(OSError):  # an error here does not matter, because the target is complete
+            with suppress(OSError):  # the target is complete even if this fails
                 flush_to_disk(self.target.parent)
         self.remove()
 
     def remove(self) -> None:
-        """Remove the draft with all its parts."""
+        """Remove the folder of the draft with all parts."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
 class _StoringExecutor(Executor):
-    """Executor of `ResumableRun.storing_executor`."""
+    """Executor that stores the result of each task as a part of a run; see `ResumableRun.storing_executor`."""
 
     def __init__(self, run: ResumableRun, name: str, executor: Executor | None) -> None:
+        """Store the arguments, which `ResumableRun.storing_executor` describes.
+
+        Args:
+            run: Run that stores the results.
+            name: Text with which the names of the parts begin.
+            executor: Executor that computes the tasks. If None, the tasks are computed in this process.
+        """
         self._run = run
         self._name = name
         self._executor = executor
-        self._submitted = 0
+        self._submitted_count = 0
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Submit a task whose result is stored as a part of the run, and return its future.
+        """Submit a task whose result is stored as a part of the run, and return the future of the stored result.
 
-        If an earlier run has stored the result, the result is loaded. Otherwise the other executor computes the task.
-        If there is no other executor, the task is computed before this method returns. The result is then stored.
+        If an earlier run has stored the result, the result is loaded. If not, the executor that was given to the
+        constructor computes the task. If the constructor was given no executor, the task is computed before this method
+        returns.
+
+        Args:
+            function: Function that computes the result, an array of numbers.
+            args: Positional arguments of the function.
+            kwargs: Keyword arguments of the function.
         """
-        part_name = f"{self._name}-{self._submitted:04d}.npy"  # parts are numbered in the order of submission
-        self._submitted += 1
-        stored_future: Future[Any] = Future()  # is done when the result is stored
+        part_name = f"{self._name}-{self._submitted_count:04d}.npy"  # parts are numbered in the order of submission
+        self._submitted_count += 1
+        stored_future: Future[Any] = Future()  # it is done when the result is stored
         loaded_result = self._run.load(part_name, _decode_array)
         if loaded_result is not None:
             stored_future.set_result(loaded_result)
@@ -176,23 +205,24 @@ class _StoringExecutor(Executor):
         else:
             task_future = self._executor.submit(function, *args, **kwargs)
             task_future.add_done_callback(lambda _: self._store(part_name, task_future, stored_future))
-            # If the caller cancels the future that it holds, the computation is cancelled as well.
+            # If the caller cancels the returned future, the task is also cancelled.
             stored_future.add_done_callback(lambda _: task_future.cancel())
         return stored_future
 
     def _store(self, part_name: str, task_future: Future[Any], stored_future: Future[Any]) -> None:
-        """Store the result of a task, and set it as the result of the future that `submit` returned.
+        """Store the result of a task, and set the result of the future that `submit` has returned.
+
+        If computing or storing the result has failed, the exception is set instead.
 
         Args:
-            part_name: Name of the part in which the result is stored.
+            part_name: Name of the part as which the result is stored.
             task_future: Future of the task, which is done or cancelled.
-            stored_future: Future that `submit` has returned. It gets the result, or the error of the task or of the
-                storing.
+            stored_future: Future that `submit` has returned.
         """
         if task_future.cancelled():
             stored_future.cancel()
 
-        # The caller may also have cancelled the future. From this call on, it can no longer be cancelled.
+        # The caller may also have cancelled the returned future. After this call, the future cannot be cancelled.
         is_cancelled = not stored_future.set_running_or_notify_cancel()
         if is_cancelled:
             return
@@ -200,12 +230,19 @@ class _StoringExecutor(Executor):
             result = task_future.result()
             self._run.save(part_name, _encode_array(result))
             stored_future.set_result(result)
-        except BaseException as error:  # the error is raised where the result is requested
+        except BaseException as error:  # `stored_future.result()` raises it again
             stored_future.set_exception(error)
 
 
 def _decode_array(data: bytes) -> Array:
-    """Return the array of numbers in the bytes of an npy file; raise ValueError if there is none."""
+    """Return the array of numbers that the bytes of an npy file contain.
+
+    Args:
+        data: Bytes of the npy file.
+
+    Raises:
+        ValueError: If the bytes are not an npy file, or the array does not contain numbers.
+    """
     array = np.load(io.BytesIO(data), allow_pickle=False)
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         raise ValueError(f"expected an array of numbers, got {getattr(array, 'dtype', 'an archive')}")
@@ -213,23 +250,29 @@ def _decode_array(data: bytes) -> Array:
 
 
 def _encode_array(array: Array) -> bytes:
-    """Return the bytes of an npy file with an array."""
+    """Return the bytes of an npy file that contains the array."""
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()
 
 
 def draft_of(target: Path) -> Path:
-    """Return the draft folder of a target."""
+    """Return the path of the draft of a run that writes the target."""
     path_with_name = target if target.name else target.absolute()  # the path "." has no name
     return path_with_name.parent / f"{path_with_name.name}.part"
 
 
 def refuse_finished(target: Path) -> None:
-    """Raise OutputExists if the target exists.
+    """Check that the target does not exist.
 
-    If a process is killed after it has renamed its data to the target, the rest of its draft remains. This function
-    removes the rest.
+    If a process was killed directly after it had renamed its data to the target, a part of the draft remains. This part
+    is also removed.
+
+    Args:
+        target: File or folder that the run writes.
+
+    Raises:
+        OutputExists: If the target exists.
     """
     draft = ResumableRun(target)
     if target.exists() and (draft.folder / "run.json").is_file() and not draft.data.exists():
@@ -239,18 +282,18 @@ def refuse_finished(target: Path) -> None:
 
 @contextmanager
 def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
-    """Begin a run, or resume a run that was stopped. The target folder is created when the block ends without an error.
+    """Begin or resume a run in the `with` block. At the end of the block, the draft becomes the target folder.
 
-    After an error, the draft is kept for the next run. The draft is removed if no part is finished, or if the same
-    error would occur again.
+    If the block raises an exception, the draft is kept for the next run, unless it contains no finished part, or the
+    next run would fail with the same error.
 
     Args:
         target: Folder that the run writes.
-        identity: All settings on which the result depends, as JSON.
-        fresh: Whether to delete an earlier draft.
+        identity: All settings on which the result depends. They must be values that JSON can represent.
+        fresh: Whether a draft of an earlier run is removed first.
 
     Yields:
-        The draft. The block writes the files of the target into its folder `data`.
+        The draft. The block writes the files of the target into the folder `data` of the draft.
 
     Raises:
         OutputExists: If the target exists, or the draft belongs to a run with other settings or is in use.
@@ -263,16 +306,15 @@ def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fa
 
 @contextmanager
 def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
-    """Begin or resume a run whose block writes the target itself, for example as a single file.
+    """Begin or resume a run in the `with` block, which writes the target itself, for example as a single file.
 
-    The finished parts of the run are stored in a folder beside the target, which is called the draft. The draft is
-    removed when the block ends without an error. After an error, the draft is kept for the next run, unless no part is
-    finished or the same error would occur again.
+    The draft is removed at the end of the block. If the block raises an exception, the draft is kept for the next run,
+    unless it contains no finished part, or the next run would fail with the same error.
 
     Args:
         target: File or folder that the run writes.
-        identity: All settings on which the result depends, as JSON.
-        fresh: Whether to delete an earlier draft.
+        identity: All settings on which the result depends. They must be values that JSON can represent.
+        fresh: Whether a draft of an earlier run is removed first.
 
     Yields:
         The draft, which stores the finished parts.
@@ -285,7 +327,7 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
     draft = ResumableRun(target)
     missing_parents = [parent for parent in target.parents if not parent.exists()]
     try:
-        identity_as_saved = json.loads(json.dumps(identity))  # with lists in place of tuples, as in the saved file
+        identity_as_saved = json.loads(json.dumps(identity))  # tuples become lists, as in the saved file
         with _claim(draft, identity_as_saved, fresh):
             try:
                 draft.prepare()
@@ -297,29 +339,33 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
                     draft.remove()
                 raise
     finally:
-        remove_empty(missing_parents)  # they were created for the draft, and are empty if it was removed
+        remove_empty(missing_parents)  # they were created for the draft, and are empty if the draft was removed
 
 
 @contextmanager
 def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterator[None]:
-    """Lock the draft of a run during the block, and create the draft if necessary.
+    """Lock the draft of a run for the `with` block, and create the draft if it does not exist.
 
-    The folder of a draft contains a lock file, and a file `run.json` with the settings of the run.
+    The folder of the draft contains a lock file, and the file `run.json` with the settings of the run.
 
     Args:
-        draft: The run.
+        draft: The draft.
         identity: Settings of the run. A draft with other settings is refused.
         fresh: Whether an existing draft is removed first.
+
+    Raises:
+        OutputExists: If the draft belongs to a run with other settings, or is used by another process.
+        OutputError: If the draft cannot be created.
     """
     folder = draft.folder
     is_draft = (folder / "run.json").is_file()  # any other folder is never removed
     if fresh and is_draft:
-        with locked(folder / "lock"):  # refuses a draft that another process is using
+        with locked(folder / "lock"):  # raises an error if another process is using the draft
             draft.remove()
     is_new = not folder.exists()
     try:
         if is_new:
-            # The folder appears with both files at once, even if the process is killed in between.
+            # The folder appears only with both files, even if the process is killed meanwhile.
             with new_folder(folder) as temporary:
                 (temporary / "lock").touch()
                 write_whole(temporary / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
@@ -327,19 +373,25 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
             _check_same_run(folder, identity)
             yield
     except KeyboardInterrupt:
-        if is_new and draft.is_empty():  # the user has stopped the run before `resume_parts` could remove the draft
+        if is_new and draft.is_empty():  # the interruption may have occurred before `resume_parts` entered its `try`
             draft.remove()
         raise
 
 
 def output_errors(target: Path) -> AbstractContextManager[None]:
-    """Convert an OSError that the block raises to an OutputError, whose message states how to resume the run."""
+    """Return a context manager that converts an OSError to an OutputError whose message states how to resume the run.
+
+    Args:
+        target: File or folder that the run writes.
+    """
     return as_output_errors(target, f"repeat the command to resume from {draft_of(target)}, or choose another output")
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Lock a folder against other processes during the block. The system unlocks the folder if this process is killed.
+    """Lock a folder for the `with` block, so that no other process can lock the folder.
+
+    The operating system unlocks the folder if this process is killed.
 
     Args:
         path: The folder, or a lock file in the folder.
@@ -355,7 +407,7 @@ def locked(path: Path) -> Iterator[None]:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT)
     try:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises an error at once if it is locked
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises an error at once instead of waiting
         except BlockingIOError as error:
             raise OutputExists(
                 f"another process is at work in {folder}; wait for it, or choose another output"
@@ -366,24 +418,24 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
-    """Check that a draft belongs to a run with the same settings.
+    """Check that a draft belongs to a run with the same settings as the present run.
 
     Args:
         folder: Folder of the draft.
         identity: Settings of the present run.
 
     Raises:
-        OutputExists: If the settings differ or cannot be read.
+        OutputExists: If the settings in the draft differ or cannot be read.
     """
     try:
-        saved = read_json(folder / "run.json", "the settings of a run", InputError, dict[str, Any])
+        saved_identity = read_json(folder / "run.json", "the settings of a run", InputError, dict[str, Any])
     except InputError as error:
         raise OutputExists(
             f"{folder} is in the way: it holds no run.json that can be read; choose another output or remove it"
         ) from error
-    # The comparison of texts also distinguishes 1, 1.0 and true, which are equal in Python.
-    if json.dumps(saved, sort_keys=True) != json.dumps(identity, sort_keys=True):
-        differences = "; ".join(_differences(saved, identity))
+    # The settings are compared as texts, because Python values such as 1, 1.0 and True would be equal.
+    if json.dumps(saved_identity, sort_keys=True) != json.dumps(identity, sort_keys=True):
+        differences = "; ".join(_differences(saved_identity, identity))
         raise OutputExists(
             f"{folder} holds the unfinished run of other settings: {differences}; finish that with its own command, "
             "choose another output, or begin again (--fresh, which throws it away)"
@@ -391,14 +443,15 @@ def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
 
 
 def _differences(saved: Any, current: Any, name: str = "") -> Iterator[str]:
-    """Yield descriptions of the settings in which two runs differ.
+    """Yield a description of each setting in which an unfinished run differs from the present run.
 
-    Only the innermost settings that differ are described. A setting that one of the runs does not have counts as None.
+    If a setting is a table, the settings in the table are compared one by one. If one of the runs does not have a
+    setting, the setting counts as None.
 
     Args:
-        saved: Settings of the unfinished run, or a part of them.
-        current: Settings of the present run, or the same part of them.
-        name: Name of this part; empty for all settings.
+        saved: All settings of the unfinished run, or one of them.
+        current: All settings of the present run, or the same one of them.
+        name: Name of the setting that is compared; empty for all settings.
     """
     if isinstance(saved, dict) and isinstance(current, dict):
         for key in sorted(saved.keys() | current.keys()):

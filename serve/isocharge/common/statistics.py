@@ -1,4 +1,4 @@
-"""Root mean square of an array."""
+"""Statistics of arrays that several packages use."""
 
 import numpy as np
 

@@ -1,20 +1,24 @@
 """Stress of a round film under a round probe as a Chebyshev series, and the file that stores the series.
 
 The film is round and elastically isotropic, so every press is a rotated press on the x axis. A disk automorphism maps
-rings about the origin to rings about the probe (see `isocharge.common.deflection_field`). Let z be a point of the film
-before the automorphism, in film radii, and let s0 be the ring that becomes the edge of the probe:
+rings around the origin to rings around the probe (see `isocharge.common.deflection_field`). Let z be a point of the
+film before the automorphism, in film radii. Let s0 be the radius of the ring that the automorphism maps to the edge of
+the probe:
 
     s0 = tanh((atanh(p + r) - atanh(p - r)) / 2),
 
-where p is the distance of the probe from the centre and r is its radius, both in film radii. The logarithm of
-s11 + s22, the sum of the two normal stresses, is a smooth function on either side of the edge of the probe:
+where p is the distance of the probe from the centre and r is the radius of the probe, both in film radii. Let s11 and
+s22 be the normal stresses. The function ln(s11 + s22) is smooth under the probe, and also smooth outside the probe. One
+series describes the function under the probe, and another series describes the function outside the probe:
 
-    ln(s11 + s22) = sum c_ijkm T_i(p') T_j(l') T_k(u) T_m(cos(arg z)),
+    ln(s11 + s22) = sum c_ijkm T_i(p') T_j(l') T_k(u) T_m(cos(arg z)).
 
-where T are Chebyshev polynomials, p' is the distance and l' is the logarithm of the force, both scaled to [-1, 1]. The
-argument u is 2 (|z| / s0)^2 - 1 under the probe. Outside of the probe, u is ln|z|, scaled linearly so that s0 becomes
--1 and `max_ring` becomes 1. An electrode of area A on a film with d31 = d32 collects the charge d31 * A * mean(s11 +
-s22). The package `simulate` writes the file, and the playground computes charges from it.
+Here T are Chebyshev polynomials, p' is the distance of the probe, and l' is the logarithm of the force, both scaled to
+[-1, 1]. Under the probe, the argument u is 2 (|z| / s0)^2 - 1. Outside the probe, u is a linear function of ln|z| that
+is -1 at s0 and 1 at `max_ring`.
+
+An electrode of area A on a film with d31 = d32 collects the charge d31 * A * mean(s11 + s22). The package `simulate`
+writes the file, and the playground computes charges from the file.
 """
 
 import base64
@@ -40,16 +44,17 @@ N_AXES = 4
 
 @dataclass(frozen=True)
 class StressSeries:
-    """Stress of one film under one probe.
+    """Stress of one film under one probe, as the coefficients of two Chebyshev series.
 
     Attributes:
-        film: Properties of the film by `isocharge.common.deflection_field.FILM_KEYS`.
+        film: Properties of the film, with the keys `isocharge.common.deflection_field.FILM_KEYS`.
         probe_radius_mm: Radius of the round probe, mm.
         max_distance_mm: Largest distance of the probe from the centre, mm.
         force_range_N: Smallest and largest force, N.
-        max_ring: Largest |z| of the series, in film radii.
-        inner: Coefficients under the probe, shape (n_distance, n_force, n_ring, n_angle); the stress is in MPa.
-        outer: Coefficients outside of the probe, of the same kind.
+        max_ring: Largest |z| for which the series is valid, in film radii.
+        inner: Coefficients of the series under the probe, shape (n_distance, n_force, n_ring, n_angle). The series
+            describes the logarithm of the stress in MPa.
+        outer: Coefficients of the series outside the probe, with the same axes as `inner`.
     """
 
     film: Mapping[str, float]
@@ -61,11 +66,15 @@ class StressSeries:
     outer: Array
 
     def fits(self, film: Any) -> bool:
-        """Return whether the film that a sensor file describes has the same properties as the film of this series."""
+        """Return whether a film has the same properties as the film of this series.
+
+        Args:
+            film: The film as a sensor file describes it. If it is not a table, the result is False.
+        """
         return is_same_film(film, self.film)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of the file."""
+        """Return the content of the file in which the series is stored."""
         return {
             "isocharge_stress": VERSION,
             "film": dict(self.film),
@@ -80,6 +89,9 @@ class StressSeries:
 
 def read_stress_series(path: Path) -> StressSeries:
     """Read a stress series from its file.
+
+    Args:
+        path: The file.
 
     Raises:
         InputError: If the file cannot be read, is damaged, or has an unsupported version.
@@ -97,7 +109,10 @@ def read_stress_series(path: Path) -> StressSeries:
 
 
 class _Table(Struct):
-    """Coefficients in a file: their shape, and the numbers as little-endian float32 in base64."""
+    """Array of coefficients as it is stored in the file.
+
+    The key `data` contains the coefficients as little-endian float32 numbers, encoded in base64.
+    """
 
     shape: tuple[int, ...]
     data: bytes
@@ -105,18 +120,18 @@ class _Table(Struct):
     def __post_init__(self) -> None:
         if len(self.shape) != N_AXES or min(self.shape) < 1:
             raise WrongKey("shape", f"{N_AXES} numbers from 1", list(self.shape))
-        expected = 4 * int(np.prod(self.shape))
-        if len(self.data) != expected:
-            raise WrongKey("data", f"{expected} bytes in base64", len(self.data))
+        expected_bytes = 4 * int(np.prod(self.shape))  # four bytes for each float32 number
+        if len(self.data) != expected_bytes:
+            raise WrongKey("data", f"{expected_bytes} bytes in base64", len(self.data))
 
     @property
     def coefficients(self) -> Array:
-        """The coefficients as an array."""
+        """The coefficients as an array of float64."""
         return np.frombuffer(self.data, "<f4").reshape(self.shape).astype(float)
 
 
 class _File(Struct):
-    """Content of the file."""
+    """Content of the file of a stress series."""
 
     isocharge_stress: int
     film: dict[str, Finite]
@@ -133,6 +148,6 @@ class _File(Struct):
 
 
 def _to_table(coefficients: Array) -> dict[str, Any]:
-    """Return coefficients as they are stored in the file."""
+    """Convert an array of coefficients to the form in which the file stores them; see `_Table`."""
     data = coefficients.astype("<f4").tobytes()
     return {"shape": list(coefficients.shape), "data": base64.b64encode(data).decode()}

@@ -1,11 +1,11 @@
-"""Decoding of TOML and JSON into typed structs with msgspec, with error messages that name the key.
+"""Decoding of TOML and JSON into typed structs with msgspec.
 
 The attributes of a `Settings` class are the keys of a file. The types and bounds of the attributes define the allowed
-values. A missing key has the default of its attribute. Error messages state what was expected, and
-`Meta(description="[x, y] in mm")` replaces the words after "expected". Conditions that a type cannot express are
-checked in `__post_init__`, which raises `WrongKey`.
+values. If a key is missing, its attribute has the default value. Error messages name the wrong key and state what was
+expected. A description such as `Meta(description="[x, y] in mm")` replaces the words after "expected". Conditions that
+a type cannot express are checked in `__post_init__`, which raises `WrongKey`.
 
-Example of a table and its reader:
+The following example defines a table and reads it from a file:
 
     class FilmTable(Settings, frozen=True):
         radius_mm: Positive
@@ -13,7 +13,7 @@ Example of a table and its reader:
 
     film = read_toml(path, "a film", SensorError, FilmTable)
 
-Examples of error messages, which all have the same form:
+Error messages have one of the following forms:
 
     mine.toml: film.radius_mm: expected a positive number, got -45
     mine.toml: unknown key 'film.radius'; did you mean 'radius_mm'? Known are radius_mm, poisson
@@ -41,20 +41,23 @@ MAX_FLOAT = sys.float_info.max
 """Largest finite number."""
 
 MAX_TOML_BYTES = 1 << 18
-"""Largest size of a TOML file, bytes. It is small, because Python reads TOML a hundred times slower than JSON."""
+"""Largest size of a TOML file, bytes. The limit is low, because Python reads TOML a hundred times slower than JSON."""
 
 MAX_JSON_BYTES = 1 << 22
 """Largest size of a JSON file, bytes."""
 
 MAX_EXAMINED_ITEMS = 1000
-"""Number of items of a list that are examined for an error.
+"""Number of items of a list that are examined in the search for a mistake.
 
-For errors in later items, the message of msgspec is used.
+If only a later item is wrong, the message of msgspec is used.
 """
 
 _KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
 _DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY_PART}\.[ \t]*+){{32}}")
-"""Dotted key of more than 32 parts, which is refused because Python's memory grows with the square of their number."""
+"""Dotted key of more than 32 parts.
+
+Such keys are refused, because the memory that Python needs grows with the square of the number of parts.
+"""
 
 Finite = Annotated[float, Meta(ge=-MAX_FLOAT, le=MAX_FLOAT)]
 NotNegative = Annotated[float, Meta(ge=0.0, le=MAX_FLOAT)]
@@ -64,16 +67,19 @@ Text = Annotated[str, Meta(min_length=1, max_length=1000)]
 
 
 class Settings(Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of a file in which unknown keys are errors. Each subclass must repeat `frozen=True` for type checkers."""
+    """Base class for a table of a file in which unknown keys are errors.
+
+    Each subclass must repeat `frozen=True`, because type checkers require it.
+    """
 
 
 class WrongKey(ValueError):
-    """Error of `__post_init__` in a struct: a value is wrong, or a key is missing.
+    """Exception that `__post_init__` of a struct raises if the value of a key is wrong, or if a key is missing.
 
     Args:
         key: Name of the key.
         expected: Description of the expected value; empty if the key is missing.
-        got: The given value.
+        got: The value of the key in the file.
     """
 
     def __init__(self, key: str, expected: str = "", got: object = None) -> None:
@@ -82,25 +88,31 @@ class WrongKey(ValueError):
 
 
 def read_toml(path: Path, what: str, error: type[InputError], kind: type[T]) -> T:
-    """Read a TOML file.
+    """Read a TOML file, and convert its content to a type.
 
     Args:
         path: The file.
         what: Description of the expected file for error messages, such as "a device file".
-        error: Class of the error if the file cannot be read or its content is wrong.
-        kind: Type of the content; `dict[str, Any]` for any table.
+        error: Class of the error that is raised.
+        kind: Type to which the content is converted; `dict[str, Any]` for any table.
+
+    Raises:
+        error: If the file cannot be read or its content is wrong.
     """
     return parse_toml(_text(path, MAX_TOML_BYTES, what, "TOML", error), str(path), error, kind)
 
 
 def read_json(path: Path, what: str, error: type[InputError], kind: type[T]) -> T:
-    """Read a JSON file.
+    """Read a JSON file, and convert its content to a type.
 
     Args:
         path: The file.
         what: Description of the expected file for error messages, such as "a device file".
-        error: Class of the error if the file cannot be read or its content is wrong.
-        kind: Type of the content; `dict[str, Any]` for any object.
+        error: Class of the error that is raised.
+        kind: Type to which the content is converted; `dict[str, Any]` for any object.
+
+    Raises:
+        error: If the file cannot be read or its content is wrong.
     """
     return parse_json(_text(path, MAX_JSON_BYTES, what, "JSON", error), str(path), error, kind)
 
@@ -110,10 +122,13 @@ def _text(path: Path, max_bytes: int, what: str, language: str, error: type[Inpu
 
     Args:
         path: The file.
-        max_bytes: Largest size of the file.
+        max_bytes: Largest size of the file, bytes.
         what: Description of the expected file for error messages, such as "a device file".
         language: "TOML" or "JSON", for error messages.
-        error: Class of the error if the file cannot be read.
+        error: Class of the error that is raised.
+
+    Raises:
+        error: If the file cannot be read, is too large, or is not text in UTF-8.
     """
     data = read_needed(path, error, f"expected {what} in {language}", max_bytes)
     try:
@@ -123,13 +138,16 @@ def _text(path: Path, max_bytes: int, what: str, language: str, error: type[Inpu
 
 
 def parse_toml(text: str, where: str, error: type[InputError], kind: type[T]) -> T:
-    """Parse a text in TOML.
+    """Parse a text in TOML, and convert its content to a type.
 
     Args:
         text: The text.
         where: Name of the file, with which the error message begins.
-        error: Class of the error if the text is wrong.
+        error: Class of the error that is raised.
         kind: Type to which the content is converted.
+
+    Raises:
+        error: If the text is not TOML, or its content is wrong.
     """
     if _DEEP_KEY.search(text):  # parsing such a key needs much memory
         raise error(f"{where}: not a TOML file: a key of more than 32 parts")
@@ -141,20 +159,23 @@ def parse_toml(text: str, where: str, error: type[InputError], kind: type[T]) ->
 
 
 def parse_json(text: str | bytes, where: str, error: type[InputError], kind: type[T]) -> T:
-    """Parse a text in JSON.
+    """Parse a text in JSON, and convert its content to a type.
 
     Args:
         text: The text.
-        where: Name of the file, with which the error message begins; empty if there is none.
-        error: Class of the error if the text is wrong.
+        where: Name of the file, with which the error message begins; empty if there is no file.
+        error: Class of the error that is raised.
         kind: Type to which the content is converted.
+
+    Raises:
+        error: If the text is not JSON, or its content is wrong.
     """
     try:
         return msgspec.json.decode(text, type=kind)
     except (ValueError, RecursionError) as decoding_error:
         cause = decoding_error
 
-    # Either the text is not JSON, or it is JSON with a content of another type. Decoding without a type shows which.
+    # The text is either not JSON, or JSON with wrong content. Decoding without a type distinguishes the two cases.
     try:
         content = msgspec.json.decode(text)
     except (ValueError, RecursionError):
@@ -163,13 +184,16 @@ def parse_json(text: str | bytes, where: str, error: type[InputError], kind: typ
 
 
 def convert(value: object, kind: type[T], where: str, error: type[InputError]) -> T:
-    """Convert a value, which consists of tables, lists, texts and numbers, to a type.
+    """Convert a value from TOML or JSON to a type.
 
     Args:
-        value: Value from TOML or JSON.
-        kind: A struct, or another type that msgspec supports.
-        where: Name of the file, with which the error message begins; empty if there is none.
-        error: Class of the error if the value is wrong.
+        value: Value that consists of tables, lists, texts, numbers and truth values.
+        kind: Type to which the value is converted: a struct, or another type that msgspec supports.
+        where: Name of the file, with which the error message begins; empty if there is no file.
+        error: Class of the error that is raised.
+
+    Raises:
+        error: If the value does not have the type. The message describes the first mistake.
     """
     try:
         return msgspec.convert(value, kind)
@@ -178,11 +202,18 @@ def convert(value: object, kind: type[T], where: str, error: type[InputError]) -
 
 
 def _prefix(where: str) -> str:
+    """Return the beginning of an error message: `where` and a colon, or an empty text if `where` is empty."""
     return f"{where}: " if where else ""
 
 
 def _first_mistake(value: object, kind: Any, cause: Exception) -> str:
-    """Return a description of the first mistake in a value, or the message of msgspec if no mistake is found."""
+    """Describe the first mistake in a value, for an error message.
+
+    Args:
+        value: Value from TOML or JSON.
+        kind: Type to which the value could not be converted.
+        cause: Exception of msgspec. Its message is returned if no mistake is found.
+    """
     try:
         return next(_mistakes(value, kind, ""), cut(str(cause)))
     except RecursionError:
@@ -190,20 +221,22 @@ def _first_mistake(value: object, kind: Any, cause: Exception) -> str:
 
 
 def _mistakes(value: object, expected_type: Any, path: str) -> Iterator[str]:
-    """Yield descriptions of the mistakes in the keys or items of a value, and then of the mistakes in the whole value.
+    """Yield a description of each mistake in a value.
+
+    The mistakes in the keys of a table or in the items of a list are yielded before a mistake in the value as a whole.
 
     Args:
         value: Value from TOML or JSON.
         expected_type: Expected type.
         path: Names of the keys that lead to the value, such as "film.radius_mm".
     """
-    members = list(_union_members(expected_type))  # only the type itself, if it is no union
+    members = list(_union_members(expected_type))  # if the type is no union, the list contains only the type itself
     yield from _mistakes_in_tag(value, members, path)
     for member in members:
         yield from _mistakes_in_parts(value, member, path)
 
-    # A mistake in the whole value. If the check of a struct has raised the error, its exception is the cause. A
-    # `WrongKey` without a message means that the key is missing.
+    # Check the value as a whole. If `__post_init__` of a struct has raised an exception, it is the cause of the error.
+    # A `WrongKey` without a message means that the key is missing.
     try:
         msgspec.convert(value, expected_type)
     except msgspec.ValidationError as error:
@@ -222,7 +255,7 @@ def _expected_value(expected_type: Any, first_member: Any) -> str:
 
     Args:
         expected_type: The type.
-        first_member: The type itself, or the first member of a union, without annotations.
+        first_member: The type without its annotations, or the first member of the type if the type is a union.
     """
     if get_origin(first_member) is Literal:
         return _one_of(get_args(first_member))  # in the declared order, which msgspec does not keep
@@ -230,13 +263,14 @@ def _expected_value(expected_type: Any, first_member: Any) -> str:
 
 
 def _mistakes_in_tag(value: object, members: list[Any], path: str) -> Iterator[str]:
-    """Yield the mistake if the tag of a table is missing or unknown.
+    """Yield a description of the mistake if the tag of a table is missing or unknown.
 
-    The tag is the key whose value selects one of several structs. If there is only one struct, the tag may be missing.
+    The tag is the value of the key that selects one of several structs. If only one struct is possible, the tag may be
+    missing.
 
     Args:
         value: Value from TOML or JSON.
-        members: Members of the expected union. There is no tag if none of them is a struct with a tag.
+        members: Members of the expected union. If no member is a struct with a tag, there is no mistake.
         path: Names of the keys that lead to the value.
     """
     structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
@@ -256,13 +290,14 @@ def _mistakes_in_tag(value: object, members: list[Any], path: str) -> Iterator[s
 
 
 def _mistakes_in_parts(value: object, expected_type: Any, path: str) -> Iterator[str]:
-    """Yield mistakes in the values of a table or in the items of a list.
+    """Yield a description of each mistake in the keys of a table or in the items of a list.
 
-    The function yields nothing for any other value, and for a value of another kind than the expected type.
+    The function yields nothing if the value is neither a table nor a list, or if the type expects another kind of
+    value.
 
     Args:
         value: Value from TOML or JSON.
-        expected_type: Expected type, which is no union.
+        expected_type: Expected type, which must not be a union.
         path: Names of the keys that lead to the value.
     """
     if isinstance(value, Mapping) and isinstance(expected_type, type) and issubclass(expected_type, Struct):
@@ -272,24 +307,24 @@ def _mistakes_in_parts(value: object, expected_type: Any, path: str) -> Iterator
         for key, item in value.items():
             yield from _mistakes(item, item_type, _join(path, key))
     elif isinstance(value, list | tuple) and get_origin(expected_type) in (list, tuple):
-        # `list[T]` and `tuple[T, ...]` have one type for all items, and other tuples have one type for each item.
+        # `list[T]` and `tuple[T, ...]` have one type for all items. Other tuples have one type for each item.
         item_types = [item_type for item_type in get_args(expected_type) if item_type is not Ellipsis]
         if len(item_types) == 1:
             item_types = item_types * len(value)
-        if len(item_types) == len(value):  # a wrong length is a mistake in the whole value, which `_mistakes` reports
+        if len(item_types) == len(value):  # `_mistakes` reports a wrong length as a mistake in the value as a whole
             for index, item in enumerate(value[:MAX_EXAMINED_ITEMS]):
                 yield from _mistakes(item, item_types[index], f"{path}[{index}]")
 
 
 def _mistakes_in_keys(table: Mapping[str, Any], struct: type[Struct], path: str) -> Iterator[str]:
-    """Yield unknown keys, missing keys, and mistakes in the values of the keys.
+    """Yield a description of each unknown key, each missing key and each mistake in the values of a table.
 
-    The function yields nothing if the tag of the table selects another struct.
+    If the tag of the table selects another struct, the function yields nothing.
 
     Args:
-        table: The table.
+        table: Table from TOML or JSON.
         struct: Struct that declares the expected keys.
-        path: Path to the table, such as "film"; empty for the whole file.
+        path: Names of the keys that lead to the table, such as "film"; empty for the whole file.
     """
     config = struct.__struct_config__
     if config.tag is not None:
@@ -299,7 +334,7 @@ def _mistakes_in_keys(table: Mapping[str, Any], struct: type[Struct], path: str)
 
     types_of_fields = get_type_hints(struct, include_extras=True)
     fields = msgspec.structs.fields(struct)
-    known_keys = [field.encode_name for field in fields]  # the keys of the file, which may differ from the attributes
+    known_keys = [field.encode_name for field in fields]  # a key may have another name than its attribute
     if config.tag_field:
         known_keys.insert(0, config.tag_field)
 
@@ -320,9 +355,9 @@ def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
     """Return an error message about an unknown key, with the most similar known key as a suggestion.
 
     Args:
-        name: The key with the names of the tables that contain it.
-        key: The key.
-        known: The known keys.
+        name: Name of the key with the names of the tables that contain it, such as "film.radius".
+        key: Name of the key alone, such as "radius".
+        known: Names of the known keys.
     """
     known_keys = list(known)
     known_text = cut(", ".join(known_keys))
@@ -335,7 +370,10 @@ def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
 def _union_members(expected_type: Any) -> Iterator[Any]:
     """Yield the members of a union without their annotations.
 
-    If the type is not a union, the function yields the type itself, also without its annotations.
+    If the type is not a union, the function yields only the type itself without its annotations.
+
+    Args:
+        expected_type: The type.
     """
     if get_origin(expected_type) is Annotated:
         type_without_annotations = get_args(expected_type)[0]
@@ -348,15 +386,20 @@ def _union_members(expected_type: Any) -> Iterator[Any]:
 
 
 def _join(path: str, key: str) -> str:
-    """Join the path of a table and the name of one of its keys, as in "film.radius_mm". The path may be empty."""
+    """Join the names of the keys that lead to a table and the name of a key of the table, as in "film.radius_mm".
+
+    Args:
+        path: Names of the keys that lead to the table; empty for the whole file.
+        key: Name of the key.
+    """
     return cut(f"{path}.{key}" if path else str(key))
 
 
 def _describe_type(value_type: inspect.Type) -> str:
-    """Return a description of the values of a type for error messages, such as "a list of 2 numbers".
+    """Describe the values that a type allows for error messages, for example as "a list of 2 numbers".
 
-    A description in the annotation of the type takes precedence. Types without a case of their own, such as tables, are
-    described by their noun.
+    If the annotation of the type contains a description, this description is returned. Types without a `case`, such as
+    tables, are described by their noun.
 
     Args:
         value_type: The type, as `msgspec.inspect.type_info` returns it.
@@ -379,9 +422,9 @@ def _describe_type(value_type: inspect.Type) -> str:
             return _one_of(member.value for member in cls)
         case inspect.UnionType(types=members):
             descriptions = [_describe_type(member) for member in members if not isinstance(member, inspect.NoneType)]
-            return " or ".join(dict.fromkeys(descriptions))  # each description once
+            return " or ".join(dict.fromkeys(descriptions))  # `fromkeys` removes repeated descriptions
         case inspect.TupleType(item_types=item_types):
-            return f"a list of {len(item_types)} {_noun(item_types[0])}s"  # all items are of the same kind
+            return f"a list of {len(item_types)} {_noun(item_types[0])}s"  # all items have the same type
         case inspect.CollectionType(item_type=item_type, min_length=min_length):
             list_description = f"a list of {_noun(item_type)}s"
             return f"{list_description}, {min_length} or more" if min_length else list_description
@@ -395,33 +438,37 @@ _NOUNS: tuple[tuple[Any, str], ...] = (
     ((inspect.TupleType, inspect.CollectionType), "list"),
     (inspect.BytesType, "text in base64"),
 )
-"""Pairs of a type of msgspec and the noun for its values."""
+"""Pairs of a type of msgspec, or several types, and the noun for the values of the type."""
 
 
 def _noun(value_type: inspect.Type) -> str:
-    """Return the noun for the values of a type, such as "number"."""
-    if isinstance(value_type, inspect.Metadata):
-        value_type = value_type.type  # the type without its annotation
+    """Return the noun for the values of a type, such as "number"; "value" for a type that is not in `_NOUNS`.
+
+    Args:
+        value_type: The type, as `msgspec.inspect.type_info` returns it.
+    """
+    type_without_annotation = value_type.type if isinstance(value_type, inspect.Metadata) else value_type
     for types_with_noun, noun in _NOUNS:
-        if isinstance(value_type, types_with_noun):
+        if isinstance(type_without_annotation, types_with_noun):
             return noun
     return "value"
 
 
 def _one_of(words: Iterable[object]) -> str:
+    """Return a list of the allowed words for an error message, as in "one of left, right"."""
     return f"one of {', '.join(map(str, words))}"
 
 
 def _describe_number(noun: str, above: float | None, minimum: float | None, maximum: float | None) -> str:
-    """Return a description of numbers with bounds, such as "a number from 0 to 1".
+    """Describe numbers with bounds for an error message, for example as "a number from 0 to 1".
 
     Args:
         noun: Noun for the numbers: "number" or "whole number".
-        above: Exclusive lower bound; None if there is none.
-        minimum: Inclusive lower bound; None if there is none.
-        maximum: Inclusive upper bound; None if there is none.
+        above: Lower bound that is not allowed itself; None if there is no such bound.
+        minimum: Smallest allowed number; None if there is no such bound.
+        maximum: Largest allowed number; None if there is no such bound.
     """
-    # Bounds of the size of `MAX_FLOAT` exclude only infinity, and are not mentioned.
+    # The bounds +-`MAX_FLOAT` exclude only infinity, and are not mentioned.
     if minimum is not None and abs(minimum) == MAX_FLOAT:
         minimum = None
     if maximum is not None and abs(maximum) == MAX_FLOAT:
@@ -438,10 +485,10 @@ def _describe_number(noun: str, above: float | None, minimum: float | None, maxi
     if maximum is not None:
         return f"a {noun} of at most {_bound_text(maximum)}"
 
-    # There is no bound to mention. Only a number that is not whole can be infinite or NaN.
+    # There is no bound to mention. A whole number is always finite.
     return f"a {noun}" if noun == "whole number" else f"a finite {noun}"
 
 
 def _bound_text(bound: float) -> str:
-    """Return a bound as a text. A float is rounded to six digits, and a whole number keeps all digits."""
+    """Return a bound as a text. A float is rounded to six significant digits, and an integer keeps all digits."""
     return f"{bound:g}" if isinstance(bound, float) else str(bound)

@@ -1,7 +1,7 @@
-"""Writing of settings as TOML; `isocharge.common.structs` reads them.
+"""Writing of settings as TOML. The module `isocharge.common.structs` reads TOML.
 
-This module uses no library. tomli-w writes no comments, and writes each number of a list on its own line. tomlkit is
-intended for changes of existing files.
+The module uses no library that writes TOML. The library tomli-w cannot write comments, and writes each number of a list
+on a separate line. The library tomlkit is intended for changes of existing files.
 """
 
 import json
@@ -16,15 +16,17 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
-    """Return the text of a TOML file: comments, keys without a table, and a section for each table.
+    """Return the text of a TOML file.
+
+    The text consists of comments, of the keys that are outside of all tables, and of a section for each table.
 
     Args:
-        tables: Texts, numbers, truth values, lists and tables by name. A table in a section or in a list is written on
-            one line.
-        comment: Lines of the comment at the head of the file, without #.
+        tables: Values by name. A value is a text, a number, a truth value, a list or a table. A table becomes a
+            section. A table inside a section or inside a list is written on one line.
+        comment: Lines of the comment at the beginning of the file, without the character #.
 
     Raises:
-        TypeError: If a value is of another type.
+        TypeError: If a value has another type.
     """
     lines = []
     for text in comment:
@@ -41,20 +43,29 @@ def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
             lines.append("")
             lines.append(f"[{_key(name)}]")
             lines += [_pair(key, value) for key, value in table.items()]
-    content = "\n".join(lines).lstrip("\n")  # without the blank line before a table at the beginning
+    content = "\n".join(lines).lstrip("\n")  # remove the blank line if the file begins with a section
     return content + "\n"
 
 
 def _pair(key: str, value: object) -> str:
+    """Return a key and its value in the notation of TOML."""
     return f"{_key(key)} = {_value(value)}"
 
 
 def _key(key: str) -> str:
+    """Return a key in the notation of TOML, with quotation marks if they are necessary."""
     return key if _BARE_KEY.fullmatch(key) else _text(key)
 
 
 def _value(value: object) -> str:
-    """Return a value in the notation of TOML; raise TypeError if TOML has no notation for its type."""
+    """Return a value in the notation of TOML.
+
+    Args:
+        value: Text, number, truth value, list, tuple or table.
+
+    Raises:
+        TypeError: If the value has another type.
+    """
     if isinstance(value, Mapping):
         return "{" + ", ".join(_pair(key, item) for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):
@@ -69,5 +80,8 @@ def _value(value: object) -> str:
 
 
 def _text(text: str) -> str:
-    """Return a text as a basic string of TOML: the JSON string of the text, with the character U+007F also escaped."""
+    """Return a text as a basic string of TOML.
+
+    A basic string of TOML is written like a string of JSON, except that the character U+007F must also be escaped.
+    """
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

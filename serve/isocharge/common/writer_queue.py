@@ -1,7 +1,7 @@
-"""A queue with a thread that writes its items, so that the caller never waits for a slow consumer.
+"""A queue whose items are written by a separate thread, so that the producer never waits for a slow consumer.
 
-The thread writes the oldest item first. If the consumer is so slow that more than `MAX_WAITING` items wait, the oldest
-items are dropped and counted. The consumer therefore gets the newest items.
+The thread writes the oldest item first. If the consumer is so slow that more than `MAX_WAITING` items are waiting, the
+oldest items are dropped and counted. A slow consumer therefore gets the newest items.
 """
 
 import threading
@@ -23,26 +23,28 @@ After this time, the waiting items count as lost.
 
 
 class WriterQueue(Generic[T]):
-    """Bounded queue with a thread that writes its items. The object is a context manager.
+    """Queue of limited length with a thread that writes the items of the queue.
+
+    The queue is a context manager, which closes the queue at the end of the `with` block.
 
     Attributes:
-        lost: Number of items that were dropped and never written.
+        lost: Number of items that were dropped without being written.
     """
 
     def __init__(self, write: Callable[[T], object], is_ready: Callable[[], bool] = lambda: True) -> None:
         """Start the thread.
 
         Args:
-            write: Function that is called in the thread with each item.
-            is_ready: Function that is called in the thread before an item is written. It waits a short time and
-                returns whether the consumer would accept an item.
+            write: Function that the thread calls with each item.
+            is_ready: Function that the thread calls before it takes an item from the queue. The function waits for a
+                short time, and returns whether the consumer accepts an item.
         """
         self.lost = 0
         self._write = write
         self._is_ready = is_ready
         self._waiting: deque[T] = deque()
-        self._change = threading.Condition()  # guards the attributes, and is notified when one of them changes
-        self._taken = 0  # number of items that the thread has taken from the queue
+        self._change = threading.Condition()  # protects the attributes, and is notified when one of them changes
+        self._taken_count = 0  # number of items that the thread has taken from the queue
         self._is_closed = False
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)  # a write may hang forever
@@ -58,14 +60,17 @@ class WriterQueue(Generic[T]):
 
     @property
     def is_stuck(self) -> bool:
-        """Whether the thread is still running after `close`, because the consumer has not accepted the last item."""
+        """Whether the queue is closed, but the thread is still waiting for the consumer to accept the last item."""
         return self._is_closed and self._thread.is_alive()
 
     def put(self, item: T) -> None:
-        """Append an item. If too many items wait, the oldest item is dropped.
+        """Append an item to the queue. If the queue is full, the oldest item is dropped.
+
+        Args:
+            item: The item.
 
         Raises:
-            Exception: The exception that `write` has raised in the thread.
+            Exception: The exception that `write` has raised in the thread, if there is one.
         """
         with self._change:
             self._raise_error()
@@ -76,16 +81,19 @@ class WriterQueue(Generic[T]):
             self._change.notify_all()
 
     def close(self) -> None:
-        """Write the waiting items for as long as the consumer accepts them, and count the rest as lost.
+        """Write the waiting items as long as the consumer accepts items, and close the queue.
+
+        Items that the consumer does not accept within the timeout are counted as lost.
 
         Raises:
             Exception: The exception that `write` has raised in the thread, unless `put` has raised it already.
         """
         with self._change:
-            # Wait as long as the thread takes the next item from the queue, or raises an error, within the timeout.
+            # Wait until the queue is empty or the thread has ended, but stop waiting if the thread takes no further
+            # item from the queue within the timeout.
             while self._waiting and self._thread.is_alive():
-                is_writing = self._change.wait_for(partial(self._has_changed, self._taken), CLOSE_TIMEOUT_s)
-                if not is_writing:
+                has_changed = self._change.wait_for(partial(self._has_changed, self._taken_count), CLOSE_TIMEOUT_s)
+                if not has_changed:
                     break
             self.lost += len(self._waiting)
             self._waiting.clear()
@@ -96,41 +104,48 @@ class WriterQueue(Generic[T]):
             self.lost += 1
         self._raise_error()
 
-    def _has_changed(self, taken: int) -> bool:
-        """Return whether the thread has taken more than `taken` items, or has ended with an error."""
-        return self._taken > taken or self._error is not None
+    def _has_changed(self, earlier_count: int) -> bool:
+        """Return whether the thread has taken an item since an earlier time, or has ended with an error.
+
+        Args:
+            earlier_count: Number of items that the thread had taken at the earlier time.
+        """
+        return self._taken_count > earlier_count or self._error is not None
 
     def _raise_error(self) -> None:
-        """Raise the error of the thread, unless there is none or it was raised before."""
+        """Raise the exception with which the thread has ended, if there is one that was not raised before."""
         error = self._error
-        self._error = None
+        self._error = None  # so that the exception is raised only once
         if error is not None:
             raise error
 
     def _run(self) -> None:
-        """Write items until the queue is closed and empty, or until `write` raises an error."""
+        """Write items until the queue is closed and empty, or until `write` raises an exception."""
         try:
             while (item := self._next()) is not None:
                 self._write(item)
-        except Exception as error:  # raised again by `put` and `close`
+        except Exception as error:  # `put` or `close` raises it again in the thread of the caller
             with self._change:
                 self._error = error
                 self._change.notify_all()
 
     def _next(self) -> T | None:
-        """Wait until the consumer accepts an item, and return the oldest item.
+        """Wait until there is an item and the consumer accepts an item, and take the oldest item from the queue.
 
-        The result is None if the queue is closed and empty. An item is only taken when the consumer accepts it, so that
-        `put` can drop old items while the consumer is slow.
+        The item remains in the queue until the consumer accepts an item. `put` can therefore drop old items while the
+        consumer is slow.
+
+        Returns:
+            The item; None if the queue is closed and empty.
         """
         with self._change:
             self._change.wait_for(lambda: self._waiting or self._is_closed)
-        # The lock is released meanwhile, because `is_ready` waits a short time. After `close`, all items are written.
+        # The lock is not held during this loop, because each call of `is_ready` waits for a short time.
         while not (self._is_ready() or self._is_closed):
             pass
         with self._change:
-            if not self._waiting:  # only after `close`, because `put` never empties the queue
+            if not self._waiting:  # the queue is closed, because only `close` empties the queue
                 return None
-            self._taken += 1
+            self._taken_count += 1
             self._change.notify_all()
             return self._waiting.popleft()

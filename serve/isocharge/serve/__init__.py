@@ -1,4 +1,4 @@
-"""Computation of contacts from charges: models, the predictor, and the path from a port to prediction records.
+"""Models that compute contacts from charges, and streams that convert the bytes of a board to prediction records.
 
     >>> from isocharge.serve import Predictor
     >>> touch = Predictor("three-25um-biaxial")
@@ -95,7 +95,7 @@ __version__: str
 
 
 def __dir__() -> list[str]:
-    """Return only the public names, which tab completion then suggests."""
+    """Return the public names, so that tab completion suggests no other names."""
     return list(__all__)
 
 

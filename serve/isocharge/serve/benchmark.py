@@ -1,7 +1,7 @@
 """Measurement of the duration of calls.
 
-A contender is one of the ways to predict that are compared, such as a method of the predictor. The contenders are
-measured in turns, so that all of them are affected equally if the machine becomes slower or faster.
+A contender is one way to compute predictions, such as a method of the predictor. The speeds of several contenders are
+compared. The contenders take turns. Therefore, a change in the speed of the machine affects all contenders equally.
 """
 
 import os
@@ -25,25 +25,25 @@ Clock = Callable[[], int]
 """Function that returns the time, ns."""
 
 MIN_CALLS = 3
-"""Smallest number of calls in a turn, however long they take."""
+"""Smallest number of calls in a turn, even if these calls take longer than the turn."""
 
 ROUNDS = 10
-"""Number of turns of every contender. The first one is a warm-up and does not count."""
+"""Number of turns of every contender. The first turn is a warm-up, whose durations are not used."""
 
 BATCH_SIZES = (16, 256, 4096)
-"""Numbers of presses in a batch. The last one is the largest batch that a server accepts by default."""
+"""Numbers of presses in a batch. The last number is the size of the largest batch that a server accepts by default."""
 
 N_CHARGES = 4096
 """Number of presses through which the calls cycle."""
 
 
 class Contender(NamedTuple):
-    """One way to predict.
+    """One way to compute predictions.
 
     Attributes:
         name: Name of the contender, for tables.
         presses: Number of presses that one call predicts.
-        call: Function that is timed.
+        call: Function that predicts the presses once. Its duration is measured.
     """
 
     name: str
@@ -72,45 +72,53 @@ class Timing(NamedTuple):
 
     @classmethod
     def of(cls, name: str, presses: int, durations_ns: Array) -> "Timing":
-        """Return the timing for durations of shape (calls,), ns."""
+        """Compute the statistics of the durations of the calls of one contender.
+
+        Args:
+            name: Name of the contender.
+            presses: Number of presses that one call predicts.
+            durations_ns: Duration of each call, shape (calls,), ns.
+        """
         p50, p99 = np.percentile(durations_ns, (50, 99)) / 1e3
         rate = presses * len(durations_ns) / (float(durations_ns.sum()) / 1e9)
         return cls(name, presses, len(durations_ns), float(p50), float(p99), rate)
 
 
 def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = time.perf_counter_ns) -> list[Timing]:
-    """Measure the duration of the calls of all contenders. In each round, every contender has one turn.
+    """Measure how long the calls of each contender take.
 
-    The first round warms up the processor and the caches, and is not counted.
+    In each round, every contender has one turn, in which it is called repeatedly. The first round only warms up the
+    processor and the caches. The durations of its calls are not used.
 
     Args:
-        contenders: The contenders.
-        seconds: Total time, s. Contenders with long calls may take longer.
+        contenders: Contenders that are measured.
+        seconds: Total time of all turns, s. The measurement takes longer if the calls of a contender take long.
         clock: Function that returns the time, ns.
 
     Returns:
-        A timing for each contender, in their order.
+        The timing of each contender, in the order of `contenders`.
     """
-    turn_ns = round(seconds * 1e9 / (ROUNDS * max(len(contenders), 1)))
+    turn_count = ROUNDS * max(len(contenders), 1)  # at least 1, so that no division by zero occurs
+    turn_ns = round(seconds * 1e9 / turn_count)
     durations: list[list[int]] = [[] for _ in contenders]
     for round_number in track(range(ROUNDS), "measuring", ROUNDS):
         is_warm_up = round_number == 0
         for contender, contender_durations in zip(contenders, durations, strict=True):
-            turn_durations = _turn(contender.call, turn_ns, clock)
+            turn_durations = _measure_turn(contender.call, turn_ns, clock)
             if not is_warm_up:
-                contender_durations += turn_durations
+                contender_durations.extend(turn_durations)
     return [
         Timing.of(contender.name, contender.presses, np.array(contender_durations, float))
         for contender, contender_durations in zip(contenders, durations, strict=True)
     ]
 
 
-def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
-    """Call a function repeatedly for the length of a turn, and return the durations of the calls, ns.
+def _measure_turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
+    """Call a function repeatedly during one turn, and return the duration of each call in ns.
 
     Args:
-        call: The function.
-        turn_ns: Length of the turn, ns. At least `MIN_CALLS` calls are made.
+        call: Function whose duration is measured.
+        turn_ns: Length of the turn, ns. The turn takes longer if it would contain fewer than `MIN_CALLS` calls.
         clock: Function that returns the time, ns.
     """
     durations_ns: list[int] = []
@@ -123,31 +131,36 @@ def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
 
 
 def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0) -> Singles:
-    """Draw charges at random from the golden vectors of a model. Presses whose contacts have flags are excluded.
+    """Draw charges at random from the golden vectors, which are charges that are stored with a model.
+
+    Golden vectors for which the model returns a contact with flags are excluded.
 
     Args:
-        predictor: The model.
+        predictor: Predictor with the model.
         golden_pC: Charges of the golden vectors, shape (n, electrodes), pC.
         seed: Seed of the random choice.
 
     Returns:
         Charges of shape (N_CHARGES, electrodes), pC.
     """
-    flags = predictor.validity.batch_flags(predictor.predict_batch(golden_pC))
-    valid_pC: Singles = golden_pC[[not words for words in flags]]
+    flags_of_presses = predictor.validity.batch_flags(predictor.predict_batch(golden_pC))
+    is_valid = [not flags for flags in flags_of_presses]
+    valid_pC: Singles = golden_pC[is_valid]
     rows = np.random.default_rng(seed).integers(0, len(valid_pC), N_CHARGES)
     return valid_pC[rows]
 
 
 def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Contender]:
-    """Return the contenders that call the methods of a predictor: two for single presses, and one for each batch size.
+    """Return the contenders that call methods of a predictor in this process.
+
+    Two contenders predict one press in each call. In addition, there is one contender for each batch size.
 
     Args:
-        predictor: The model.
-        charge_pC: Charges of presses, shape (n, electrodes), pC. Each call for one press uses the next row. Batches of
-            more than n presses are left out.
+        predictor: Predictor with the model.
+        charge_pC: Charges of presses, shape (n, electrodes), pC. Each call for one press uses the next row. Batch sizes
+            larger than n are left out.
     """
-    # Functions that return the charges of the next press, as an array and as a list, and begin again after the last.
+    # These functions return the charges of the next press, and begin again with the first press after the last one.
     next_array = partial(next, cycle(charge_pC))
     next_list = partial(next, cycle(charge_pC.tolist()))
     out = np.zeros(N_WITHOUT_CORRELATION, np.float32)  # receives the results of `predict_into`
@@ -163,12 +176,16 @@ def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Cont
 
 
 def machine(packages: Sequence[str] = ("numpy", "onnxruntime")) -> dict[str, str]:
-    """Return the processor, the operating system and the versions of Python and packages of this machine."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text("utf-8").splitlines() if info.exists() else []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    """Return the processor, the operating system, and the versions of Python and of packages on this machine.
+
+    Args:
+        packages: Names of the packages.
+    """
+    cpu_file = Path("/proc/cpuinfo")  # exists only on Linux
+    lines = cpu_file.read_text("utf-8").splitlines() if cpu_file.exists() else []
+    cpu_names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return {
-        "cpu": next(names, platform.processor()),
+        "cpu": next(cpu_names, platform.processor()),
         "cores": str(os.cpu_count()),
         "system": platform.platform(),
         "python": platform.python_version(),

@@ -1,4 +1,4 @@
-"""The flags in the field `flags` of a record, and the meaning of each flag."""
+"""Names of the flags that the field `flags` of a record can contain, and the meaning of each flag."""
 
 TARE = "tare"
 OUTSIDE = "outside"

@@ -1,6 +1,8 @@
-"""The simulator: from a press on a clamped piezoelectric film to the charges of its electrodes.
+"""Simulator that computes the charges of the electrodes when a probe presses on a clamped piezoelectric film.
 
-Lengths are in mm, forces in N, stresses in MPa, charges in pC. These four lines compute the charges of one press.
+Lengths are in mm, forces in N, stresses in MPa and charges in pC.
+
+Example:
 
     from isocharge.simulate import Circle, load_sensor, press, touch_charge
 
@@ -101,7 +103,7 @@ __version__: str
 
 
 def __dir__() -> list[str]:
-    """List the public names only, for tab completion."""
+    """Return the public names, so that tab completion suggests no other names."""
     return list(__all__)
 
 

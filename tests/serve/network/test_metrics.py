@@ -90,7 +90,7 @@ def test_latency_histogram_counts_the_durations():
     stages = np.round(np.exp(rng.uniform(np.log(1e3), np.log(2e7), (2000, 3)))).astype(int)
     stages[:3] = [[10_000, 0, 0], [9_999, 1, 1], [20_000_000, 0, 1]]  # on a bound, and just beyond
     for row in stages.tolist():
-        counters.succeeded(1, tuple(row))
+        counters.count_answered(1, tuple(row))
     total = stages.sum(axis=1)
     expected = [np.count_nonzero(total <= bound) for bound in (*LATENCY_BOUNDS_NS, math.inf)]
     assert np.cumsum(counters.latency).tolist() == expected

@@ -321,7 +321,7 @@ def test_records_have_the_standard_deviations_of_an_uncertain_memory(film, predi
 
 def test_warming_charges_are_relative_to_their_mean():
     board = device_from_table({"common_mode": {"pC_per_K": {"A": 2.0, "B": -6.0, "C": 3.0, "D": 1.0}}}, "b")
-    np.testing.assert_allclose(board.chain((*NAMES, "D")).pyro, np.array([2.0, -6.0, 3.0, 1.0]) / 3.0)
+    np.testing.assert_allclose(board.chain((*NAMES, "D")).warming_ratios, np.array([2.0, -6.0, 3.0, 1.0]) / 3.0)
 
 
 @pytest.mark.parametrize("per_K", [{"A": 1.0}, {"A": 0.0, "B": 0.0, "C": 0.0, "D": 0.0}])

@@ -34,7 +34,7 @@ def test_live_tape_stores_the_latest_samples():
         tape.append(samples(np.arange(first, first + 7.0)))
     assert tape.oldest == 25
     assert tape.total == 35
-    assert tape.index(30.5) == 31
+    assert tape.first_number_after(30.5) == 31
     assert tape.samples(0, 35)["timestamp"].tolist() == list(range(25, 35))
     tape.append(samples(np.arange(35.0, 60.0)))
     assert tape.samples(tape.oldest, tape.total)["timestamp"].tolist() == list(range(50, 60))
@@ -48,7 +48,7 @@ def test_recorded_tape_stores_all_samples(recorded):
     assert tape.total == 3000
     assert len(tape.samples(0, 3000)) == 3000
     assert tape.span() == (1e9, 1e9 + 29.99)
-    assert tape.index(1e9 + 15.001) == 1501
+    assert tape.first_number_after(1e9 + 15.001) == 1501
 
 
 def test_recorded_tape_replaces_times_that_go_back(recorded):

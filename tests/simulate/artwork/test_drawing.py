@@ -144,7 +144,7 @@ def sampled(path):
 
 def test_leads_reach_the_rim_without_crossing_leads_or_electrodes(sensor):
     leads = straight_leads(sensor)
-    assert leads.without == ()
+    assert leads.unconnected == ()
     assert leads.summary == f"all {len(sensor.electrodes)} leads go straight to the rim"
     for electrode in sensor.electrodes:
         path = leads.paths[electrode.name]
@@ -165,5 +165,5 @@ def test_electrode_without_a_straight_lead_is_reported():
     ring = [Electrode.of_square(f"R{n}", (10.0 * np.cos(a), 10.0 * np.sin(a)), 2.7) for n, a in enumerate(angles)]
     middle = Electrode.of_square("M", (0.0, 0.0), 3.0)
     leads = straight_leads(replace(load_sensor("three-25um-biaxial"), electrodes=(middle, *ring)))
-    assert leads.without == ("M",)
+    assert leads.unconnected == ("M",)
     assert leads.summary == "no straight lead to the rim for M: use another layer for their leads"

@@ -55,24 +55,29 @@ def test_three_electrodes_form_an_equilateral_triangle(found, centres):
     assert np.abs(z) == pytest.approx(np.full(3, np.abs(z).mean()), rel=0.1)
     assert np.abs(z).min() > 7.0
     assert np.sort(np.mod(np.angle(z / z[0]), 2.0 * np.pi)) == pytest.approx(2.0 * np.pi / 3.0 * np.arange(3), abs=0.2)
-    assert (found.summary, found.unambiguous, found.refused) == (UNAMBIGUOUS, True, 0)
+    assert (found.summary, found.unambiguous, found.n_rejected) == (UNAMBIGUOUS, True, 0)
 
 
 def test_errors_agree_with_the_limits_of_the_forward_map(found):
     """The limits are computed independently from the forward map of the new sensor."""
     forward_map = ForwardMap.build(found.sensor, found.case.probe, 4.0, DEFAULT_FORCE_RANGE)
-    contact = np.column_stack([found.after.presses, np.ones(len(found.after.presses))])
+    contact = np.column_stack([found.errors_after.presses, np.ones(len(found.errors_after.presses))])
     limits = limits_at(forward_map, contact, found.case.noise).position
-    assert found.after.noise_alone == pytest.approx(limits, rel=0.02)
-    numbers = found.after.to_dict()["noise_alone"]
+    assert found.errors_after.noise_alone == pytest.approx(limits, rel=0.02)
+    numbers = found.errors_after.to_dict()["noise_alone"]
     worst, rms = limits.max(), np.sqrt(np.mean(limits**2))
-    assert (numbers["worst_mm"], numbers["rms_mm"], found.value) == pytest.approx((worst, rms, worst), rel=5e-3)
+    assert (numbers["worst_mm"], numbers["rms_mm"], found.minimised_error) == pytest.approx(
+        (worst, rms, worst), rel=5e-3
+    )
 
 
 def test_no_neighbouring_layout_is_better_by_more_than_one_percent(found, centres, tables):
     """Small random moves of the electrodes do not reduce the largest error noticeably."""
     search, rng = Search(found.case, tables["four-25um-biaxial"]), np.random.default_rng(0)
-    assert all(search.value(centres + rng.uniform(-0.4, 0.4, (3, 2))) > 0.99 * found.value for _ in range(20))
+    assert all(
+        search.minimised_error(centres + rng.uniform(-0.4, 0.4, (3, 2))) > 0.99 * found.minimised_error
+        for _ in range(20)
+    )
 
 
 def test_rms_and_weighted_goals_reduce_their_own_error(centres, sensor, tables, monkeypatch):
@@ -84,8 +89,8 @@ def test_rms_and_weighted_goals_reduce_their_own_error(centres, sensor, tables, 
         start = search.optima(*random_layouts(search.case))[0]
         value, *numbers = search.refine(start)
         best = np.reshape(numbers, (-1, 2))
-        assert value == pytest.approx(search.value(best))
-        assert value < min(0.95 * search.value(centres), search.value(start))
+        assert value == pytest.approx(search.minimised_error(best))
+        assert value < min(0.95 * search.minimised_error(centres), search.minimised_error(start))
         assert search.case.all_clearances(best).min() > -1e-3
 
 
@@ -97,8 +102,8 @@ def test_ambiguous_layout_is_rejected_for_the_next_one(sensor, monkeypatch):
     second = design(case_of(sensor))
     monkeypatch.setattr(design_module, "ambiguities", lambda *_: "it folds")
     best = design(case_of(sensor))
-    assert (second.unambiguous, second.refused, best.unambiguous, best.refused) == (True, 1, False, 0)
-    assert best.value < second.value
+    assert (second.unambiguous, second.n_rejected, best.unambiguous, best.n_rejected) == (True, 1, False, 0)
+    assert best.minimised_error < second.minimised_error
 
 
 def test_ambiguities_reports_folds_and_pairs(sensor, monkeypatch):

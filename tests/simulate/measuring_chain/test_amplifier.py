@@ -99,9 +99,11 @@ def test_temperature_step_ends_and_pyro_mismatch_differs_between_electrodes():
     part = Amplifier(noise=CLEAN, step=2.0, step_at=2.0, step_time=0.005, step_for=10.0, pyro_mismatch=0.2)
     readings, process = measure(part, np.zeros((5000, 4)))
     warmest = 1.0 - np.exp(-10.0 / 2.67)
-    np.testing.assert_allclose(readings[2400], 2.0 * process.pyro * warmest, rtol=0.01)
-    np.testing.assert_allclose(readings[4999], 2.0 * process.pyro * warmest * np.exp(-13.0 / 2.67), rtol=0.05)
-    assert np.ptp(process.pyro) > 20.0
+    np.testing.assert_allclose(readings[2400], 2.0 * process.pyro_charge_per_K * warmest, rtol=0.01)
+    np.testing.assert_allclose(
+        readings[4999], 2.0 * process.pyro_charge_per_K * warmest * np.exp(-13.0 / 2.67), rtol=0.05
+    )
+    assert np.ptp(process.pyro_charge_per_K) > 20.0
 
 
 def test_converter_clips_and_rounds_to_16_bits():
@@ -115,7 +117,7 @@ def test_converter_clips_and_rounds_to_16_bits():
 
 def test_mismatch_is_drawn_once_for_each_channel():
     process = load_amplifier("bench").start(20_000, RATE, np.random.default_rng(0))
-    stds = [values.std() for values in (process.gain, process.tau, process.offset)]
+    stds = [values.std() for values in (process.gain, process.leak_time, process.offset)]
     assert stds == pytest.approx([0.01, 0.5, 2.0], rel=0.03)
     assert set(np.abs(process.bias)) == {0.5}
 

@@ -67,7 +67,7 @@ def test_refined_template_locates_points_in_split_elements():
     refined = RefinedTemplate(base, parent, low, size)
     of_base = rng.integers(3, size=300)
     at = rng.uniform(-1.0, 1.0, (2, 300))
-    element, *local = refined.within(of_base, *at)
+    element, *local = refined.to_split_elements(of_base, *at)
     np.testing.assert_array_equal(parent[element], of_base)
     assert np.abs(local).max() <= 1.0
     np.testing.assert_allclose(low[element].T + 0.5 * size[element].T * (np.array(local) + 1.0), at)

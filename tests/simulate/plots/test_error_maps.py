@@ -42,7 +42,7 @@ def test_identification_picture_shows_the_error_against_distance():
     shape = rings.position.shape[:2]
     uneven = np.linspace(0.0, 2.0, shape[1])
     maps = [LimitMap(force, rings, rings.distance[:, None] * uneven / force, *[np.ones(shape)] * 2) for force in (1, 2)]
-    area = SimpleNamespace(folds=np.array([[3.0, 0.0]]), radius=2.5, searched=6.0, error=1.0, fold_radius=3.0)
+    area = SimpleNamespace(folds=np.array([[3.0, 0.0]]), radius=2.5, search_radius=6.0, error=1.0, fold_radius=3.0)
     noise = noise_model("reference")
     probe = Circle(1.0)
     figure = identification_picture(SimpleNamespace(maps=maps, area=area, sensor=SENSOR, noise=noise, probe=probe))

@@ -20,8 +20,8 @@ def test_derivatives_with_respect_to_parameters_and_contacts_equal_differences(l
     rng = np.random.default_rng(3)
     parameters = layout.prior.draw(rng, 1)[0]
     contact = draw_contacts(rng, layout.domain.within(7.0), 6)
-    contact_derivative = charges.by_contact(parameters, contact)
-    parameter_derivative = charges.by_parameter(parameters, contact, contact_derivative)
+    contact_derivative = charges.contact_slopes(parameters, contact)
+    parameter_derivative = charges.unknown_slopes(parameters, contact, contact_derivative)
     largest_charge = np.abs(charges.charges(parameters, contact)).max(axis=1)[:, None]
 
     for index, std in enumerate(layout.prior.std):
@@ -52,7 +52,7 @@ def test_derivatives_include_the_effect_of_parameters_on_modes_and_traces(proble
     given = np.append(problem.before.parameters, coefficients)
     unknowns[: given.size] = given
     charge = charges.charges(unknowns, contact)
-    derivative = charges.by_parameter(unknowns, contact, charges.by_contact(unknowns, contact))
+    derivative = charges.unknown_slopes(unknowns, contact, charges.contact_slopes(unknowns, contact))
 
     for index, name in enumerate(names):
         step = np.zeros_like(unknowns)

@@ -173,7 +173,7 @@ def test_caution_about_a_fold_is_in_log_card_and_metadata(film, sensor, tmp_path
     model = release(fit(dataset, TINY), tmp_path / "models" / "centre")
     caution, *_ = caplog.messages  # further messages may be about the short training
     assert "seems to fold about 0." in caution or "seems to fold about 1." in caution
-    assert model.metadata.made_with["cautions"] == [caution]
+    assert model.metadata.made_with["cautions"][0] == caution
     assert f"- {caution}." in (model.folder / "card.md").read_text("utf-8")
 
 

@@ -1,8 +1,8 @@
-"""Training of small networks that compute contacts from charges, and calibration of films by measured presses.
+"""Training of small networks that compute contacts from charges, and calibration of films with measured presses.
 
-A network is trained on a dataset, and released as a folder with an ONNX model and its card. Each of the functions in
-the example can be used without the others. The names in `needs_torch` are imported when they are first used, because
-torch takes a second to import.
+A network is trained on a dataset. It is then released as a folder that contains an ONNX model and a model card. Each
+function in the example can be used on its own. The names in `needs_torch` are imported when they are first used,
+because the import of PyTorch takes long.
 
 Example:
 
@@ -81,7 +81,10 @@ __version__: str
 
 
 def __dir__() -> list[str]:
-    """List the public names only, for tab completion. They include the names that are not imported yet."""
+    """Return the public names, so that tab completion suggests no other names.
+
+    The list includes public names that are not imported yet.
+    """
     return list(__all__)
 
 
@@ -93,13 +96,16 @@ else:  # hidden from type checkers, which would otherwise accept every misspelt 
     def __getattr__(name):
         """Import a public name from `needs_torch` when it is first used, and store it in the module.
 
-        The import is delayed, because PyTorch takes long to import.
+        The names are not imported together with the package, because the import of PyTorch takes long.
 
         Args:
-            name: Name of the attribute.
+            name: Name of an attribute that the module does not contain yet.
+
+        Raises:
+            AttributeError: If the name is not public.
         """
         if name not in __all__:
-            return _version_attribute(name)  # raises AttributeError for all names except `__version__`
+            return _version_attribute(name)  # the version, or AttributeError for all other names
         with require("train"):
             value = getattr(import_module("isocharge.train.needs_torch"), name)
         globals()[name] = value  # Python then no longer calls this function for this name

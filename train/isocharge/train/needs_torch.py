@@ -1,4 +1,4 @@
-"""Public names of `isocharge.train` whose import loads torch. They are imported at their first use."""
+"""Public names of `isocharge.train` whose import also imports PyTorch. They are imported when they are first used."""
 
 from isocharge.train.films.fit import FilmsConfig as FilmsConfig
 from isocharge.train.films.fit import fit_films as fit_films

@@ -56,9 +56,10 @@ def demo_command(
 ) -> None:
     """Show what isocharge does: simulate a film, train a model, follow a virtual sensor live, and draw the results.
 
-    Takes less than a minute. Writes dataset, model and one page of pictures (mm, N, pC) into a new folder. --live only
-    follows a virtual sensor on a page for browsers, with the released model; it trains and writes nothing.
-    --playground only writes one HTML file, which needs no server and no other file.
+    Takes less than a minute. Writes the dataset, the model and one page of pictures (mm, N, pC) into a new folder. With
+    --live, the command only follows a virtual sensor with the released model, on a page for browsers. No model is then
+    trained, and no file is written. With --playground, the command only writes one HTML file, which needs no server and
+    no other file.
 
     Example: isocharge demo -o first-light
     """
@@ -87,10 +88,10 @@ def _write_playground(path: Path) -> None:
     """Write the playground, and print how to open it.
 
     Args:
-        path: Path of the HTML file. Missing folders are made.
+        path: Path of the HTML file. Missing folders are created.
 
     Raises:
-        OutputExists: If there is a file already.
+        OutputExists: If the file exists already.
     """
     from isocharge.serve.viewer.playground_page import playground_html  # imported late, because the import is slow
 

@@ -65,9 +65,9 @@ class FollowedPress(NamedTuple):
     """Frame of the live part in which both the virtual sensor and the model have a contact.
 
     Attributes:
-        number: Number of the press, from 1.
-        true_x_mm, true_y_mm, true_force_N: What the virtual sensor plays.
-        x_mm, y_mm, force_N: What the model estimates.
+        number: Number of the press, counted from 1.
+        true_x_mm, true_y_mm, true_force_N: True contact, which the virtual sensor plays.
+        x_mm, y_mm, force_N: Contact that the model estimates.
     """
 
     number: int
@@ -80,7 +80,7 @@ class FollowedPress(NamedTuple):
 
 
 def run_demo(output: Path | None, seconds: float | None, config: Path | None, sensor_name: str | None = None) -> None:
-    """Run the demo, print a table of its results, and write dataset, model and picture into a new folder.
+    """Run the demo, print a table of its results, and write the dataset, the model and a picture into a new folder.
 
     Args:
         output: The folder; None for the first free name of demo-output, demo-output-2, ...
@@ -95,7 +95,7 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
     sweep = Sweep(played_radius_mm(sensor.name), samples=SAMPLES, seed=SEED)
     durations_s: dict[str, float] = {}
     with new_folder(folder) as draft:
-        with _step(
+        with _demo_step(
             "simulate", f"{sensor.name}, circle of 1 mm, 0.05 to 2 N, within {sweep.radius:.3g} mm", durations_s
         ):
             # The forward map interpolates the charges of all presses. There is one map for each probe.
@@ -105,18 +105,18 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
                 f"   {len(dataset.samples)} presses interpolated from {forward_map.solves} solves, relative error "
                 f"{forward_map.error:.1e}"
             )
-        with _step("train", "a small network on noisy charges, exported to ONNX", durations_s):
+        with _demo_step("train", "a small network on noisy charges, exported to ONNX", durations_s):
             model = release(fit(dataset, settings), draft / "models" / sensor.name, command=this_command())
             predictor = Predictor(model.folder)
             say(f"   median position error {model.metadata.errors['position_median_mm']:g} mm with noise")
-        with _step(
+        with _demo_step(
             "serve",
             f"a virtual sensor sends {RATE_HZ:g} frames/s over a pseudo-terminal, the model answers live",
             durations_s,
         ):
             followed, totals = _follow_live(forward_map, predictor, seconds or LIVE_S)
             say(f"   {totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated")
-        with _step("show", "one page of pictures", durations_s):
+        with _demo_step("show", "one page of pictures", durations_s):
             tested = _test_presses(forward_map, predictor, sweep)
             equilibrium = press(forward_map.sensor.film, forward_map.probe, DRAWN_POSITION_MM, DRAWN_FORCE_N)
             draw_page(forward_map, equilibrium, followed, tested, draft / "demo.png")
@@ -125,15 +125,16 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
 
 
 @contextmanager
-def _step(name: str, description: str, durations_s: dict[str, float]) -> Iterator[None]:
-    """Print the title of a step, show the progress of the step during the block, and store its duration.
+def _demo_step(name: str, description: str, durations_s: dict[str, float]) -> Iterator[None]:
+    """Context manager of one step of the demo, which prints a title and shows the progress of the step.
 
     Args:
         name: Name of the step.
         description: What the step does.
-        durations_s: Durations of the steps by name, s, to which the duration of this step is added.
+        durations_s: Durations of the completed steps by name, s. The duration of this step is added.
     """
-    say(f"\n{len(durations_s) + 1}. {name}: {description}")
+    step_number = len(durations_s) + 1
+    say(f"\n{step_number}. {name}: {description}")
     start_s = time.perf_counter()
     with shown_progress():
         yield
@@ -141,13 +142,13 @@ def _step(name: str, description: str, durations_s: dict[str, float]) -> Iterato
 
 
 def _free_name(base: Path) -> Path:
-    """Return `base`, or the first of the paths base-2, base-3 and so on that does not exist."""
-    numbered = (base.with_name(f"{base.name}-{number}") for number in count(2))
-    return next(path for path in chain([base], numbered) if not path.exists())
+    """Return the first path of the sequence base, base-2, base-3, ... that does not exist."""
+    numbered_paths = (base.with_name(f"{base.name}-{number}") for number in count(2))
+    return next(path for path in chain([base], numbered_paths) if not path.exists())
 
 
 def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, StreamTotals]:
-    """Play a virtual sensor, read its port, and print the estimated and the true contact twice per second.
+    """Play a virtual sensor, read its port, and print the estimated and the true contact at regular intervals.
 
     Args:
         forward_map: Charges of the presses of the virtual sensor.
@@ -155,8 +156,9 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
         seconds: Duration, s.
 
     Returns:
-        The frames in which both the virtual sensor and the model have a contact, shape (n, 7), mm and N: number of the
-        press, true (x, y, F) and estimated (x, y, F), as in `FollowedPress`. Counts of the frames of the stream.
+        Two values. The first is an array of the frames in which both the virtual sensor and the model have a contact,
+        shape (n, 7), mm and N: number of the press, true (x, y, F) and estimated (x, y, F), as in `FollowedPress`. The
+        second contains the counts of all frames of the stream.
     """
     touch = TouchStream(predictor)
     frame_count = round(seconds * RATE_HZ)
@@ -169,7 +171,7 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
         all_records = (record for chunk in port for record in touch.feed(chunk))
         records = islice(all_records, frame_count)
         for frame_number, record in enumerate(track(records, "following", frame_count), start=1):
-            truth = sensor.truth(record.seq or 0)  # what the virtual sensor played in the frame of this number
+            truth = sensor.truth(record.seq or 0)  # the press that the virtual sensor played in this frame
             true_contact = (truth.x_mm, truth.y_mm, truth.force_N)
             contact = _contact_of(record)
 
@@ -181,20 +183,24 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
             if is_pressed:
                 followed.append(FollowedPress(press_number, *true_contact, *contact))
             if frame_number % print_interval == 0:
-                say(f"   {_columns(record.contact, contact)}     {_columns(truth.force_N > 0.0, true_contact)}")
+                estimated_columns = _contact_columns(record.contact, contact)
+                true_columns = _contact_columns(truth.force_N > 0.0, true_contact)
+                say(f"   {estimated_columns}     {true_columns}")
     return np.array(followed), touch.totals()
 
 
 def _contact_of(record: PredictionRecord) -> tuple[float, float, float]:
-    """Return x, y (mm) and force (N) of a record.
-
-    The function returns 0 for a value that the record does not contain.
-    """
+    """Return x (mm), y (mm) and the force (N) of a record. Values that the record does not contain are 0."""
     return record.x_mm or 0.0, record.y_mm or 0.0, record.force_N or 0.0
 
 
-def _columns(is_contact: bool, contact: tuple[float, float, float]) -> str:
-    """Format x, y (mm) and force (N) for the table of the live part."""
+def _contact_columns(is_contact: bool, contact: tuple[float, float, float]) -> str:
+    """Format a contact for the table of the live part.
+
+    Args:
+        is_contact: Whether there is a contact. Otherwise the text "no contact" is returned.
+        contact: Position x and y, mm, and force, N.
+    """
     if not is_contact:
         return f"{'no contact':>22}"
     x_mm, y_mm, force_N = contact
@@ -204,31 +210,48 @@ def _columns(is_contact: bool, contact: tuple[float, float, float]) -> str:
 def _test_presses(forward_map: ForwardMap, predictor: Predictor, sweep: Sweep) -> Array:
     """Estimate the contacts of presses on which the model was not trained.
 
+    Args:
+        forward_map: Charges of the presses.
+        predictor: The model that estimates the contacts.
+        sweep: Settings of the presses on which the model was trained. The test presses have another seed.
+
     Returns:
         True and estimated (x, y, F), shape (TEST_PRESSES, 6), mm and N.
     """
-    test = Sweep(sweep.radius, sweep.force_range, TEST_PRESSES, sweep.seed + 1)
-    contact = test.over((forward_map.probe,)).contact
-    charge = noise_model("reference").add(forward_map.charges(contact), np.random.default_rng(test.seed))
-    return np.column_stack([contact, *predictor.predict_batch(charge)[:3]])
+    test_sweep = Sweep(sweep.radius, sweep.force_range, TEST_PRESSES, sweep.seed + 1)
+    true_contact = test_sweep.over((forward_map.probe,)).contact
+    clean_charge_pC = forward_map.charges(true_contact)
+    noisy_charge_pC = noise_model("reference").add(clean_charge_pC, np.random.default_rng(test_sweep.seed))
+    x_mm, y_mm, force_N = predictor.predict_batch(noisy_charge_pC)[:3]
+    return np.column_stack([true_contact, x_mm, y_mm, force_N])
 
 
 def _position_error(presses: Array) -> Array:
-    """Compute the distances between true and estimated positions, mm.
+    """Compute the distances between the true and the estimated positions of presses.
 
-    Each row ends with the true contact (x, y, F), followed by the estimated contact.
+    Args:
+        presses: Rows that end with the true (x, y, F) and the estimated (x, y, F), shape (n, 6) or (n, 7), mm and N.
+
+    Returns:
+        Distances, shape (n,), mm.
     """
-    return position_error(presses[:, -3:], presses[:, -6:-3])
+    true_contact = presses[:, -6:-3]
+    estimated_contact = presses[:, -3:]
+    return position_error(estimated_contact, true_contact)
 
 
-def _position_words(presses: Array) -> str:
-    """Format median and 95th percentile of the position error."""
+def _position_error_text(presses: Array) -> str:
+    """Format the median and the 95th percentile of the position error.
+
+    Args:
+        presses: Rows that end with the true (x, y, F) and the estimated (x, y, F), shape (n, 6) or (n, 7), mm and N.
+    """
     median_mm, p95_mm = np.percentile(_position_error(presses), (50, 95))
     return f"median {median_mm:.3f} mm, 95 % {p95_mm:.3f} mm"
 
 
 def _summary(tested: Array, followed: Array, durations_s: dict[str, float], model_folder: Path) -> str:
-    """Return the table of results.
+    """Measure the latency of the model, and return the table of the results of the demo.
 
     Args:
         tested: Test presses, true and estimated (x, y, F), shape (m, 6), mm and N.
@@ -239,19 +262,18 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], mode
     true_contact, estimated_contact = np.split(tested, 2, axis=1)  # each of shape (m, 3)
     errors = ContactErrorStatistics.of(estimated_contact, true_contact)
 
-    # Measure the latency of the second kind of call, the prediction of a single press from a list of charges.
+    # Measure the latency of one kind of call, the prediction of a single press from a list of charges.
     model = load_model(find_model(str(model_folder)))
     predictor = Predictor(model.folder)
     charges = press_charges(predictor, model.golden.charge_pC)
-    contenders = in_process_contenders(predictor, charges)
-    one_press_as_list = contenders[1]
-    (latency,) = take_turns([one_press_as_list], LATENCY_S)
+    _press_from_array, press_from_list, *_batches = in_process_contenders(predictor, charges)
+    (latency,) = take_turns([press_from_list], LATENCY_S)
 
     size_KiB = (model.folder / "model.onnx").stat().st_size / 1024
     results_folder = model_folder.parent.parent
     rows = [
-        ("position error, with noise", _position_words(tested)),
-        ("position error, live", _position_words(followed)),
+        ("position error, with noise", _position_error_text(tested)),
+        ("position error, live", _position_error_text(followed)),
         ("force error", f"median {errors.force_median_percent:.2f} %, rms {errors.force_rms_percent:.2f} %"),
         ("model", f"{size_KiB:.0f} KiB, {model.metadata.label}"),
         ("one prediction", f"p50 {latency.p50_us:.1f} us, p99 {latency.p99_us:.1f} us"),
@@ -262,14 +284,14 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], mode
 
 
 def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array, tested: Array, path: Path) -> None:
-    """Draw the results on one page and write the picture.
+    """Draw the results of the demo on one page, and write the page as a picture.
 
     Args:
         forward_map: Forward map of the film.
         equilibrium: The press whose deflection is drawn.
         followed: Frames of the live part, shape (n, 7), mm and N: number of the press, true and estimated (x, y, F).
         tested: Test presses, true and estimated (x, y, F), shape (m, 6), mm and N.
-        path: Path of the picture.
+        path: Path of the picture, which is written.
     """
     electrode_count = len(forward_map.electrodes)
     figure = new_figure(15.0, 9.2)

@@ -20,11 +20,11 @@ SEED = 0
 
 
 def show_live_film(address: Address, seconds: float | None, sensor_name: str | None = None) -> None:
-    """Play a virtual sensor, estimate its contacts, and show both on the live page.
+    """Play a virtual sensor, estimate its contacts with a released model, and show the contacts on the live page.
 
     Args:
         address: Address at which the page listens.
-        seconds: Time after which to stop, s; None for Ctrl-C.
+        seconds: Time after which the demo stops, s; None to stop at Ctrl-C.
         sensor_name: Name of the sensor and of its released model; None for `DEFAULT_SENSOR`.
 
     Raises:
@@ -33,7 +33,7 @@ def show_live_film(address: Address, seconds: float | None, sensor_name: str | N
     sensor = sensor_name or DEFAULT_SENSOR
     predictor = Predictor(sensor)
     touch = TouchStream(predictor)
-    live = RecordedStream(touch)
+    stream = RecordedStream(touch)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
 
@@ -52,11 +52,11 @@ def show_live_film(address: Address, seconds: float | None, sensor_name: str | N
         # Carry out the requests of the page. A recording that the page begins has every frame, and neither a device
         # file nor a name of the film.
         header = RecordingHeader(policy="every", device={}, name="")
-        stack.enter_context(answering(link, live, header))
+        stack.enter_context(answering(link, stream, header))
 
         say("Ctrl-C stops")
-        feed = PageFeed(link, touch, live)
-        records = stack.enter_context(closing(live.follow(port)))
+        feed = PageFeed(link, touch, stream)
+        records = stack.enter_context(closing(stream.follow(port)))
         for record in records:
             feed.write(record)
             if seconds is not None and touch.counts.records > seconds * RATE_HZ:

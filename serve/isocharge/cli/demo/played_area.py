@@ -1,4 +1,4 @@
-"""Sensor of the demo, and the area in which its virtual presses lie."""
+"""Sensor of the demo, and the area of the film in which the presses of the demo lie."""
 
 import numpy as np
 
@@ -11,10 +11,10 @@ DEFAULT_SENSOR = "three-25um-biaxial"
 
 
 def played_radius_mm(sensor: str) -> float:
-    """Return the largest distance of a press from the centre of the film, mm.
+    """Return the largest distance of a press of the demo from the centre of the film, mm.
 
-    If there is a released model with the name of the sensor, the distance is the radius of its working area. Otherwise,
-    it is `DEFAULT_RADIUS`.
+    If there is a released model with the name of the sensor, the distance is the radius of the working area of this
+    model. Otherwise, the distance is `DEFAULT_RADIUS`.
 
     Args:
         sensor: Name of the sensor.

@@ -1,4 +1,4 @@
-"""`isocharge serve bench`: measure the speed of a model on this machine, and print its errors."""
+"""`isocharge serve bench`: measure the speed of a model on this machine, and print the errors of the model."""
 
 from collections.abc import Iterator
 from typing import Annotated
@@ -26,9 +26,10 @@ def bench_command(
     ] = 10.0,
     json: JsonOption = False,
 ) -> None:
-    """Measure how fast a model predicts in process on this machine, and print its errors.
+    """Measure how fast a model computes contacts on this machine, and print the errors of the model.
 
-    The charges are the golden vectors of the model, in pC. All calls are measured in turns, after a warm-up round.
+    The charges (pC) are taken from the golden vectors of the model. After a warm-up round, the different kinds of calls
+    are measured in turn.
 
     Example: isocharge serve bench three-25um-biaxial --seconds 10
     """

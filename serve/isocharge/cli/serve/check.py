@@ -34,9 +34,10 @@ def check_command(
     json: JsonOption = False,
     models: ModelsOption = None,
 ) -> None:
-    """Compare a model with measured presses, and test whether noise explains its errors.
+    """Compare a model with measured presses, and test whether noise explains the errors of the model.
 
-    Exit code: 0 if the model fits, 1 if it does not fit or there are too few presses, 2 if the input is wrong.
+    The exit code is 0 if the model fits the presses, 1 if the model does not fit or there are too few presses, and 2 if
+    the input is wrong.
 
     Example: isocharge serve check three-25um-biaxial presses.csv --position-std 0.05
     """
@@ -52,8 +53,12 @@ def check_command(
 def _text(check: PressCheck) -> Iterator[str]:
     """Yield the lines of the report: presses, summary of the errors, statistical tests, verdict and notes.
 
-    The summary compares the errors with the errors that noise of the charges and the uncertainty of the rig cause. The
-    column `beyond` is the part of the errors that these two do not explain.
+    The summary contains the errors, and the parts of the errors that are explained by the noise of the charges and by
+    the uncertainty of the rig. The column `beyond` is the part of the errors that neither the noise nor the rig
+    explains.
+
+    Args:
+        check: Result of the comparison.
     """
     yield from _press_lines(check)
     yield ""
@@ -62,7 +67,8 @@ def _text(check: PressCheck) -> Iterator[str]:
     yield from _summary_line("position, mm", check.position_mm)
     yield from _summary_line("force, %", check.force_percent)
 
-    # Statistical tests of whether noise and rig explain the errors. Without positions or forces there are no errors.
+    # Statistical tests of whether the noise and the rig explain the errors. Without measured positions or forces, there
+    # are no errors.
     agreement = check.agreement
     if agreement.degrees > 0:
         reduced_chi_squared = agreement.chi_squared / agreement.degrees
@@ -84,7 +90,7 @@ def _text(check: PressCheck) -> Iterator[str]:
 
 
 def _press_lines(check: PressCheck) -> Iterator[str]:
-    """Yield a table of the presses with the largest errors, in the order of the file."""
+    """Yield the lines of a table of the presses with the largest errors, in the order of the file."""
     squared_ratio = check.errors.squared_ratio  # squared errors of x, y and F over their variances, shape (n, 3)
     chi_squared = np.nansum(squared_ratio, axis=1)  # shape (n,)
     worst_presses = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
@@ -111,12 +117,13 @@ def _press_line(row: dict[str, Any]) -> str:
 
 
 def _number_cell(value: float, width: int, decimals: int) -> str:
-    """Format a number aligned to the right. NaN is formatted as a dash."""
+    """Format a number, aligned to the right in a cell of the given width. NaN is formatted as a dash."""
     text = "-" if math.isnan(value) else f"{value:.{decimals}f}"
     return text.rjust(width)
 
 
 def _summary_line(name: str, errors: ErrorSummary | None) -> Iterator[str]:
+    """Yield the line of the summary for one kind of error, or nothing if there are no errors of this kind."""
     if errors is not None:
         values = (errors.rms, errors.median, errors.max, errors.noise, errors.rig, errors.beyond)
         yield f"{name:14}" + "".join(f"{value:9.3g}" for value in values)

@@ -100,10 +100,11 @@ def doctor_command(
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Listen on a port: what frames arrive, how good the charges are, what is missing for a touch, a device file.
+    """Listen on a port, report its frames, the quality of its charges and missing settings, and write a device file.
 
-    Leave the film alone meanwhile: offset, noise and drift are those of a film at rest. If the film is touched, no
-    device file is written. Exit code 1 if no frames are recognised, or the film is touched.
+    Do not touch the film meanwhile, because the offset, the noise and the drift of the charges are measured at rest. If
+    the film is touched, no device file is written. The exit code is 1 if no frames are recognised or the film is
+    touched.
 
     Example: isocharge serve doctor --port /dev/ttyACM0 --write board.toml
     """
@@ -113,8 +114,8 @@ def doctor_command(
     if write is not None:
         refuse_existing(write)
     metadata = Predictor(model, models=models).metadata if model else None
-    electrodes = metadata.electrodes if metadata else ()
-    unnoticed = metadata.unnoticed if metadata else None
+    electrodes = metadata.electrodes if metadata else ()  # empty for any model
+    unnoticed = metadata.unnoticed if metadata else None  # presses outside the working area that the model misses
     settings = {"pC_per_unit": pC_per_unit, "V_per_unit": V_per_unit, "feedback_pF": feedback_pF}
     say(f"listening for {seconds:g} s; leave the film alone")
     examination = examine(
@@ -123,8 +124,8 @@ def doctor_command(
         seconds=seconds,
         device=load_device(device),
         electrodes=electrodes,
-        gain={key: _setting(key, text) for key, text in settings.items() if text is not None},
-        request=_request(request, request_Hz),
+        gain={key: _parse_gain_setting(key, text) for key, text in settings.items() if text is not None},
+        request=_parse_request(request, request_Hz),
         wait=wait,
     )
     if not json:
@@ -141,9 +142,10 @@ def doctor_command(
     if json:
         unnoticed_share = unnoticed.total_share if unnoticed else None
         show_json(asdict(examination) | {"found_channels": found_channels, "unnoticed_share": unnoticed_share})
-    alive = len(examination.channels)
-    if examination.good and len(electrodes) > alive:
-        say(f"models of {alive} electrodes: {', '.join(_models_of(alive, models)) or 'none'}; choose one with --model")
+    channel_count = len(examination.channels)
+    if examination.good and len(electrodes) > channel_count:
+        suitable_models = ", ".join(_models_with(channel_count, models)) or "none"
+        say(f"models of {channel_count} electrodes: {suitable_models}; choose one with --model")
     if not examination.good:
         raise typer.Exit(1)
     if examination.touch:
@@ -151,14 +153,14 @@ def doctor_command(
         say(f"{not_written}the film was touched: take the finger away, and try again")
         raise typer.Exit(1)
     if write is not None:
-        _write(write, examination, model or "MODEL")
+        _write_device_file(write, examination, model or "MODEL")
 
 
 def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> ElectrodeCheck:
-    """Ask for a press near each electrode, and return which channels answer.
+    """Ask the user for a press near each electrode, and return the channel that changes most under each press.
 
     Args:
-        examination: Result of listening.
+        examination: Result of the port check.
         electrodes: Electrodes of the model; empty for any model.
 
     Raises:
@@ -172,9 +174,9 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
     if device.channels:
         channel_of_electrode = dict(device.channels)
     elif len(electrodes) == len(channel_names) and not are_electrodes_named:
-        channel_of_electrode = dict(zip(electrodes, channel_names, strict=True))  # by their order
+        channel_of_electrode = dict(zip(electrodes, channel_names, strict=True))  # in the order of the channels
     else:
-        channel_of_electrode = {name: name for name in channel_names}
+        channel_of_electrode = {name: name for name in channel_names}  # each channel has the name of its electrode
     with Port(examination.url, baud=examination.baud, request=device.request) as port:
         return check_electrodes(port, device, channel_of_electrode, say)
 
@@ -182,8 +184,8 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
 def port_lines() -> Iterator[str]:
     """Yield a line for each serial port of this machine.
 
-    The line names the port, and describes the frames that the port received within one second. If there were no intact
-    frames, the line contains the first missing setting. If the port cannot be read, the line contains the error.
+    The line contains the name of the port, and describes the frames that arrived within one second. If no intact frames
+    arrived, the line names the first missing setting. If the port cannot be read, the line contains the error message.
     """
     for port in sorted(list_ports.comports()):
         try:
@@ -200,19 +202,27 @@ def port_lines() -> Iterator[str]:
         yield f"{port.device} ({port.description}): {received}"
 
 
-def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
-    """Yield the names of the models with the given number of electrodes. Models that cannot be read are omitted."""
-    for name in dict.fromkeys(name for root in repositories(models) for name in model_names(root)):
+def _models_with(electrode_count: int, models: Path | None) -> Iterator[str]:
+    """Yield the names of the models with a given number of electrodes. Models that cannot be read are omitted.
+
+    Args:
+        electrode_count: The number of electrodes.
+        models: Value of `--models`; None if the option is not given.
+    """
+    names = [name for root in repositories(models) for name in model_names(root)]
+    unique_names = dict.fromkeys(names)  # several repositories may contain a model with the same name
+    for name in unique_names:
         with suppress(IsochargeError):
-            if len(Predictor(name, models=models).metadata.electrodes) == electrodes:
+            if len(Predictor(name, models=models).metadata.electrodes) == electrode_count:
                 yield name
 
 
-def _setting(key: str, text: str) -> Any:
+def _parse_gain_setting(key: str, text: str) -> Any:
     """Parse an option that describes the gain, and return one number or a number for each electrode.
 
     Args:
-        key: Key of the setting in a device file, such as `pC_per_unit`, from which the name of the option follows.
+        key: Key of the setting in a device file, such as `pC_per_unit`. The error message contains the option with the
+            corresponding name, such as `--pc-per-unit`.
         text: Value of the option, such as `0.1` or `A=0.1,B=-0.1`.
 
     Raises:
@@ -228,12 +238,12 @@ def _setting(key: str, text: str) -> Any:
         raise InputError(f"{option}: expected a number like 0.0457, or A=0.0457,B=-0.0457, got {text!r}") from error
 
 
-def _request(text: str | None, rate_Hz: float) -> Request | None:
-    r"""Convert the text of `--request` to a request of bytes that is sent to the board for each frame.
+def _parse_request(text: str | None, rate_Hz: float) -> Request | None:
+    r"""Convert the text of `--request` to the bytes that are sent to the board as a request for each frame.
 
     Args:
-        text: Value of the option, None if it is not given. Escape sequences such as `\n` and `\x01` stand for one
-            byte each.
+        text: Value of the option; None if the option is not given. Each escape sequence, such as `\n` or `\x01`, stands
+            for one byte.
         rate_Hz: Number of requests per second, Hz.
 
     Raises:
@@ -254,13 +264,13 @@ def _request(text: str | None, rate_Hz: float) -> Request | None:
     return Request(data, rate_Hz)
 
 
-def _write(path: Path, examination: Examination, model: str) -> None:
+def _write_device_file(path: Path, examination: Examination, model: str) -> None:
     """Write the device file, and print the command that uses it.
 
     Args:
         path: The file.
-        examination: Result of listening, which contains the description of the board.
-        model: Model that is to be used.
+        examination: Result of the port check, which contains the content of the device file.
+        model: Name of the model for the printed command.
 
     Raises:
         InputError: If the file cannot be written.
@@ -269,10 +279,10 @@ def _write(path: Path, examination: Examination, model: str) -> None:
         write_whole(path, device_text(examination).encode())
     except OSError as error:
         raise InputError(f"--write {path}: cannot be written ({error.strerror}); choose another path") from error
-    if not examination.works:  # settings that a touch needs are missing
+    if not examination.works:  # settings are missing without which touches are not detected
         say(f"{path} written; it gives no touches yet: put in what is missing above")
         return
-    has_measured_offsets = "offset" in examination.device.get("gain", {})
+    has_measured_offsets = "offset" in examination.device.get("gain", {})  # the charges of the film at rest
     if has_measured_offsets:
         say("the offsets are right only if nothing lay on the film; a steady weight cannot be noticed")
     command = join(["isocharge", "serve", "stream", model, "--port", examination.url, "--device", str(path)])
@@ -283,9 +293,9 @@ def report_lines(examination: Examination) -> Iterator[str]:
     """Yield the lines of the report on a port: the frames, a table of the channels, and the missing settings.
 
     Args:
-        examination: Result of listening on the port.
+        examination: Result of the port check.
     """
-    # The frames.
+    # The frames
     speed = f" at {examination.baud} baud" if has_speed(examination.url) else ""
     yield f"{examination.url}{speed}: {examination.format}"
     yield f"{examination.bytes_seen} bytes in {examination.seconds:.1f} s, {examination.rate_Hz:.1f} frames/s"
@@ -294,7 +304,7 @@ def report_lines(examination: Examination) -> Iterator[str]:
     if examination.unused:
         yield f"channels that no electrode uses: {printable(', '.join(examination.unused))}"
 
-    # The channels: a line if their unit is not pC, and a table.
+    # The channels: a line if their unit is not pC, and a table with one row for each channel
     if examination.unit == "V":
         yield "the channels are volts, it seems, not pC"
     elif examination.unit != "pC":
@@ -305,9 +315,9 @@ def report_lines(examination: Examination) -> Iterator[str]:
     for channel in examination.channels:
         yield _channel_line(channel, examination.unit)
     if examination.held:
-        yield examination.held  # a sentence about held presses
+        yield examination.held  # a sentence about a press that was held during the check
 
-    # The missing settings.
+    # The missing settings
     yield "missing to get a touch:" if examination.missing else "missing to get a touch: nothing"
     for sentence in examination.missing:
         yield f"- {sentence}"
@@ -318,7 +328,7 @@ def report_lines(examination: Examination) -> Iterator[str]:
 
 
 UNIT_SYMBOLS = {"pC": "pC", "counts": "ct", "V": " V"}
-"""Symbols of the units in the head of the table, of two characters."""
+"""Symbols of the units in the head of the table. Each symbol has two characters."""
 
 COLUMN_WIDTHS = (12, 11, 12, 10, 10)
 """Widths of the columns of numbers, characters."""
@@ -331,7 +341,7 @@ VOLT_DECIMALS = (5, 6, 5, 5, 5)
 
 
 def _numbering_line(examination: Examination) -> str:
-    """Describe the sequence numbers of the frames and the clock of the device."""
+    """Return a line about lost and repeated frames, and about the clock of the device."""
     clock = "a device clock" if examination.device_clock else "no device clock"
     if examination.lost is None:
         return f"frames have no numbers; {clock}"
@@ -339,17 +349,17 @@ def _numbering_line(examination: Examination) -> str:
 
 
 def _channel_line(channel: ChannelHealth, unit: str) -> str:
-    """Return the row of a channel in the table.
+    """Return the row of a channel in the table of the report.
 
     Args:
         channel: Health of the channel.
         unit: Unit of the channel: "pC", "counts" or "V".
     """
-    # The attributes are named after pC, but have the unit of the channel. The hum is that at 50 Hz and at 60 Hz.
-    figures = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
-    all_decimals = VOLT_DECIMALS if unit == "V" else DECIMALS
+    # The attributes are named after pC, but their values have the unit of the channel. The hum has two amplitudes.
+    results = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
+    decimals_of_columns = VOLT_DECIMALS if unit == "V" else DECIMALS
     cells = [f"{printable(channel.name):8.8s}"]
-    for figure, width, decimals in zip(figures, COLUMN_WIDTHS, all_decimals, strict=True):
-        text = "?" if figure is None else f"{figure:.{decimals}f}"
+    for result, width, decimals in zip(results, COLUMN_WIDTHS, decimals_of_columns, strict=True):
+        text = "?" if result is None else f"{result:.{decimals}f}"
         cells.append(f"{text:>{width}s}")
     return "".join(cells)

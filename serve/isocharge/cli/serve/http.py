@@ -65,11 +65,11 @@ def http_command(
         typer.Option("--log", help="On stderr: sentences for people, or a line of JSON for each request and message."),
     ] = LogFormat.text,
 ) -> None:
-    """Serve models over HTTP, and over gRPC if asked, with the Open Inference Protocol v2 of Triton and KServe.
+    """Serve models over HTTP and, with --grpc-port, over gRPC. The protocol is the Open Inference Protocol v2.
 
-    Charges are in pC, positions in mm, forces in N. Prints the address once the server answers; `/` there is a page for
-    people, `/openapi.json` for programs, `/metrics` for Prometheus. Ctrl-C stops the server after it has answered the
-    requests that have begun.
+    Charges are in pC, positions in mm, and forces in N. Prints the address as soon as the server answers requests. The
+    server has a page for people at `/`, a description for programs at `/openapi.json`, and metrics for Prometheus at
+    `/metrics`. After Ctrl-C, the server answers all requests that have begun, and stops.
 
     Example: isocharge serve http --port 8000
     """
@@ -102,17 +102,17 @@ def http_command(
 
 @contextmanager
 def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
-    """Yield the traffic counters of the servers, which write the log of requests if `--log json` is given.
+    """Context manager that yields the traffic counters of the servers, and writes a log of requests for `--log json`.
 
-    A separate thread writes the log to stderr while the context is open, so that a slow reader of stderr does not delay
-    the answers. Warnings of all packages are written to the same log.
+    A separate thread writes the log to stderr, so a slow reader of stderr does not delay the answers. The warnings of
+    all packages are written to the same log.
 
     Args:
         log: Value of `--log`.
         token: Token that the log must not contain.
     """
     if log is LogFormat.text:
-        yield Traffic()  # without a log of requests
+        yield Traffic()  # counters without a log of requests
         return
     with WriterQueue(write_stderr) as line_queue:
         request_log = RequestLog(line_queue.put, secret=token)
@@ -124,16 +124,16 @@ def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
 
 
 def _report(traffic: Traffic, level: str, event: str, message: str) -> None:
-    """Report an event of the server as a line of the log. If there is no log, print a sentence on stderr.
+    """Report an event of the server as a line of the log or, without a log, as a sentence on stderr.
 
     Args:
-        traffic: Counters of the server, which have the log.
+        traffic: Counters of the server, which contain the log; `traffic.log` is None without a log.
         level: Level of the event in the log.
         event: Name of the event: "refused" for models that are not served, or "serving".
         message: The reason for the refusal, or the names of the served models.
     """
     if traffic.log is not None:
-        traffic.log.message(level, event, message)
+        traffic.log.write_message(level, event, message)
     elif event == "refused":
         say(f"refused: {message}")
     else:
@@ -146,7 +146,7 @@ def _grpc(handler: Handler, host: str, port: int | None, tls: Tls | None) -> Abs
     Args:
         handler: Handler of the HTTP server, whose models, limits and token are used.
         host: Name or address on which the server listens.
-        port: Port; None for no gRPC server, whose address is empty.
+        port: Port of the gRPC server; None for no gRPC server. The yielded address is then empty.
         tls: Certificate and key; None for no TLS.
     """
     if port is None:

@@ -68,7 +68,7 @@ def plot_command(
     ] = None,
     models: ModelsOption = None,
 ) -> None:
-    """Draw a recording: the path on the film (mm), position, force (N) and charges (pC) over time, flags.
+    """Draw a recording: the path on the film (mm), and position, force (N), charges (pC) and flags over time.
 
     The picture shows the records as they were written. No contacts are computed again.
 
@@ -104,13 +104,13 @@ PlottedRecord = defstruct(
     "PlottedRecord",
     [(name, PredictionRecord.__annotations__[name]) for name in (*NUMBERS, "charge_pC", "charge_raw_pC", "flags")],
 )
-"""A record that is read from a recording: only the fields that are drawn, with the types of the record."""
+"""A record of a recording, reduced to the fields that are drawn. The types are those of `PredictionRecord`."""
 
 
 def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
-    """Convert records to one array for each column.
+    """Convert records to columns: one array for each number, each charge and each flag.
 
-    The electrodes are those of the first record.
+    The names of the electrodes are taken from the first record.
 
     Args:
         records: The n records.
@@ -133,6 +133,7 @@ def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
     row_type = np.dtype((float, len(names)))  # None in a row becomes NaN
     rows = np.fromiter((_record_values(record, electrodes) for record in all_records), row_type)  # shape (n, n_column)
     columns = dict(zip(names, rows.T, strict=True))
+    # Leave out the flags that no record has.
     return {name: column for name, column in columns.items() if name not in MEANINGS or column.any()}
 
 
@@ -159,7 +160,7 @@ class _Groups(NamedTuple):
         start: Position of the first record of each group, shape (n_group,).
         start_time: Time of the first record of each group, in the unit of the time axis.
         end_time: Time of the last record of each group, in the unit of the time axis.
-        after_gap: Groups that follow a gap, across which no line is drawn.
+        after_gap: Numbers of the groups that follow a gap. No line is drawn across a gap.
     """
 
     start: Integers
@@ -171,8 +172,8 @@ class _Groups(NamedTuple):
     def of(cls, time_s: Array, unit_s: float) -> "_Groups":
         """Divide consecutive records into at most `MAX_GROUPS` groups of equal size, and find the gaps between them.
 
-        A gap is a pause before a group that is much longer than the usual time between the starts of two groups. It is
-        at least `MIN_GAP_S`, and at least `MIN_GAP_GROUPS` times this usual time.
+        A gap is a pause before a group that is much longer than the usual time between the starts of two groups. A gap
+        is at least as long as `MIN_GAP_S`, and at least `MIN_GAP_GROUPS` times as long as this usual time.
 
         Args:
             time_s: Times since the first record, shape (n,), s.
@@ -182,26 +183,37 @@ class _Groups(NamedTuple):
             The groups, with times in the unit of the time axis.
         """
         group_size = math.ceil(len(time_s) / MAX_GROUPS)
-        start = np.arange(0, len(time_s), group_size)  # first record of each group
-        last = np.append(start[1:], len(time_s)) - 1  # last record of each group
+        start = np.arange(0, len(time_s), group_size)  # position of the first record of each group
+        last = np.append(start[1:], len(time_s)) - 1  # position of the last record of each group
         start_s = time_s[start]
         end_s = time_s[last]
 
         usual_length_s = float(np.median(np.diff(start_s))) if len(start) > 1 else 0.0
         min_gap_s = max(MIN_GAP_S, MIN_GAP_GROUPS * usual_length_s)
-        pause_s = start_s[1:] - end_s[:-1]  # before the second group, the third group, and so on
-        after_gap = np.flatnonzero(pause_s > min_gap_s) + 1
+        pause_s = start_s[1:] - end_s[:-1]  # pauses before the second group, before the third group, and so on
+        after_gap = np.flatnonzero(pause_s > min_gap_s) + 1  # numbers of the groups after a gap
         return cls(start, start_s / unit_s, end_s / unit_s, after_gap)
 
     def draw_band(self, axes: Any, lower: Array, upper: Array, **style: Any) -> None:
-        """Draw the band between two columns, from the smallest to the largest value of each group."""
+        """Draw the band between two columns, with one point for each group.
+
+        Args:
+            axes: Axes of matplotlib.
+            lower: Lower edge of the band at each record, shape (n,). NaN stands for no value.
+            upper: Upper edge of the band at each record, shape (n,). NaN stands for no value.
+            style: Further arguments of `fill_between`.
+        """
+        # Smallest lower edge and largest upper edge of the records of each group; `fmin` and `fmax` ignore NaN.
         group_lower = np.fmin.reduceat(lower, self.start)
         group_upper = np.fmax.reduceat(upper, self.start)
+
+        # A point of NaN interrupts the band at each gap.
         curves = (self.start_time, group_lower, group_upper)
-        axes.fill_between(*(np.insert(curve, self.after_gap, np.nan) for curve in curves), **style)
+        interrupted_curves = [np.insert(curve, self.after_gap, np.nan) for curve in curves]
+        axes.fill_between(*interrupted_curves, **style)
 
     def draw_line(self, axes: Any, values: Array, **style: Any) -> None:
-        """Draw the line of a column, which covers all values of each group."""
+        """Draw a column as a line. At each group, the line covers the range of the values of the group."""
         self.draw_band(axes, values, values, lw=1.1, **style)
 
 
@@ -211,7 +223,7 @@ def recording_picture(
     """Draw the picture of a recording.
 
     Args:
-        traces: Columns of the records, as `traces_of` returns them.
+        traces: Columns of the records by name, as `traces_of` returns them.
         sensor: The film; None if it is unknown.
         working_area: Corners of the working area, shape (n, 2), mm; None if it is unknown.
         title: Names of the file and the model.
@@ -244,7 +256,7 @@ def _time_unit(duration_s: float) -> tuple[float, str]:
     for min_duration_s, unit_s, unit in TIME_UNITS:  # from the longest unit to the shortest
         if duration_s >= min_duration_s:
             return unit_s, unit
-    return 1.0, "s"  # the clock was set back during the recording
+    return 1.0, "s"  # the duration is negative, because the clock was set back during the recording
 
 
 def _draw_over_time(figure: Any, groups: _Groups, traces: dict[str, Array], time_label: str) -> None:
@@ -274,11 +286,20 @@ def _draw_over_time(figure: Any, groups: _Groups, traces: dict[str, Array], time
 
 
 def _draw_with_std(axes: Any, groups: _Groups, traces: dict[str, Array], name: str, colour: str) -> None:
-    """Draw a quantity over time, and a band of two standard deviations around it."""
+    """Draw a quantity over time, and a band of two standard deviations to both sides of the quantity.
+
+    Args:
+        axes: Axes of matplotlib.
+        groups: Groups of records, each of which is drawn as a single point.
+        traces: Columns of the records by name.
+        name: Name of the column, such as "x_mm".
+        colour: Colour of the line and of the band.
+    """
+    quantity, _, unit = name.partition("_")
     values = traces[name]
-    spread = 2.0 * traces[name.replace("_", "_std_")]
-    groups.draw_band(axes, values - spread, values + spread, color=colour, alpha=0.25, lw=0.0)
-    groups.draw_line(axes, values, color=colour, label=name.partition("_")[0])
+    two_std = 2.0 * traces[f"{quantity}_std_{unit}"]
+    groups.draw_band(axes, values - two_std, values + two_std, color=colour, alpha=0.25, lw=0.0)
+    groups.draw_line(axes, values, color=colour, label=quantity)
 
 
 def _draw_charges(axes: Any, groups: _Groups, traces: dict[str, Array]) -> None:
@@ -290,9 +311,9 @@ def _draw_charges(axes: Any, groups: _Groups, traces: dict[str, Array]) -> None:
 
 
 def _draw_flags(axes: Any, groups: _Groups, traces: dict[str, Array], words: list[str]) -> None:
-    """Draw the times at which flags are set. Each flag has one row of bars.
+    """Draw bars for the times at which flags are set, in one row for each flag.
 
-    A single record is drawn as a short bar, so that it is visible.
+    A single record is also drawn as a short bar, because a bar without length would be invisible.
 
     Args:
         axes: Axes of matplotlib.
@@ -300,20 +321,20 @@ def _draw_flags(axes: Any, groups: _Groups, traces: dict[str, Array], words: lis
         traces: Columns of the records.
         words: The flags, from the lowest row to the highest.
     """
-    total_time = max(float(groups.end_time[-1]), 1e-9)  # not zero, even if there is only one record
+    total_time = max(float(groups.end_time[-1]), 1e-9)  # above zero, even if there is only one record
     min_length = 2e-3 * total_time
     lengths = np.maximum(groups.end_time - groups.start_time, min_length)
     for row_height, word in enumerate(words):
         # The flag of a group is set if the flag is set in one of its records.
         is_set = np.maximum.reduceat(traces[word], groups.start) > 0.0
         starts_and_lengths = np.column_stack([groups.start_time[is_set], lengths[is_set]])
-        bottom_and_height = (row_height - 0.35, 0.7)  # centred on the tick of the row
+        bottom_and_height = (row_height - 0.35, 0.7)  # the bar is centred on the tick of the row
         axes.broken_barh(starts_and_lengths, bottom_and_height, color=INK)
     axes.set(yticks=range(len(words)), yticklabels=words)
 
 
 def _label_axes(axes: Any, label: str) -> None:
-    """Add a label and a grid, and also a legend if a line of the axes has a label.
+    """Add a label and a grid to axes. Add a legend if a line or a band of the axes has a label.
 
     Args:
         axes: Axes of matplotlib.
@@ -340,7 +361,7 @@ def _draw_path(axes: Any, traces: dict[str, Array], time: Array, time_label: str
     """
     position_mm = np.column_stack([traces["x_mm"], traces["y_mm"]])
     has_position = ~np.isnan(position_mm[:, 0])
-    contacts = _every_nth(np.flatnonzero(has_position), MAX_POINTS)  # numbers of the records that are drawn as dots
+    contacts = _every_nth(np.flatnonzero(has_position), MAX_POINTS)  # positions of the records that are drawn as dots
     if len(contacts):
         line_x, line_y = _every_nth(position_mm, MAX_POINTS).T
         axes.plot(line_x, line_y, color=INK, lw=0.5, alpha=0.5)  # NaN separates the presses
@@ -363,7 +384,7 @@ def _draw_contacts(
         axes: Axes of matplotlib.
         traces: Columns of the records.
         position_mm: Position of each record, shape (n, 2), mm.
-        contacts: Numbers of the records that are drawn.
+        contacts: Positions of the drawn records in the columns, shape (m,).
         time: Time of each record, shape (n,), in the unit of the label.
         time_label: Label of the scale of colours.
     """
@@ -403,6 +424,6 @@ def _draw_contacts(
 
 
 def _every_nth(values: Any, max_count: int) -> Any:
-    """Return every n-th row of an array. The function uses the smallest n for which at most `max_count` rows remain."""
-    step = max(1, math.ceil(len(values) / max_count))
-    return values[::step]
+    """Return every n-th row of an array, with the smallest n for which at most `max_count` rows remain."""
+    n = max(1, math.ceil(len(values) / max_count))
+    return values[::n]

@@ -33,7 +33,8 @@ def predict_command(
 ) -> None:
     """Compute positions (mm) and forces (N) with their standard deviations from the charges of presses (pC).
 
-    The column `flags` states why a row may be wrong: outside the working area or forces, misfit, far beyond both.
+    The column `flags` states why a contact may be wrong. For example, the contact may be outside the working area or
+    the range of forces, or the charges may fit no single contact.
 
     Example: isocharge serve predict three-25um-biaxial presses.csv > contacts.csv
     """
@@ -49,7 +50,7 @@ def predict_command(
 
 
 def _read_charges(file: str, electrodes: tuple[str, ...]) -> Array:
-    """Read charges, and return them in the order of the electrodes, shape (n, electrodes), pC.
+    """Read the charges of n presses, and return the charges in the order of the electrodes, shape (n, electrodes), pC.
 
     Args:
         file: Path of a CSV or Parquet file; `-` for CSV text on stdin.

@@ -1,4 +1,4 @@
-"""Output of the records of `serve stream` and `serve replay`: options, writers, and the summary at the end."""
+"""Output of the records of `isocharge serve stream` and `isocharge serve replay`, and the summary at the end."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -19,7 +19,7 @@ WaitOption = Annotated[
 
 
 class LogFormat(StrEnum):
-    """What a server writes on stderr."""
+    """Format of the messages of a server on stderr."""
 
     text = "text"
     json = "json"
@@ -36,10 +36,10 @@ OutputOption = Annotated[
 ]
 
 DEFAULT_TARGETS = ("json",)
-
+"""Targets of the output if the option `--output` is not given."""
 
 LATENCIES = 100_000
-"""Number of records, the latest ones, over which the summary's percentiles are taken."""
+"""Number of the latest records from whose latencies the summary computes percentiles."""
 
 RecordWriter = Callable[[PredictionRecord], object]
 """Function that is called with each record."""
@@ -53,7 +53,7 @@ def write_records(
     Args:
         records: The records.
         writers: Functions that write a record, which are called in their order.
-        latencies: Collects the latency of each record, us.
+        latencies: Queue to which the latency of each record is added, us.
     """
     last_tare_pC = None
     for record in records:
@@ -61,7 +61,7 @@ def write_records(
             write(record)
         if record.tare_pC != last_tare_pC:
             last_tare_pC = record.tare_pC
-            if last_tare_pC is not None:  # it is None until the tare is measured
+            if last_tare_pC is not None:  # None until a tare is measured
                 say("tared: " + ", ".join(f"{name} {charge:.2f} pC" for name, charge in last_tare_pC.items()))
         if record.latency_us is not None:
             latencies.append(record.latency_us)
@@ -71,8 +71,8 @@ def outputs_of(targets: Sequence[str] | None, touch: TouchStream, *, is_live: bo
     """Return the outputs for the targets of `--output`.
 
     Args:
-        targets: Values of the option.
-        touch: The stream, whose records they get.
+        targets: Values of the option; None or empty for `DEFAULT_TARGETS`.
+        touch: The stream whose records are written.
         is_live: Whether the records come from a sensor.
 
     Raises:
@@ -90,22 +90,27 @@ def outputs_of(targets: Sequence[str] | None, touch: TouchStream, *, is_live: bo
 
 
 def say_missing_records(outputs: Outputs) -> None:
-    """Print how many records are missing in each output. The outputs must have been closed."""
-    for target, missing in outputs.not_written.items():
-        if missing is not None:
-            say(f"{target}: {missing} records not written, the oldest: the output was too slow")
+    """Print how many records are missing in each output. The outputs must have been closed.
+
+    Args:
+        outputs: The outputs. `not_written` contains the number of missing records of each incomplete output by its
+            target; None if an error ended the output.
+    """
+    for target, missing_records in outputs.not_written.items():
+        if missing_records is not None:
+            say(f"{target}: {missing_records} records not written, the oldest: the output was too slow")
         else:
             say(f"{target}: incomplete")
 
 
 def summary(touch: TouchStream, latencies: deque[float]) -> str:
-    """Format the numbers of frames and faults, and percentiles of the latency.
+    """Return the summary of a stream: the numbers of frames and faults, and percentiles of the latency.
 
     Args:
         touch: The stream.
         latencies: Latencies of the latest records, us.
     """
-    totals = touch.totals()  # numbers of frames and bytes
+    totals = touch.totals()  # numbers of frames, damaged frames and dropped bytes
     counts = touch.counts  # numbers of outages and of skipped frames
     frames_text = (
         f"{totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated, {totals.restarts} restarts; "

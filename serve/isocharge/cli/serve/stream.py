@@ -148,52 +148,60 @@ def stream_command(
 ) -> None:
     """Follow a sensor live: read its port, and print position (mm) and force (N) for every frame of charges.
 
-    The first 100 frames (0.5 s at 200 Hz) are the tare, the charges at rest: leave the film alone meanwhile. The signal
-    SIGUSR1 starts a new tare. SIGUSR2 discards the estimated changes of the film.
-    SIGHUP loads the latest version of MODEL without losing a frame. Ctrl-C stops. If the reader of stdout is too slow
-    for a sensor, the oldest lines are dropped and counted in the summary; a recording (--record) is complete. Exit
-    code 1 if no frames are recognised within --seconds.
+    The tare (the charges at rest) is measured from the first 100 frames, which take 0.5 s at 200 Hz. Do not touch the
+    film meanwhile. The signal SIGUSR1 starts a new tare. The signal SIGUSR2 discards the estimated changes of the film.
+    The signal SIGHUP loads the latest version of MODEL without losing a frame. Ctrl-C stops the command. If the reader
+    of stdout is too slow for a sensor, the oldest lines are dropped, and the summary states their number. A recording
+    (--record) is complete even if lines are dropped. The exit code is 1 if no frames are recognised within --seconds.
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
     if name is not None and not (0 < len(name) <= MAX_NAME_CHARACTERS and is_printable(name)):
         raise InputError(f"--name: expected 1 to {MAX_NAME_CHARACTERS} printable characters, got {shown(name)}")
-    address = None if live is None else page_address(live, token)
+    address = None if live is None else page_address(live, token)  # None for no page
     tls = page_tls(live, tls_cert, tls_key)
+
+    # The options take precedence over the settings of the device file.
     predictor = Predictor(model, models=models)
     board = load_device(device)
     if offset_limit_pC is not None:
         board = with_settings(board, "tare", offset_limit_pC=offset_limit_pC)
-    board = with_settings(board, "track", on=True) if track else board
-    board = with_settings(board, "follow", on=True) if follow else board
-    path = TouchStream(predictor, board, policy=policy, frame_id=name)
+    if track:
+        board = with_settings(board, "track", on=True)
+    if follow:
+        board = with_settings(board, "follow", on=True)
+    touch = TouchStream(predictor, board, policy=policy, frame_id=name)
     latencies: deque[float] = deque(maxlen=LATENCIES)
     recorder = Recorder(record, predictor.metadata.label, policy.value, board.table, name) if record else None
-    recorded = RecordedStream(path, recorder)
-    with ExitStack() as stack:
+    stream = RecordedStream(touch, recorder)
+    with ExitStack() as stack:  # closes the contexts in reverse order
         stack.enter_context(until_stopped())
         page = None
         if address is not None:
             folder = find_model(model, models)
-            page = stack.enter_context(live_page(address, token, path.frame_id, predictor.metadata, folder, tls=tls))
+            page = stack.enter_context(live_page(address, token, touch.frame_id, predictor.metadata, folder, tls=tls))
         source = stack.enter_context(
             open_source(port, baud=baud, reconnect=reconnect, request=board.request, wait=wait)
         )
-        stack.enter_context(on_signal(signal.SIGUSR1, recorded.request_tare))
-        stack.enter_context(on_signal(signal.SIGUSR2, recorded.request_film_reset))
-        renew = partial(recorded.request_model, partial(_load, model, models))
-        stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(renew)))
+
+        # The handlers of the signals only request changes, which the stream carries out later.
+        stack.enter_context(on_signal(signal.SIGUSR1, stream.request_tare))
+        stack.enter_context(on_signal(signal.SIGUSR2, stream.request_film_reset))
+        request_latest_model = partial(stream.request_model, partial(_load, model, models))
+        stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(request_latest_model)))
         timer = stack.enter_context(stop_after(seconds))
-        outputs = stack.enter_context(outputs_of(output, path, is_live=source.is_live))
+
+        outputs = stack.enter_context(outputs_of(output, touch, is_live=source.is_live))
         writers: list[RecordWriter] = [outputs.write]
         if page is not None:
+            # The page must not begin a recording if the command itself records the stream.
             header = None if recorder else RecordingHeader(policy.value, board.table, name)
-            stack.enter_context(answering(page, recorded, header))
-            feed = PageFeed(page, path, recorded)
+            stack.enter_context(answering(page, stream, header))
+            feed = PageFeed(page, touch, stream)
             writers.append(feed.write)
         if recorder:
             stack.enter_context(recorder)
-        records = stack.enter_context(closing(recorded.follow(source)))  # closed before the recorder
+        records = stack.enter_context(closing(stream.follow(source)))  # closed before the recorder
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
             with no_frames_advice_added(port, device):
@@ -201,8 +209,8 @@ def stream_command(
         finally:
             if source.is_live:
                 outputs.close()
-            say(summary(path, latencies))
-    has_no_frames = path.totals().frames == 0
+            say(summary(touch, latencies))
+    has_no_frames = touch.totals().frames == 0
     if has_no_frames:
         say(f"no frames were recognised; {no_frames_hint(port, device)}")
     say_missing_records(outputs)
@@ -213,13 +221,19 @@ def stream_command(
 
 
 def _load(model: str, models: Path | None) -> Predictor:
-    """Load the latest version of a model, and check its golden vectors on this machine."""
+    """Load the latest version of a model, and check that this machine computes the outputs in its golden vectors.
+
+    Args:
+        model: Name or path of the model.
+        models: Value of `--models`; None if the option is not given.
+    """
     folder = find_model(model, models)
     load_checked_model(folder)
     return Predictor(folder)
 
 
 def _load_labelled(label: str, models: Path | None) -> Predictor:
+    """Load the version of a model that a label `NAME/VERSION` in a recording names."""
     return Predictor(find_labelled_model(label, models))
 
 
@@ -242,8 +256,8 @@ def replay_command(
 ) -> None:
     """Play a recording of raw bytes again: the same model and device give the same records, bit for bit.
 
-    --device replaces the recorded description of the board, if that description was wrong. With --live, the recording
-    can be played on a page at any speed, until Ctrl-C.
+    If the recorded description of the board was wrong, replace it with --device. With --live, the recording can be
+    played on a page at any speed, until Ctrl-C.
 
     Example: isocharge serve replay touch.rec --real-time
     """
@@ -294,11 +308,11 @@ def _play_on_page(
         link: The reader's end of the link to the page.
         feed: Sender of the records to the page.
         outputs: The outputs, which are closed at the end of the recording.
-        latencies: Collects the latency of each record, us.
+        latencies: Queue to which the latency of each record is added, us.
     """
     records = play(on_marker=lambda marker: link.send_message(marker=[*marker]))
     write_records(records, [outputs.write, feed.write], latencies)
-    outputs.close()  # before Ctrl-C, which is the only end of the page and would discard the files
+    outputs.close()  # now, because the page stays open until Ctrl-C, which would discard files that are not closed
     link.send_message(is_complete=True)
     while link.wait_for_request() is not None:  # until the process of the page ends, or Ctrl-C
         pass

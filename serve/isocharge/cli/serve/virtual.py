@@ -1,4 +1,4 @@
-"""`isocharge serve virtual`: a virtual sensor, made of the simulator's forward map and amplifier."""
+"""`isocharge serve virtual`: a virtual sensor, which uses the forward map and the amplifier of the simulation."""
 
 import threading
 import time
@@ -116,8 +116,8 @@ def virtual_command(
 ) -> None:
     """Play a sensor: simulate presses that wander over the film, and send their charges as frames on a pseudo-terminal.
 
-    Prints the path of the port, solves the film, then plays until Ctrl-C. Nothing touches the film until it is solved,
-    during --rest, and in the first second of the random presses.
+    Prints the path of the port, solves the film, then plays until Ctrl-C. Nothing touches the film while the film is
+    solved, during --rest, and in the first second of the random presses.
 
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
@@ -174,7 +174,7 @@ def virtual_command(
 
 
 def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) -> tuple[Sensor, Probe]:
-    """Return the sensor and the probe as described, or, if there is a seed, a film and a probe that vary at random.
+    """Return the described sensor and probe or, if there is a seed, a sensor and a probe that vary at random.
 
     Args:
         sensor_name: Name or file of the sensor.
@@ -194,13 +194,19 @@ def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) 
 
 
 def _amplifier(noise: str, settings: VirtualScript) -> Amplifier:
-    """Return the amplifier that `--noise` names, with the changes that the settings of the script request."""
-    changes: dict[str, Any] = {
+    """Return the amplifier that `--noise` names, with the changes that the settings of the script request.
+
+    Args:
+        noise: Value of `--noise`.
+        settings: Settings of the script. Each setting that is None leaves the amplifier unchanged.
+    """
+    settings_of_amplifier: dict[str, Any] = {
         "step": settings.temperature_step_K,
         "bias": settings.drift_pC_per_s,
         "limit": settings.limit_pC,
     }
-    return replace(load_amplifier(noise), **{key: value for key, value in changes.items() if value is not None})
+    changes = {key: value for key, value in settings_of_amplifier.items() if value is not None}
+    return replace(load_amplifier(noise), **changes)
 
 
 def _untouched_frame(rate_Hz: float) -> Script:
@@ -213,12 +219,12 @@ def _frame_settings(frames: FrameFormat | None, board: BoardEncoder | None) -> d
     """Return the arguments of `VirtualSensor` that determine the frames.
 
     Args:
-        frames: Format of the frames, if there is no device file; None for the binary frame. A board has its own format.
+        frames: Format of the frames if there is no board; None for the binary format. A board has its own format.
         board: Board of the device file; None if there is none.
     """
     if board is not None:
         settings: dict[str, Any] = {"encode": board.encode}
-        # The sequence number and the device clock begin again at these values.
+        # Values at which the sequence number and the device clock of the board wrap to 0
         settings["seq_modulus"] = board.seq_modulus
         settings["t_us_modulus"] = board.t_us_modulus
         if board.request is not None:
@@ -231,7 +237,12 @@ def _frame_settings(frames: FrameFormat | None, board: BoardEncoder | None) -> d
 
 
 def _largest_distance_mm(radius_mm: float, scripted_presses: Script | None) -> float:
-    """Return the distance from the centre up to which charges are needed, mm."""
+    """Return the distance from the centre of the film up to which charges are needed, mm.
+
+    Args:
+        radius_mm: Largest distance of a random press, mm.
+        scripted_presses: Presses of the script; None if the presses are random.
+    """
     if scripted_presses is None or not scripted_presses.touching.any():
         return radius_mm
     distance_mm = np.hypot(scripted_presses.x_mm, scripted_presses.y_mm)
@@ -239,7 +250,12 @@ def _largest_distance_mm(radius_mm: float, scripted_presses: Script | None) -> f
 
 
 def _largest_force_N(force_max_N: float, scripted_presses: Script | None) -> float:
-    """Return the force up to which charges are needed, N."""
+    """Return the force up to which charges are needed, N.
+
+    Args:
+        force_max_N: Largest force of a random press, N.
+        scripted_presses: Presses of the script; None if the presses are random.
+    """
     if scripted_presses is None:
         return force_max_N
     return max(force_max_N, ROUNDING_MARGIN * float(scripted_presses.force_N.max()))

@@ -1,4 +1,4 @@
-"""Functions that commands with forward maps share: workers, progress, radius of a sweep, and simulated presses."""
+"""Functions that several commands with forward maps use, for workers, progress, stress and simulated presses."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
@@ -44,10 +44,12 @@ def executor_for(workers: int | None, cluster: str | None) -> AbstractContextMan
 
 @contextmanager
 def shown_run(target: Path) -> Iterator[None]:
-    """Show the progress of a resumable run. If the user stops the run, print that the same command continues it.
+    """Context manager that shows the progress of a resumable run.
+
+    If the user stops the run, a message states that the same command resumes the run.
 
     Args:
-        target: Output of the run.
+        target: File or folder that the run writes.
     """
     try:
         with shown_progress():
@@ -75,7 +77,7 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
         return parse_radius_mm(text)
     radii = []
     for probe in probes:
-        forward_map = map_to_search(sensor, probe, force)  # charges over the whole area that may be a working area
+        forward_map = map_to_search(sensor, probe, force)  # charges over the largest possible working area
         area = working_area(forward_map, noise_model("reference"))
         say(f"{probe.notation}: {area.summary}")
         radii.append(area.radius)
@@ -89,7 +91,7 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
 
 
 def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit: float = DEFAULT_STRESS_LIMIT) -> None:
-    """Print a warning for each probe that stresses the film beyond a limit.
+    """Print a warning for each probe that can stress the film beyond a limit.
 
     Args:
         film: The film.
@@ -123,7 +125,8 @@ def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, fo
         radius: Largest distance of a press from the centre, mm.
         force: Smallest and largest force, N.
     """
+    has_few_electrodes = len(sensor.electrodes) <= FEW_ELECTRODES
+    n_press = N_SIMULATED_PRESSES if has_few_electrodes else MANY_SIMULATED_PRESSES
     with TemporaryDirectory() as folder:
-        n_press = N_SIMULATED_PRESSES if len(sensor.electrodes) <= FEW_ELECTRODES else MANY_SIMULATED_PRESSES
         sweep = Sweep(radius, force, samples=n_press)
         return read_dataset(run_sweep(Path(folder) / "presses", sensor, probes, sweep))

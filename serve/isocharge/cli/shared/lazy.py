@@ -1,6 +1,6 @@
-"""Groups of commands whose modules are imported only when a command is called.
+"""Groups of commands that import the module of a command only when the command is called.
 
-The help of a group is therefore printed without importing its commands.
+The help of a group is therefore printed without importing the commands of the group.
 """
 
 from collections.abc import Mapping
@@ -16,10 +16,10 @@ from isocharge.common.extras import require
 
 
 class LazyCommand(NamedTuple):
-    """A command that is imported when it is called.
+    """Description of a command whose function is imported when the command is called.
 
     Attributes:
-        function_path: Place of its function, "package.module:function".
+        function_path: Module and name of the function, "package.module:function".
         summary: One sentence for the help of the group.
         extra: Extra of pyproject.toml that the command always needs; None if the base install is enough.
     """
@@ -33,25 +33,27 @@ def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer
     """Return a group of commands that are imported only when they are needed.
 
     A command is imported when the user calls it, completes its options, or requests its help. The help of the group
-    needs only the summaries.
+    needs only the summaries of the commands.
 
     Args:
         summary: Summary of the group.
         commands: The commands by name.
     """
 
-    # Typer creates the group itself and accepts only a class. The class therefore contains the commands of this group.
+    # Typer creates the object of the group itself and accepts only a class. The class is therefore defined here, where
+    # its methods can use `commands`.
     class LazyGroup(TyperGroup):
         """A group that stores only the names and the summaries of its commands."""
 
         def __init__(self, **settings: Any) -> None:
+            """Add a placeholder for each command, which has the summary of the command as its help."""
             super().__init__(**settings)
             for name, command in commands.items():
                 placeholder = TyperCommand(name, help=command.summary, short_help=command.summary)
                 self.add_command(placeholder)
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-            """Return the command that the arguments name. It is imported in place of its placeholder."""
+            """Import the command that the arguments name, and return the command in place of its placeholder."""
             name, command, remaining_args = super().resolve_command(ctx, args)
             if name is not None and name in commands:
                 command = load_command(commands[name])

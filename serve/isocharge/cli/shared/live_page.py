@@ -1,4 +1,4 @@
-"""Options of the live page for commands, and the messages between a stream and its page."""
+"""Options of commands for the live page, and the exchange of messages between a stream and its page."""
 
 import logging
 import math
@@ -49,10 +49,10 @@ STATE_INTERVAL_S = 0.25
 
 
 class RecordingHeader(NamedTuple):
-    """Content of the header of a recording that the page begins; see `Recorder`.
+    """Content of the header of a recording that the user begins on the live page.
 
     Attributes:
-        policy: Which frames have a record; a `Policy`.
+        policy: Value of `Policy`, which states for which frames records are computed.
         device: Content of the device file.
         name: Name of the film in the records; None or empty for the name of the sensor of the model.
     """
@@ -126,8 +126,8 @@ def page_tls(live: str | None, certificate: Path | None, key: Path | None) -> Tl
 def given_token(token: str | None) -> str | None:
     """Return the token that the option or the environment contains.
 
-    If the environment contains an empty token, the function returns an empty text. Typer alone would treat an empty
-    token as a missing token.
+    If the environment variable `ISOCHARGE_TOKEN` is empty, the function returns an empty text. Typer alone would treat
+    an empty token as a missing token.
     """
     return os.environ.get("ISOCHARGE_TOKEN") if token is None else token
 
@@ -137,7 +137,7 @@ def page_address(live: str, token: str | None) -> Address:
 
     Args:
         live: Value of `--live`: PORT or HOST:PORT.
-        token: Value of `--token`.
+        token: Value of `--token`; None if the option is not given.
 
     Raises:
         InputError: If `live` has another form, or if other machines could see the page without a token.
@@ -167,15 +167,15 @@ def live_page(
     is_recording: bool = False,
     tls: Tls | None = None,
 ) -> Iterator[ReaderEnd]:
-    """Run the page of a stream in a separate process, and print the address of the page.
+    """Context manager that runs the page of a stream in a separate process, and prints the address of the page.
 
     Args:
         address: Address at which the page listens.
         token: Value of `--token`.
-        name: Name of the stream, for people.
+        name: Name of the stream, which the page shows.
         metadata: Metadata of the model that estimates the contacts.
         model: Folder of the version of the model.
-        is_recording: Whether the stream is a recording, which waits until its page reads.
+        is_recording: Whether the stream is a recording. Its replay waits for the page instead of losing records.
         tls: Certificate and key; None for no TLS.
 
     Yields:
@@ -191,8 +191,9 @@ def live_page(
     description = describe_film(name, metadata, find_field(model, metadata))
     reader, page_end = make_link()
     page = Page(page_end, description, address, given_token(token), is_recording, tls)
-    # The process of the page ends when the reader's end is closed. This end is therefore closed before the code waits
-    # for the process, and also if the process cannot be started. Closing twice is harmless.
+    # The process of the page ends when the reader's end of the link is closed. At the end of the block, the contexts
+    # are closed in reverse order. The second `closing` therefore ends the process before `page_process` waits for its
+    # end. The first `closing` is needed if the process cannot be started. Closing twice is harmless.
     with closing(reader), page_process(page) as url, closing(reader):
         if is_recording:
             reader.enable_waiting()  # a slow page then delays the replay, instead of losing records
@@ -204,30 +205,30 @@ def live_page(
 class PageFeed:
     """Sends the records of a stream to its live page, and the counters of the stream a few times per second."""
 
-    def __init__(self, link: ReaderEnd, touch: TouchStream, live: RecordedStream | None = None) -> None:
-        """Initialise without records.
+    def __init__(self, link: ReaderEnd, touch: TouchStream, stream: RecordedStream | None = None) -> None:
+        """Store the stream and its link. No records have been sent yet.
 
         Args:
             link: The reader's end of the link to the page.
-            touch: The stream.
-            live: The stream with its recording; None for a replay.
+            touch: The stream whose records are sent.
+            stream: The same stream with its recording; None for a replay.
         """
         self._link = link
         self._touch = touch
-        self._live = live
+        self._stream = stream
         self._pack = SampleFormat(touch.predictor.metadata.electrodes).pack
         self._last_state_s = 0.0
         self._timestamps_s: deque[float] = deque(maxlen=RATE_RECORDS)
 
     def write(self, record: PredictionRecord) -> None:
-        """Send a record without waiting for the page, and from time to time also the state of the stream.
+        """Send a record without waiting for the page. From time to time, also send the state of the stream.
 
         If the process of the page has ended, a message is printed once, and the stream continues.
         """
         was_open = self._link.is_open
         self._link.send_sample(self._pack(record))
         self._timestamps_s.append(math.nan if record.timestamp is None else record.timestamp)
-        if was_open and not self._link.is_open:  # sending has closed the link
+        if was_open and not self._link.is_open:  # sending closes the link if the process of the page has ended
             say("the process of the live page has ended; the stream goes on without it")
         now_s = time.monotonic()
         if now_s - self._last_state_s > STATE_INTERVAL_S:
@@ -237,12 +238,17 @@ class PageFeed:
     def _rate_Hz(self) -> float | None:
         """Compute the frame rate of the board (Hz) from the times of the latest records; None if it is unknown."""
         elapsed_s = self._timestamps_s[-1] - self._timestamps_s[0]
-        if not elapsed_s > 0.0:
+        if not elapsed_s > 0.0:  # also if a time is NaN
             return None
         return (len(self._timestamps_s) - 1) / elapsed_s
 
     def _send_state(self, record: PredictionRecord) -> None:
-        recorder = self._live.recorder if self._live else None
+        """Send the counters and the state of the stream to the page.
+
+        Args:
+            record: The latest record.
+        """
+        recorder = self._stream.recorder if self._stream else None
         page_counters = {"reconnects": self._touch.counts.outages, "not_shown": self._link.dropped}
         self._link.send_message(
             counters=self._touch.totals()._asdict() | page_counters,
@@ -256,43 +262,43 @@ class PageFeed:
 
 
 @contextmanager
-def answering(link: ReaderEnd, live: RecordedStream, header: RecordingHeader | None) -> Iterator[None]:
-    """Carry out the requests of the page during the block, and show warnings of the package `serve` on the page.
+def answering(link: ReaderEnd, stream: RecordedStream, header: RecordingHeader | None) -> Iterator[None]:
+    """Context manager that carries out the requests of the page, and shows warnings of `isocharge.serve` on the page.
 
-    A thread waits for the requests and carries them out. It ends when the link is closed.
+    A separate thread waits for the requests and carries out each request. The thread ends when the link is closed.
 
     Args:
         link: The reader's end of the link to the page.
-        live: The stream.
-        header: Header of the recordings that the page begins. None refuses requests for recordings.
+        stream: The stream, which carries out the requests.
+        header: Header of the recordings that the page begins. If it is None, requests for recordings are refused.
     """
     handler = logging.Handler()
     handler.emit = lambda record: _show_note(link, record.getMessage())  # type: ignore[method-assign]
     logger = logging.getLogger("isocharge.serve")
     logger.addHandler(handler)
-    threading.Thread(target=_answer_requests, args=(link, live, header), name="page requests", daemon=True).start()
+    threading.Thread(target=_answer_requests, args=(link, stream, header), name="page requests", daemon=True).start()
     try:
         yield
     finally:
         logger.removeHandler(handler)
 
 
-def _answer_requests(link: ReaderEnd, live: RecordedStream, header: RecordingHeader | None) -> None:
+def _answer_requests(link: ReaderEnd, stream: RecordedStream, header: RecordingHeader | None) -> None:
     """Carry out requests of the page until the link is closed, and show each error on the page."""
     while (request := link.wait_for_request()) is not None:
         try:
-            _carry_out(request, link, live, header)
+            _carry_out(request, link, stream, header)
         except IsochargeError as error:
             _show_note(link, str(error))
 
 
-def _carry_out(request: LiveRequest, link: ReaderEnd, live: RecordedStream, header: RecordingHeader | None) -> None:
+def _carry_out(request: LiveRequest, link: ReaderEnd, stream: RecordedStream, header: RecordingHeader | None) -> None:
     """Carry out one request of the page: write a marker, begin or end a recording, tare, or reset the film.
 
     Args:
         request: The request.
         link: The reader's end of the link to the page.
-        live: The stream.
+        stream: The stream, which carries out the requests.
         header: Header of the recordings that the page begins; None if the command itself records the stream.
 
     Raises:
@@ -301,24 +307,24 @@ def _carry_out(request: LiveRequest, link: ReaderEnd, live: RecordedStream, head
     match request:
         case Marker(text=text):
             marker = recording.Marker(time.time(), text)
-            live.request_marker(marker)
+            stream.request_marker(marker)
             link.send_message(marker=[*marker])
         case Record(on=begins):
             if header is None:
                 raise InputError("the command that runs the stream records it already (--record)")
-            if begins:
-                model_label = live.predictor.metadata.label
+            if begins:  # otherwise the request ends a recording
+                model_label = stream.predictor.metadata.label
                 path = Path(f"{model_label.replace('/', '-')}-{time.strftime('%Y%m%d-%H%M%S')}.rec")
                 recorder = Recorder(path, model_label, header.policy, header.device, header.name)
-                live.request_recording(recorder)
+                stream.request_recording(recorder)
                 link.send_message(recording=f"{path.name}, which waits for data")
             else:
-                live.request_recording(None)  # ends the recording
+                stream.request_recording(None)
                 link.send_message(recording=None)
         case Tare():
-            live.request_tare()
+            stream.request_tare()
         case Back():  # back to the film as it was calibrated
-            live.request_film_reset()
+            stream.request_film_reset()
 
 
 def _show_note(link: ReaderEnd, text: str) -> None:

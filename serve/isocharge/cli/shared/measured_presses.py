@@ -1,4 +1,4 @@
-"""Options for files of measured presses, and the reader of such files for commands."""
+"""Options of commands for files of measured presses, and the function that reads such a file."""
 
 from pathlib import Path
 from typing import Annotated
@@ -34,8 +34,8 @@ def read_press_file(
     Args:
         file: CSV or Parquet file.
         electrodes: Names of the electrodes; None if all columns without another meaning are electrodes.
-        position_std_mm: Standard deviation of x and y where the file has none, mm.
-        force_std: Standard deviation of a force where the file has none, relative to the force.
+        position_std_mm: Standard deviation of x and y for presses without one in the file, mm.
+        force_std: Standard deviation of the force for presses without one in the file, relative to the force.
     """
     presses = read_presses(file, electrodes, position_std_mm=position_std_mm, force_std=force_std)
     if presses.ignored:

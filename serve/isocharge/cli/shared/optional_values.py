@@ -36,9 +36,10 @@ OPTIONAL_VALUES = {"--live": OptionalValue(DEFAULT_LIVE_ADDRESS, is_address)}
 
 
 def insert_omitted_values(words: Sequence[str]) -> list[str]:
-    """Insert the default values of options whose value is omitted.
+    """Insert the default value after each option whose value is omitted.
 
-    An option has a value if the next word of the command line is suitable as its value (`OPTIONAL_VALUES`).
+    The value of an option is omitted if the next word of the command line is not suitable as its value. The function
+    `is_value` of the option decides whether a word is suitable.
 
     Args:
         words: The command line. Words after `--` are arguments and remain as they are.
@@ -65,5 +66,5 @@ class OptionalValueCommand(TyperCommand):
     """A command that accepts the options in `OPTIONAL_VALUES` without a value."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the command line after the omitted values are inserted."""
+        """Insert omitted values into the command line, and parse the completed command line."""
         return super().parse_args(ctx, insert_omitted_values(args))

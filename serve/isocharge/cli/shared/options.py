@@ -101,10 +101,10 @@ def refuse(mistakes: Mapping[str, object]) -> None:
     """Refuse contradictory options before anything is computed.
 
     Args:
-        mistakes: Each key is the error message of a mistake, and its value is true if the mistake was made.
+        mistakes: Whether each mistake was made, by the error message for the mistake.
 
     Raises:
-        InputError: If a mistake was made. The message is that of the first one.
+        InputError: If a mistake was made. The error has the message of the first mistake.
     """
     for message, was_made in mistakes.items():
         if was_made:
@@ -112,10 +112,7 @@ def refuse(mistakes: Mapping[str, object]) -> None:
 
 
 def worker_count(workers: int | None) -> int:
-    """Return the value of `--workers`.
-
-    Without the option, return the number of processor cores, at most 64.
-    """
+    """Return the value of `--workers`. Without the option, return the number of processor cores, but at most 64."""
     from isocharge.simulate.execution.workers import cores
 
     return workers or min(cores(), 64)
@@ -140,7 +137,15 @@ def parse_side_force(text: str) -> tuple[float, float]:
 
 
 def _parse_pair(text: str, expected: str) -> tuple[float, float]:
-    """Parse two numbers that are separated by a comma. The error message begins with `expected`."""
+    """Parse two numbers that are separated by a comma.
+
+    Args:
+        text: The two numbers, such as "3,-2".
+        expected: Beginning of the error message, which describes the expected text.
+
+    Raises:
+        InputError: If the text is not two numbers separated by a comma.
+    """
     try:
         first, second = (parse_number(part.strip()) for part in text.split(","))
     except ValueError as error:

@@ -11,14 +11,14 @@ from isocharge.serve.port.source import STDIN
 
 @contextmanager
 def no_frames_advice_added(port: str, device: Path | None) -> Iterator[None]:
-    """Add advice to the error message if the bytes of a port contain no frames.
+    """Context manager that adds advice to the error message if the bytes of a port contain no frames.
 
     Args:
         port: Value of `--port`.
-        device: Value of `--device`.
+        device: Value of `--device`; None if the option is not given.
 
     Raises:
-        NoFramesError: If the block raises it.
+        NoFramesError: If the block raises this error. The advice is added to its message.
     """
     try:
         yield
@@ -31,7 +31,7 @@ def no_frames_hint(port: str, device: Path | None) -> str:
 
     Args:
         port: Value of `--port`.
-        device: Value of `--device`.
+        device: Value of `--device`; None if the option is not given.
     """
     if port == STDIN or Path(port).is_file():  # `isocharge serve doctor` can only listen on a port
         return "describe the board in a device file (--device)"

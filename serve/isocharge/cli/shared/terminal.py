@@ -1,8 +1,9 @@
 """Output and termination of the commands: results, messages, progress, standard streams and signals.
 
-All text that a command prints passes through this module, which escapes the characters that a terminal executes or
-hides. Messages are printed on stderr. Progress bars are only shown if stderr is a terminal. If a standard stream is
-closed, full or slow, the command does not fail, and its text is not written into another file.
+All text that a command prints passes through this module. The module escapes characters that a terminal would interpret
+as commands or would not show. Messages are printed on stderr. Progress bars are only shown if stderr is a terminal. If
+a standard stream is closed, full or slow, the command does not fail, and text for this stream is not written into
+another file.
 """
 
 import io
@@ -73,7 +74,9 @@ def open_closed_streams() -> None:
 
 
 def discard_output(descriptor: int) -> None:
-    """Redirect a standard stream to the null device. Otherwise Python would fail when it flushes the stream at exit.
+    """Redirect a standard stream to the null device.
+
+    Without this redirection, Python would fail when it flushes the stream at exit.
 
     Args:
         descriptor: File descriptor of the stream.
@@ -128,32 +131,36 @@ def write_stderr(line: str) -> None:
 
 
 def stdout_is_ready() -> bool:
-    """Return whether stdout accepts a line within a tenth of a second.
+    """Return whether stdout is ready for a line within a tenth of a second.
 
     A pipe that is ready has room for `PIPE_BUF` bytes, which is more than the length of a record.
     """
     try:
-        return bool(select.select([], [sys.stdout.fileno()], [], 0.1)[1])
+        _readable, writable, _exceptional = select.select([], [sys.stdout.fileno()], [], 0.1)
+        return bool(writable)
     except (OSError, ValueError, io.UnsupportedOperation):
-        return True  # the write raises the error
+        return True  # the error is raised again when the line is written
 
 
 def _write_buffered(text: str) -> None:
+    """Write a text to stdout through the buffer of Python, and flush the buffer."""
     sys.stdout.write(text)
     sys.stdout.flush()
 
 
 def _write_all(descriptor: int, data: bytes) -> None:
+    """Write all data to a file descriptor. If the descriptor is not ready, wait until it is ready."""
     while data:
         try:
-            data = data[os.write(descriptor, data) :]
+            written_bytes = os.write(descriptor, data)
+            data = data[written_bytes:]
         except BlockingIOError:  # another program on the same terminal has made it non-blocking
             select.select([], [descriptor], [])
 
 
 @contextmanager
 def until_stopped() -> Iterator[None]:
-    """Run the block until it ends, or until the command is asked to stop, which is not an error.
+    """Context manager whose block runs until it ends or until the command is stopped. A stop is not an error.
 
     Three events stop the block: Ctrl-C, the signal SIGTERM, and a reader of stdout that closes its end of the pipe.
     """
@@ -175,7 +182,7 @@ MIN_TIMER_S = 1e-3
 
 
 class StopTimer:
-    """Timer of `stop_after`.
+    """Timer that interrupts the block of `stop_after`.
 
     Attributes:
         has_expired: Whether the timer, and not Ctrl-C, has interrupted the block.
@@ -185,7 +192,7 @@ class StopTimer:
         self.has_expired = False
 
     def interrupt(self, *_: object) -> None:
-        """Interrupt the block. This is the handler of the signal SIGALRM.
+        """Interrupt the block. The timer calls this method as the handler of the signal SIGALRM.
 
         Raises:
             KeyboardInterrupt: Always.
@@ -196,9 +203,9 @@ class StopTimer:
 
 @contextmanager
 def stop_after(seconds: float | None) -> Iterator[StopTimer]:
-    """Interrupt the block after the given time in the same way as Ctrl-C, even while the command waits for a port.
+    """Context manager that interrupts its block after the given time, even while the command waits for a port.
 
-    A timer of the system sends the signal SIGALRM, whose handler raises KeyboardInterrupt.
+    A timer of the system sends the signal SIGALRM, whose handler raises KeyboardInterrupt, as Ctrl-C does.
 
     Args:
         seconds: Time, s; None for no limit.
@@ -221,7 +228,7 @@ def stop_after(seconds: float | None) -> Iterator[StopTimer]:
 
 @contextmanager
 def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[None]:
-    """Call the function `act` whenever a signal arrives during the block."""
+    """Context manager that calls the function `act` whenever the given signal arrives during the block."""
     previous_handler = signal.signal(number, lambda *_: act())
     try:
         yield
@@ -232,8 +239,9 @@ def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[Non
 def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
     """Return a handler of SIGHUP that calls `act`, or stops the command if its terminal has been closed.
 
-    The user sends SIGHUP to request the action. The system sends the same signal when the terminal is closed. The
-    handler distinguishes the two cases by the standard streams that were terminals when the command started.
+    The user sends SIGHUP to request the action. The system sends the same signal when the terminal is closed. If a
+    standard stream that was a terminal at the start of the command is not a terminal any more, the terminal has been
+    closed.
 
     Args:
         act: Function that the handler calls while the terminal is open. If the terminal has been closed, the handler
@@ -267,13 +275,13 @@ def say(message: str) -> None:
 
 
 def this_command() -> str:
-    """Return the command line as it was given, for the cards and reports that state how they were made."""
+    """Return the command line as it was given, for cards and reports that state the command by which they were made."""
     return shlex.join(["isocharge", *sys.argv[1:]])
 
 
 @contextmanager
 def warnings_to_stderr() -> Iterator[None]:
-    """Print the warnings of all packages of isocharge on stderr while the context is open.
+    """Context manager that prints the warnings of all packages of isocharge on stderr.
 
     Warnings of simulation and training begin with `caution:`.
     """
@@ -297,7 +305,7 @@ class _WarningFormatter(logging.Formatter):
 
 @contextmanager
 def shown_progress() -> Iterator[None]:
-    """Show the progress of all work inside the block: bars on a terminal, otherwise a line every few seconds."""
+    """Context manager that shows the progress of its block: bars on a terminal, otherwise a line every few seconds."""
     if sys.stderr.isatty():
         with _progress_bars() as show_bar, listening(show_bar):
             yield
@@ -310,9 +318,11 @@ class _ProgressLines:
     """Shows progress as plain lines of text, at most one line in each `PROGRESS_LINE_INTERVAL_S`."""
 
     def __init__(self) -> None:
+        """Print the first line after one interval."""
         self._next_line_s = time.monotonic() + PROGRESS_LINE_INTERVAL_S
 
     def __call__(self, title: str, done: int, total: int, note: str) -> None:
+        """Print a line that `done` of `total` steps are complete, unless the latest line is too recent."""
         if time.monotonic() >= self._next_line_s:
             self._next_line_s = time.monotonic() + PROGRESS_LINE_INTERVAL_S
             say(f"{title}: {done} of {total} {note}".rstrip())
@@ -320,7 +330,7 @@ class _ProgressLines:
 
 @contextmanager
 def _progress_bars() -> Iterator[Listener]:
-    """Open a display of progress bars on stderr, and yield the function that updates the bars.
+    """Context manager that shows progress bars on stderr, and yields the function that updates the bars.
 
     Each title has its own bar, which shows the elapsed and the remaining time.
     """
@@ -348,9 +358,9 @@ def _progress_bars() -> Iterator[Listener]:
         bar_of_title: dict[str, TaskID] = {}
 
         def update_bar(title: str, done: int, total: int, note: str) -> None:
-            """Show that `done` of `total` steps are complete in the bar with this title; create the bar if necessary.
+            """Show that `done` of `total` steps are complete in the bar with this title. Create the bar if necessary.
 
-            If fewer steps are complete than before, the work has started again, and the bar starts again, too.
+            If fewer steps are complete than before, the work has started again. The bar then also starts again.
 
             Args:
                 title: Title of the work, which identifies its bar.

@@ -1,4 +1,4 @@
-"""A virtual sensor made of the simulator's forward map and amplifier."""
+"""A virtual sensor that uses the forward map and the amplifier of the simulation."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,38 +15,39 @@ SCRIPT_S = 60.0
 
 
 def virtual_sensor(forward_map: ForwardMap, noise: str, seed: int, rate_Hz: float = 200.0) -> VirtualSensor:
-    """Return a sensor that plays random presses of up to 0.8 N over the whole area of a forward map.
+    """Return a virtual sensor that plays random presses over the whole area of a forward map.
 
     Args:
         forward_map: Charges of the presses.
-        noise: Level of the noise model.
+        noise: Name of the amplifier, such as `reference`.
         seed: Seed of presses, noise and offsets.
         rate_Hz: Frames per second, Hz.
     """
-    script = random_script(forward_map, seed, rate_Hz, DEFAULT_PLAYED_FORCE_RANGE[1])
-    return VirtualSensor(
-        film_charges(forward_map), script, noise=measure_function(load_amplifier(noise), rate_Hz), seed=seed
-    )
+    _min_force_N, max_force_N = DEFAULT_PLAYED_FORCE_RANGE
+    script = random_script(forward_map, seed, rate_Hz, max_force_N)
+    measure = measure_function(load_amplifier(noise), rate_Hz)
+    return VirtualSensor(film_charges(forward_map), script, noise=measure, seed=seed)
 
 
 def random_script(forward_map: ForwardMap, seed: int, rate_Hz: float, max_force_N: float) -> Script:
     """Return a script of presses that wander over the whole area of a forward map.
 
     Args:
-        forward_map: Forward map, to whose domain the presses are restricted.
+        forward_map: Forward map. The presses stay within its area and its range of forces.
         seed: Seed of the presses.
         rate_Hz: Frames per second, Hz.
         max_force_N: Largest force, N. It is reduced to the largest force of the forward map if necessary.
     """
     domain = forward_map.domain
-    max_force_N = min(domain.force_range[1], max_force_N)
-    min_force_N = min(domain.force_range[0], max_force_N)
+    min_map_force_N, max_map_force_N = domain.force_range
+    max_played_force_N = min(max_map_force_N, max_force_N)
+    min_played_force_N = min(min_map_force_N, max_played_force_N)
     return wander(
         seed=seed,
         seconds=SCRIPT_S,
         rate_Hz=rate_Hz,
         radius_mm=domain.radius,
-        force_range_N=(min_force_N, max_force_N),
+        force_range_N=(min_played_force_N, max_played_force_N),
     )
 
 
@@ -61,8 +62,8 @@ def film_charges(forward_map: ForwardMap) -> Charges:
 def film_charges_per_K(forward_map: ForwardMap) -> Charges | None:
     """Return the function that computes how much the touch charges of contacts change per kelvin of warming, pC/K.
 
-    The result is None if the temperature of the film does not change its pretension. Otherwise further presses are
-    solved.
+    The result is None if the temperature of the film does not change the pretension of the film. If the temperature
+    changes the pretension, further presses are simulated in order to determine the effect.
 
     Args:
         forward_map: Charges of the presses.
@@ -90,7 +91,7 @@ def _charges(map_charges: Callable[[Array], Array], min_force_N: float, contact:
         Charges, shape (n, electrodes), pC.
     """
     force_N = contact[:, 2]
-    relative_force = force_N.clip(max=min_force_N) / min_force_N  # 1 for forces in the domain
+    relative_force = force_N.clip(max=min_force_N) / min_force_N  # 1 for forces in the domain, otherwise below 1
     charge_factor = relative_force ** (2.0 / 3.0)
     contact_in_domain = contact.copy()
     contact_in_domain[:, 2] = force_N.clip(min=min_force_N)
@@ -117,7 +118,7 @@ class _RunningAmplifier:
     """An amplifier that continues its drift and its noise from call to call."""
 
     def __init__(self, amplifier: Amplifier, rate_Hz: float) -> None:
-        """Store the amplifier, which is started by the first call of `measure`."""
+        """Store the amplifier. The first call of `measure` creates the state of the amplifier."""
         self._amplifier = amplifier
         self._rate_Hz = rate_Hz
         self._measurement: Callable[..., Any] | None = None

@@ -1,5 +1,5 @@
-"""Reading and writing of files with named columns of numbers, with one module for each format.
+"""Reading and writing of files with named columns of numbers.
 
-`number_table` checks names, values and rows. `csv_table` and `parquet_table` turn their format into columns.
-`table_file` chooses the format by the name of the file.
+The modules `csv_table` and `parquet_table` convert a file of their format to columns. The module `number_table` checks
+the names, the values and the number of rows. The module `table_file` chooses the format by the name of the file.
 """

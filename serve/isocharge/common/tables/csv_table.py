@@ -1,7 +1,8 @@
-"""Columns of numbers as CSV text.
+"""Reading and writing of columns of numbers as CSV text.
 
-A line that begins with # is a comment, unless it is inside a quoted cell. Blank lines, and blanks around a name or a
-number, are ignored. Numbers are written with a decimal point. The texts `nan` and `inf` are not accepted.
+A line that begins with # is a comment, unless the line is a part of a quoted cell. Blank lines are ignored. Blanks
+before and after a name or a number are also ignored. Numbers must have a decimal point, and not a decimal comma. The
+texts `nan` and `inf` are not accepted.
 """
 
 import codecs
@@ -33,31 +34,31 @@ _OTHER_FORMATS = {
     b"PAR1": "the file is Parquet: rename it so that its name ends in .parquet",
     b"\x1f\x8b": "the file is compressed: unpack it, as with: gunzip < FILE > NEW.csv",
 }
-"""Advice for files that are not text in UTF-8, by their first bytes.
+"""Advice for files that are not text in UTF-8, by the first bytes of the file.
 
-UTF-32 precedes UTF-16, because the first bytes of UTF-32 begin with those of UTF-16.
+The entry of UTF-32 precedes the entries of UTF-16, because the mark of UTF-32 begins with the mark of UTF-16.
 """
 
 BYTE_ORDER_MARK = "\ufeff"
 
 
 class CsvTable(NumberTable):
-    """The columns of a CSV text."""
+    """Table of numbers that is read from a CSV text."""
 
     row_noun = "line"
 
     def __init__(
         self, lines: Iterable[str], names: Collection[str], where: str, error: type[InputError], expected: str
     ) -> None:
-        """Read the header.
+        """Read the header, which is the first line that is neither blank nor a comment.
 
         Args:
-            lines: Lines of the file.
-            names: Names that have a meaning. A header that begins with one of them is not a comment, even if the name
-                begins with #.
-            where: The file, for messages.
-            error: Class of the error that is raised for anything that is wrong with the file.
-            expected: The expected header, for messages.
+            lines: Lines of the text.
+            names: Names of columns that have a meaning. A header whose first name is one of these names is not a
+                comment, even if the name begins with #.
+            where: Name of the file, for error messages.
+            error: Class of the error that is raised for every mistake in the file.
+            expected: Description of the expected header, for error messages.
 
         Raises:
             error: If the file is empty, is not CSV text in UTF-8, or has too many columns.
@@ -66,9 +67,9 @@ class CsvTable(NumberTable):
         first_row = next(self._rows, None)
         if first_row is None:
             raise error(f"{where}: empty; expected {expected}")
-        _line_number, header = first_row
+        _, header = first_row
         if any("\0" in name for name in header):
-            # The high byte of an ASCII letter is zero. It is the first byte in UTF-16BE, and the second in UTF-16LE.
+            # In UTF-16, one of the two bytes of an ASCII letter is zero: the first in UTF-16BE, the second in UTF-16LE.
             encoding = "UTF-16BE" if header[0].startswith("\0") else "UTF-16LE"
             raise error(
                 f"{where}: the header has null characters: the file seems to be UTF-16 without a byte order mark; save "
@@ -80,40 +81,60 @@ class CsvTable(NumberTable):
         """Convert the cells of the requested columns to numbers, row by row.
 
         Args:
-            rules: Rule of each requested column, by its name. The rules only appear in error messages here.
-            max_rows: Largest number of rows.
+            rules: Rules of the requested columns, by the names of the columns. This method uses only their
+                descriptions, for error messages.
+            max_rows: Largest number of rows that is accepted.
 
         Raises:
-            error: If there are too many rows, or a cell is not a finite number.
+            error: If there are too many rows, a row has the wrong number of cells, or a cell is not a finite number.
         """
-        positions = {name: self.header.index(name) for name in rules}  # index of each column in a row
-        line_numbers = array("q")  # 64-bit integers, which need less memory than a list
-        numbers = array("d")  # 64-bit floats: the numbers of the first row, then those of the second row, and so on
+        column_indices = {name: self.header.index(name) for name in rules}
+        # The arrays of the module `array` need less memory than lists. "q" are 64-bit integers, "d" are 64-bit floats.
+        line_numbers = array("q")
+        numbers = array("d")  # the numbers of the first row, then the numbers of the second row, and so on
         for line_number, cells in self._rows:
             if len(line_numbers) == max_rows:
                 self._refuse_row_count(max_rows)
             self._check_cell_count(line_number, cells)
             line_numbers.append(line_number)
-            for name, position in positions.items():
-                number = _number(cells[position])
+            for name, column_index in column_indices.items():
+                number = _number(cells[column_index])
                 if number is None:
-                    self._refuse_cell(line_number, name, rules[name], cells[position])
+                    self._refuse_cell(line_number, name, rules[name], cells[column_index])
                 numbers.append(number)
-        rows = np.array(numbers, dtype=np.float64).reshape(len(line_numbers), len(positions))
-        values = dict(zip(positions, rows.T, strict=True))
+        rows = np.array(numbers, dtype=np.float64).reshape(len(line_numbers), len(column_indices))
+        values = dict(zip(column_indices, rows.T, strict=True))
         return NumberColumns(values, np.array(line_numbers, dtype=np.intp), self.row_noun)
 
     def _check_cell_count(self, line_number: int, cells: list[str]) -> None:
-        """Raise `error` if a row has fewer cells than the header, or more cells that are not blank."""
-        surplus = cells[len(self.header) :]
-        if len(cells) < len(self.header) or any(cell.strip() for cell in surplus):
+        """Check that a row has as many cells as the header. Additional blank cells are accepted.
+
+        Args:
+            line_number: Number of the line, for the error message.
+            cells: Cells of the row.
+
+        Raises:
+            error: If the row has too few cells, or additional cells that are not blank.
+        """
+        additional_cells = cells[len(self.header) :]
+        if len(cells) < len(self.header) or any(cell.strip() for cell in additional_cells):
             raise self.error(
                 f"{self.where}, line {line_number}: expected {len(self.header)} cells as in the header, got "
                 f"{len(cells)}: {shown(cells)}"
             )
 
     def _refuse_cell(self, line_number: int, name: str, rule: ColumnRule, cell: str) -> NoReturn:
-        """Raise `error` for a cell that is not a finite number."""
+        """Raise the error for a cell that is not a finite number.
+
+        Args:
+            line_number: Number of the line of the cell.
+            name: Name of the column.
+            rule: Rule of the column, whose description appears in the message.
+            cell: Content of the cell.
+
+        Raises:
+            error: Always.
+        """
         has_decimal_comma = "," in cell and _number(cell.replace(",", ".", 1)) is not None
         advice = "; write a decimal point" if has_decimal_comma else ""
         raise self.error(
@@ -122,6 +143,14 @@ class CsvTable(NumberTable):
         )
 
     def _refuse_header(self, reason: str) -> NoReturn:
+        """Raise the error for a wrong header, with advice if the columns are not separated by commas.
+
+        Args:
+            reason: What is wrong with the header, for the error message.
+
+        Raises:
+            error: Always.
+        """
         for separator, command in _SEPARATORS.items():
             if len(self.header) == 1 and separator in self.header[0]:
                 reason += (
@@ -132,10 +161,14 @@ class CsvTable(NumberTable):
 
 
 def csv_text(columns: Mapping[str, Array]) -> str:
-    """Return columns of shape (n,) as CSV text with all digits. NaN becomes an empty cell."""
+    """Return columns of numbers as CSV text. Numbers have all digits, and NaN becomes an empty cell.
+
+    Args:
+        columns: Columns by their names, each of shape (n,).
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)  # the names
+    writer.writerow(columns)  # the keys of `columns`, which are the names
     rows = np.column_stack(list(columns.values()))  # shape (n, n_column)
     for row in rows.tolist():
         writer.writerow("" if math.isnan(value) else repr(value) for value in row)
@@ -143,22 +176,27 @@ def csv_text(columns: Mapping[str, Array]) -> str:
 
 
 class _LinesWithoutComments:
-    """Iterator of the lines of a CSV text, in which each comment line is replaced by a blank line.
+    """Iterator over the lines of a CSV text that replaces each comment by a blank line.
+
+    The CSV reader therefore ignores the comments, and still counts their lines.
 
     Attributes:
-        at_row_start: Whether the next line begins a row. Otherwise the line continues a quoted cell and cannot be a
-            comment. The reader of the rows sets this attribute after each row.
+        is_at_row_start: Whether the next line begins a row. If the next line continues a quoted cell of the previous
+            line, it cannot be a comment. The code that reads the rows sets this attribute after each row.
     """
 
     def __init__(self, lines: Iterable[str], names: Collection[str]) -> None:
-        """Store the lines and the names of columns.
+        """Store the arguments.
 
-        A line whose first cell is one of these names is not a comment, even if it begins with #.
+        Args:
+            lines: Lines of the text, each with its line end.
+            names: Names of columns. A line whose first cell is one of these names is not a comment, even if the name
+                begins with #.
         """
-        self.at_row_start = True
+        self.is_at_row_start = True
         self._lines = iter(lines)
         self._names = names
-        self._at_first_line = True
+        self._is_at_first_line = True
 
     def __iter__(self) -> Iterator[str]:
         """Return the iterator itself."""
@@ -167,67 +205,70 @@ class _LinesWithoutComments:
     def __next__(self) -> str:
         """Return the next line, or a blank line in place of a comment.
 
-        After each line, the attribute `at_row_start` is False until the reader of the rows sets it again.
+        The attribute `is_at_row_start` becomes False, because the following line may continue a quoted cell.
         """
         line = next(self._lines)
-        if self._at_first_line:
+        if self._is_at_first_line:
             line = line.removeprefix(BYTE_ORDER_MARK)
-            self._at_first_line = False
-        is_comment = self.at_row_start and _is_comment(line, self._names)
-        self.at_row_start = False
+            self._is_at_first_line = False
+        is_comment = self.is_at_row_start and _is_comment(line, self._names)
+        self.is_at_row_start = False
         return "\n" if is_comment else line
 
 
 def _numbered_rows(
     lines: Iterable[str], names: Collection[str], where: str, error: type[InputError]
 ) -> Iterator[tuple[int, list[str]]]:
-    """Yield the line number, from 1, and the cells of each row that is neither blank nor a comment.
+    """Yield the line number and the cells of each row that is neither blank nor a comment.
 
-    If a row has several lines, its line number is the number of the last line.
+    The first line has the number 1. If a row extends over several lines, the line number is the number of its last
+    line.
 
     Args:
         lines: Lines of the text, each with its line end.
-        names: Names that have a meaning. A line that begins with # and one of these names is not a comment.
+        names: Names of columns that have a meaning. A line whose first cell is one of these names is not a comment,
+            even if the name begins with #.
         where: Name of the file, for error messages.
-        error: Class of the errors.
+        error: Class of the error that is raised.
 
     Raises:
         error: If the lines are not CSV text in UTF-8.
     """
-    source = _LinesWithoutComments(lines, names)
-    reader = csv.reader(source, strict=True)
+    lines_without_comments = _LinesWithoutComments(lines, names)
+    reader = csv.reader(lines_without_comments, strict=True)
     try:
         for cells in reader:
-            source.at_row_start = True  # the next line begins a row and may be a comment
+            lines_without_comments.is_at_row_start = True  # the next line begins a row and may be a comment
             if any(cell.strip() for cell in cells):
                 yield reader.line_num, cells
-    except InputError:  # from the iterator that supplies the lines
+    # The order of the next clauses matters, because InputError and UnicodeDecodeError are subclasses of ValueError.
+    except InputError:  # the iterator `lines` has raised an error with its own message
         raise
     except csv.Error as cause:
         raise error(f"{where}, line {reader.line_num}: not CSV text ({cause})") from cause
-    except UnicodeDecodeError as cause:  # a kind of ValueError, which is therefore caught before
+    except UnicodeDecodeError as cause:
         raise error(where + _decoding_advice(cause, reader.line_num)) from cause
-    except ValueError as cause:  # a line that is too long to be held
+    except ValueError as cause:  # a line is too long; the reader has not counted this line yet
         raise error(f"{where}, line {reader.line_num + 1}: not CSV text ({cause})") from cause
 
 
 def _decoding_advice(cause: UnicodeDecodeError, lines_before: int) -> str:
     """Return the end of an error message about bytes that are not UTF-8: the line, the reason and what to do.
 
-    If the file begins like a file of another known format, the message names this format instead.
+    If the file begins like a file of another known format, the message names this format and states what to do.
 
     Args:
-        cause: The error, which contains the piece of the file that was being decoded, and the position of the wrong
-            byte in this piece.
-        lines_before: Number of lines before this piece.
+        cause: The exception. It contains the part of the file that was decoded last, and the position of the wrong byte
+            in this part.
+        lines_before: Number of lines before this part.
     """
-    piece = cause.object
-    is_first_piece = lines_before == 0
-    other_format = _other_format(piece) if is_first_piece else None
-    if other_format:
-        return f": {other_format}"
-    line_number = lines_before + piece[: cause.start].count(b"\n") + 1
-    wrong_byte = piece[cause.start]
+    decoded_part = cause.object
+    is_first_part = lines_before == 0
+    format_advice = _other_format_advice(decoded_part) if is_first_part else None
+    if format_advice:
+        return f": {format_advice}"
+    line_number = lines_before + decoded_part[: cause.start].count(b"\n") + 1
+    wrong_byte = decoded_part[cause.start]
     return (
         f", line {line_number}: the byte 0x{wrong_byte:02x} is not text in UTF-8: "
         "save the file as UTF-8; if it is Windows or Latin-1 text, as with: iconv -f WINDOWS-1252 -t UTF-8 FILE > "
@@ -235,10 +276,8 @@ def _decoding_advice(cause: UnicodeDecodeError, lines_before: int) -> str:
     )
 
 
-def _other_format(data: bytes) -> str | None:
-    """If the bytes belong to another file format, return a sentence that names the format and states what to do.
-
-    Otherwise return None.
+def _other_format_advice(data: bytes) -> str | None:
+    """Return advice if a file has another format than CSV text in UTF-8; None if its format is not recognised.
 
     Args:
         data: First bytes of the file.
@@ -250,13 +289,18 @@ def _other_format(data: bytes) -> str | None:
 
 
 def _is_comment(line: str, names: Collection[str]) -> bool:
-    """Return whether a line begins with # and its first cell is not one of the names."""
+    """Return whether a line is a comment, because it begins with # and its first cell is not one of the names.
+
+    Args:
+        line: The line, which begins a row.
+        names: Names of columns that may begin with #.
+    """
     first_cell = line.partition(",")[0].strip()
     return first_cell.startswith("#") and first_cell not in names
 
 
 def _number(cell: str) -> float | None:
-    """Return the number in a cell, NaN for an empty cell, and None for anything that is not a finite number."""
+    """Return the number in a cell; NaN if the cell is empty, and None if it does not contain a finite number."""
     text = cell.strip()
     if not text:
         return math.nan

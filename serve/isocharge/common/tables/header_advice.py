@@ -1,4 +1,4 @@
-"""Advice for columns whose names differ from the expected names by their case, their language or their unit."""
+"""Advice for columns whose names differ from the expected names in capital letters, language or unit."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,7 +18,7 @@ GENERAL_WORDS = frozenset(
     | {"charge", "ladung", "carga", "carica", "q"}
     | {"electrode", "elektrode", "channel", "kanal", "canal", "ch"}
 )
-"""Words that may be added to the name of a column without changing its meaning."""
+"""Words that the name of a column may contain in addition, without a change of its meaning."""
 
 MAX_COLUMN_CHARACTERS = 100
 """Largest number of characters of a column name for which advice is given. A longer text is not the name of a
@@ -29,13 +29,14 @@ _LABEL_AND_UNIT = re.compile(r"(.*?)(?:\s*[\[(]\s*([^\[\]()]+?)\s*[\])]|[\s_/]+(
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """Names that other programs use for a column.
+    """Description of a column by which the column is recognised under another name.
 
     Attributes:
-        noun: What the column is, for messages: "column" or "electrode".
-        unit: Unit of its numbers; empty if it has none.
-        words: Words in lower case. A column name that contains one of these words probably means this column.
-        is_known_by_unit: Whether any column name with this unit in brackets means this column.
+        noun: Noun for the column in messages: "column" or "electrode".
+        unit: Unit of the numbers in the column; empty if the numbers have no unit.
+        words: Words in lower case. If the name of a column in a file contains one of these words, it probably means
+            this column.
+        is_known_by_unit: Whether every name with this unit in brackets means this column.
     """
 
     noun: str = "column"
@@ -45,32 +46,33 @@ class ColumnMeaning:
 
 
 def header_advice(columns: Iterable[str], absent: Mapping[str, ColumnMeaning]) -> Iterator[str]:
-    """Yield advice for each column that is probably one of the missing columns under another name.
+    """Yield advice for each column of a file that is probably a missing column under another name.
 
-    If several columns of the file resemble the same missing column, only the first of them gets the advice.
+    If several columns of the file resemble the same missing column, advice is given only for the first of these
+    columns.
 
     Args:
-        columns: Columns of the file that have no other meaning.
-        absent: Meanings of the missing columns, by name.
+        columns: Names of the columns of the file that have no meaning.
+        absent: Meanings of the missing columns, by the names of the missing columns.
     """
-    remaining = dict(absent)  # missing columns that no column resembles yet
+    remaining = dict(absent)  # missing columns for which no advice was given yet
     for column in columns:
-        if len(column) > MAX_COLUMN_CHARACTERS:  # not the name of a quantity
+        if len(column) > MAX_COLUMN_CHARACTERS:  # such a long text is not the name of a quantity
             continue
         for name, meaning in remaining.items():
             advice = _advice(column, name, meaning)
             if advice:
                 yield advice
-                del remaining[name]
+                del remaining[name]  # the `break` ends the loop, so the change of the dictionary does no harm
                 break
 
 
 def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
-    """Return advice for a column that is probably the missing column `name`, or an empty text for any other column.
+    """Return advice if a column of a file is probably a given missing column; return an empty text otherwise.
 
-    Three kinds of names are recognised. The name may differ only in its capital letters. It may consist of words that
-    mean the missing column. It may also consist of such words and a unit, which is either that of the missing column or
-    can be converted to it.
+    Three kinds of names are recognised. A name of the first kind differs from the missing name only by capital letters.
+    A name of the second kind consists of words that mean the missing column. A name of the third kind consists of such
+    words and a unit. The unit is either the unit of the missing column, or a unit that can be converted to it.
 
     Args:
         column: Name of the column in the file.
@@ -83,15 +85,15 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
         )
     advice_to_rename = f"rename {shown(column)} to {shown(name)}"
     if meaning.noun == "electrode":
-        meaning = replace(meaning, words=_words(name))  # an electrode is recognised by its own name
+        meaning = replace(meaning, words=_words(name))  # an electrode is recognised by the words of its name
 
-    # The column consists of words only, such as "force applied".
+    # Check whether the name consists only of words, such as "force".
     words = _words(column)
     other_words = words - meaning.words - GENERAL_WORDS  # general words, such as "position", do not change the meaning
     if _is_named(words, meaning) and not other_words:
         return advice_to_rename
 
-    # The column consists of a label and a unit, such as "force (N)" or "force_N".
+    # Check whether the name consists of a label and a unit, such as "force (N)" or "force_N".
     match = _LABEL_AND_UNIT.fullmatch(column)
     if match is None:
         return ""
@@ -108,12 +110,12 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
 
 
 def _is_named(words: frozenset[str], meaning: ColumnMeaning) -> bool:
-    """Return whether the words of a column name identify a column.
+    """Return whether the words in the name of a column mean the expected column.
 
-    The words must contain all words of the name of an electrode, or at least one word of any other column.
+    An electrode requires all words of its name. Any other column requires at least one of its words.
 
     Args:
-        words: Words of the column name in the file.
+        words: Words in the name of the column in the file.
         meaning: Meaning of the expected column.
     """
     if meaning.noun == "electrode":
@@ -122,5 +124,5 @@ def _is_named(words: frozenset[str], meaning: ColumnMeaning) -> bool:
 
 
 def _words(text: str) -> frozenset[str]:
-    """Return the words of a text in lower case, separated by anything but letters and digits."""
+    """Return the words of a text in lower case. All characters except letters and digits separate words."""
     return frozenset(word for word in re.split(r"[\W_]+", text.casefold()) if word)

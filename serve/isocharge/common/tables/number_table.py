@@ -1,8 +1,8 @@
-"""Named columns of numbers from a file: the checks of names, values and rows that all formats share.
+"""Named columns of numbers from a file, and the checks that all file formats share.
 
-Each format is a subclass of `NumberTable`. The subclass reads the header, and converts the requested columns to float64
-arrays in which NaN stands for an empty cell. All further checks are in this module, so that the same fault gets the
-same message in every format.
+Each file format is a subclass of `NumberTable`. The subclass reads the header, and converts the requested columns to
+float64 arrays in which NaN stands for an empty cell. All other checks are in this module. The same mistake in a file
+therefore leads to the same message in every format.
 """
 
 from abc import ABC, abstractmethod
@@ -32,15 +32,15 @@ MAX_LISTED_NAMES = 10
 
 @dataclass(frozen=True)
 class ColumnRule:
-    """The numbers that a column may hold.
+    """Rule that states which numbers a column may contain.
 
     Attributes:
-        description: Description of the expected cell for messages, such as "a force in N".
+        description: Description of a correct cell for messages, such as "a force in N".
         minimum: Smallest number that is accepted.
         maximum: Largest number that is accepted.
         is_positive: Whether only numbers above zero are accepted.
         may_be_empty: Whether empty cells are accepted.
-        meaning: Names that other programs use for the column, for advice about a header.
+        meaning: Description by which the column is recognised under another name, for advice about a header.
     """
 
     description: str
@@ -51,15 +51,21 @@ class ColumnRule:
     meaning: ColumnMeaning = field(default_factory=ColumnMeaning)
 
     def violations(self, values: Array) -> Booleans:
-        """Return a mask of the values that violate the rule, shape (n,). NaN stands for an empty cell."""
-        is_empty = np.isnan(values)
-        # Comparisons with NaN are false, so that an empty cell is not outside of the limits.
-        is_outside = (values < self.minimum) | (values > self.maximum)
+        """Compute which values of a column violate the rule.
+
+        Args:
+            values: Values of the column, shape (n,); NaN for an empty cell.
+
+        Returns:
+            Whether each value violates the rule, shape (n,).
+        """
+        # Comparisons with NaN are false, so these comparisons accept empty cells.
+        is_violation = (values < self.minimum) | (values > self.maximum)
         if self.is_positive:
-            is_outside |= values <= 0.0
+            is_violation |= values <= 0.0
         if not self.may_be_empty:
-            is_outside |= is_empty
-        return np.asarray(is_outside)
+            is_violation |= np.isnan(values)
+        return np.asarray(is_violation)
 
 
 CHARGE_RULE = ColumnRule("a charge in pC", meaning=ColumnMeaning("electrode", "pC"))
@@ -68,12 +74,12 @@ CHARGE_RULE = ColumnRule("a charge in pC", meaning=ColumnMeaning("electrode", "p
 
 @dataclass(frozen=True)
 class NumberColumns:
-    """Columns of numbers, and the numbers of the rows from which they were read.
+    """Columns of numbers, and the positions of their rows in the file.
 
     Attributes:
-        values: The columns by name, each of shape (n,); NaN for an empty cell.
-        row_numbers: Number of each row in the file, shape (n,).
-        row_noun: What the row numbers count: "line" of a text, "row" of a table.
+        values: The columns by their names, each of shape (n,); NaN for an empty cell.
+        row_numbers: Number of the line or row in the file from which each row was read, shape (n,).
+        row_noun: What the row numbers count: "line" for the lines of a text, or "row" for the rows of a table.
     """
 
     values: Mapping[str, Array]
@@ -81,22 +87,23 @@ class NumberColumns:
     row_noun: str
 
     def check(self, rules: Mapping[str, ColumnRule], where: str, error: type[InputError]) -> None:
-        """Check the values of all columns.
+        """Check that all values comply with the rules of their columns.
 
         Args:
-            rules: The rule of each column.
-            where: Beginning of the message, for example the file with a comma and a blank; may be empty.
-            error: Class of the error.
+            rules: Rules by the names of the columns.
+            where: Beginning of the error message, such as "presses.csv, "; may be empty.
+            error: Class of the error that is raised.
 
         Raises:
-            error: If a value breaks a rule. The message names the first such row, the column, the rule and the value.
+            error: If a value violates its rule. The message names the first wrong row, the column, the rule and the
+                value.
         """
         masks = [rules[name].violations(column) for name, column in self.values.items()]
         is_violation = np.column_stack(masks)  # shape (n, n_column)
         violations = np.argwhere(is_violation)  # row and column of each violation, ordered by rows
         if not violations.size:
             return
-        row, column_index = violations[0]
+        row, column_index = violations[0]  # the first violation
         name = list(self.values)[column_index]
         value = _value_text(float(self.values[name][row]))
         raise error(
@@ -106,23 +113,26 @@ class NumberColumns:
 
 
 def _value_text(value: float) -> str:
-    """Return a number as text for an error message, with enough digits to recognise the number."""
+    """Return a number as text for an error message.
+
+    The text has six significant digits if they are exact, and otherwise all digits.
+    """
     if np.isnan(value):
         return "an empty cell"
-    short = f"{value:.6g}"
-    if float(short) == value:
-        return short
-    return repr(value)
+    short_text = f"{value:.6g}"
+    is_exact = float(short_text) == value
+    return short_text if is_exact else repr(value)
 
 
 class NumberTable(ABC):
-    """A file with a header and columns of numbers, which is read once.
+    """Base class for a file with a header and columns of numbers. The columns can be read only once.
 
     Attributes:
-        header: Names of the columns.
-        where: The file, for messages.
-        error: Class of the error that is raised for anything that is wrong with the file.
-        row_noun: What the row numbers of the format count, for messages.
+        header: Names of the columns in the file.
+        where: Name of the file, for error messages.
+        error: Class of the error that is raised for every mistake in the file.
+        expected: Description of the expected header, for error messages.
+        row_noun: What the row numbers of the format count, for error messages: "line" or "row".
     """
 
     row_noun: ClassVar[str]
@@ -130,14 +140,14 @@ class NumberTable(ABC):
     def __init__(
         self, header: Sequence[str], names: Collection[str], where: str, error: type[InputError], expected: str
     ) -> None:
-        """Check the number of columns and store their names.
+        """Check the number of columns, and store the names of the columns.
 
         Args:
             header: Names of the columns in the file.
-            names: Names that have a meaning. Blanks at the ends of all other names are removed.
-            where: The file, for messages.
-            error: Class of the error that is raised for anything that is wrong with the file.
-            expected: The expected header, for messages.
+            names: Names of columns that have a meaning. Blanks at the ends of all other names are removed.
+            where: Name of the file, for error messages.
+            error: Class of the error that is raised for every mistake in the file.
+            expected: Description of the expected header, for error messages.
 
         Raises:
             error: If the file has too many columns.
@@ -152,15 +162,19 @@ class NumberTable(ABC):
     def choose_columns(
         self, required: Mapping[str, ColumnRule], optional: Mapping[str, ColumnRule] | None = None
     ) -> dict[str, ColumnRule]:
-        """Return the rules of the columns to read: all required columns, and the optional columns that the file has.
+        """Choose the columns to read: all required columns, and the optional columns that the file contains.
 
         Args:
-            required: Rules of the required columns, by name.
-            optional: Rules of the optional columns, by name.
+            required: Rules of the required columns, by the names of the columns.
+            optional: Rules of the optional columns, by the names of the columns.
+
+        Returns:
+            The rules of the chosen columns, by the names of the columns.
 
         Raises:
-            error: If a required column is missing, if the name of a column is similar to that of an absent optional
-                column, or if the file has one of the columns twice. The message states which column to rename.
+            error: If a required column is missing, if the file contains a chosen column twice, or if a column has a
+                similar name as an optional column that the file does not contain. The message states which column to
+                rename.
         """
         known_rules = {**required, **(optional or {})}
         chosen_rules = {name: rule for name, rule in known_rules.items() if name in self.header or name in required}
@@ -168,7 +182,7 @@ class NumberTable(ABC):
 
         missing_names = [name for name in required if name not in self.header]
         if missing_names:
-            # A missing column may be in the file under another name.
+            # The file may contain a missing column under another name. The message then contains advice.
             absent = {name: rule.meaning for name, rule in known_rules.items() if name not in self.header}
             advice = islice(header_advice(other_columns, absent), MAX_LISTED_NAMES)
             self._refuse_header("; ".join([f"missing: {_listed(missing_names)}", *advice]))
@@ -180,11 +194,14 @@ class NumberTable(ABC):
         return chosen_rules
 
     def refuse_similar_names(self, columns: Iterable[str], optional: Mapping[str, ColumnRule]) -> None:
-        """Raise `error` if the names of columns are similar to those of optional columns that the file does not have.
+        """Refuse columns whose names are similar to the names of optional columns that the file does not contain.
 
         Args:
-            columns: Names of the columns.
-            optional: Rules of the optional columns, by name.
+            columns: Names of the columns of the file that are checked.
+            optional: Rules of the optional columns, by the names of the columns.
+
+        Raises:
+            error: If a column has such a name. The column is probably an optional column whose name is misspelt.
         """
         absent = {name: rule.meaning for name, rule in optional.items() if name not in self.header}
         advice = list(islice(header_advice(columns, absent), MAX_LISTED_NAMES))
@@ -192,14 +209,16 @@ class NumberTable(ABC):
             self._refuse_header(f"{'; '.join(advice)}; or remove the column")
 
     def read(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
-        """Read columns and check their values.
+        """Read the chosen columns, and check their values.
 
         Args:
-            rules: Rules of the columns to read, in the requested order, as `choose_columns` returns them.
+            rules: Rules of the columns to read, as `choose_columns` returns them. The columns are returned in the same
+                order.
             max_rows: Largest number of rows that is accepted.
 
         Raises:
-            error: If the file is damaged or has more than `max_rows` rows, or if a cell breaks the rule of its column.
+            error: If the file is damaged or has more than `max_rows` rows, or if a cell violates the rule of its
+                column.
         """
         columns = self._read_columns(rules, max_rows)
         columns.check(rules, f"{self.where}, ", self.error)
@@ -207,17 +226,30 @@ class NumberTable(ABC):
 
     @abstractmethod
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
-        """Convert the requested columns to arrays without checking the values; see `read` for the arguments."""
+        """Convert the requested columns to arrays, without checking the values. `read` describes the arguments."""
 
     def _refuse_header(self, reason: str) -> NoReturn:
+        """Raise the error for a wrong header.
+
+        Args:
+            reason: What is wrong with the header, for the error message.
+
+        Raises:
+            error: Always.
+        """
         raise self.error(f"{self.where}: expected {self.expected}, got the header {shown(list(self.header))}; {reason}")
 
     def _refuse_row_count(self, max_rows: int) -> NoReturn:
+        """Raise the error for a file that has more than `max_rows` rows.
+
+        Raises:
+            error: Always.
+        """
         raise self.error(f"{self.where}: expected at most {max_rows:,} presses, got more; split the file")
 
 
 def _listed(names: Sequence[str]) -> str:
-    """List names for a message. If there are more than `MAX_LISTED_NAMES` names, the message only counts the others."""
+    """List the first `MAX_LISTED_NAMES` names for a message, and state the number of the other names."""
     listed = ", ".join(map(shown, names[:MAX_LISTED_NAMES]))
     if len(names) <= MAX_LISTED_NAMES:
         return listed

@@ -1,8 +1,8 @@
-"""Columns of numbers as Parquet.
+"""Reading and writing of columns of numbers as Parquet.
 
-The types of the requested columns and the number of rows are first checked in the metadata of the file. Then only the
-requested columns are decoded. The types of the columns may be integers, floating-point numbers and decimals of any
-width. Null and NaN stand for empty cells. All other columns may have any type.
+First, the number of rows and the types of the requested columns are checked in the metadata of the file. Then only the
+requested columns are decoded. A requested column may contain integers, floating-point numbers or decimal numbers of any
+width. Null and NaN stand for empty cells. The other columns of the file may have any type.
 """
 
 import io
@@ -34,28 +34,28 @@ MAX_FOOTER_BYTES = 16 << 20
 """Largest size of the metadata at the end of a file."""
 
 ROWS_PER_BATCH = 1 << 16
-"""Number of rows of a column that are decoded at a time."""
+"""Number of rows of a column that are decoded in one batch."""
 
 FIRST_INEXACT_INTEGER = 2**53
 """Smallest positive integer that may be the result of rounding in float64, because 2^53 + 1 is rounded to 2^53."""
 
 
 class ParquetTable(NumberTable):
-    """The columns of a Parquet file."""
+    """Table of numbers that is read from a Parquet file."""
 
     row_noun = "row"
 
     def __init__(
         self, file: BinaryIO, names: Collection[str], where: str, error: type[InputError], expected: str
     ) -> None:
-        """Read the metadata.
+        """Read the metadata of the file.
 
         Args:
-            file: A regular file, opened for reading; it stays open until the columns are read.
-            names: Names that have a meaning.
-            where: The file, for messages.
-            error: Class of the error that is raised for anything that is wrong with the file.
-            expected: The expected header, for messages.
+            file: The file, which is open for reading. It must remain open until the columns have been read.
+            names: Names of columns that have a meaning.
+            where: Name of the file, for error messages.
+            error: Class of the error that is raised for every mistake in the file.
+            expected: Description of the expected header, for error messages.
 
         Raises:
             error: If the file is not Parquet, is damaged, or has too many columns.
@@ -76,11 +76,12 @@ class ParquetTable(NumberTable):
         """Decode the requested columns.
 
         Args:
-            rules: Rule of each requested column, by its name. The rules only appear in error messages here.
-            max_rows: Largest number of rows.
+            rules: Rules of the requested columns, by the names of the columns. This method uses only their
+                descriptions, for error messages.
+            max_rows: Largest number of rows that is accepted.
 
         Raises:
-            error: If there are too many rows, or a column has no numbers, or the file is damaged.
+            error: If there are too many rows, if the type of a column is not a number type, or if the file is damaged.
         """
         row_count = self._metadata.num_rows
         if row_count > max_rows:
@@ -90,14 +91,18 @@ class ParquetTable(NumberTable):
         return NumberColumns(values, row_numbers, self.row_noun)
 
     def _read_column(self, name: str, rule: ColumnRule) -> Array:
-        """Return one column as float64, shape (n,), with NaN for null.
+        """Read one column, and check its type.
 
         Args:
             name: Name of the column.
             rule: Rule of the column, whose description appears in error messages.
 
+        Returns:
+            The numbers of the column as float64, shape (n,); NaN for null.
+
         Raises:
-            error: If the column has no numbers, or the file is damaged.
+            error: If the type of the column is not a number type, if the conversion may have rounded an integer, or if
+                the file is damaged.
         """
         from pyarrow.types import is_integer
 
@@ -114,19 +119,25 @@ class ParquetTable(NumberTable):
         return numbers
 
     def _decode(self, index: int, name: str) -> Array:
-        """Return one column as float64, shape (n,), decoded in batches of rows.
+        """Decode one column in batches of rows, which limits the memory.
 
         Args:
             index: Index under which Parquet stores the column.
             name: Name of the column, for error messages.
+
+        Returns:
+            The numbers of the column as float64, shape (n,); NaN for null.
+
+        Raises:
+            error: If the column has another number of rows than the metadata declare.
         """
-        row_count = self._metadata.num_rows  # number that the metadata declare
+        row_count = self._metadata.num_rows  # the number of rows that the metadata declare
         numbers = np.empty(row_count)
-        decoded_rows = 0
+        decoded_rows = 0  # number of rows that are decoded
         all_groups = list(range(self._metadata.num_row_groups))
         for batch in self._parquet.reader.iter_batches(ROWS_PER_BATCH, all_groups, [index], use_threads=False):
             batch_end = decoded_rows + batch.num_rows
-            if batch_end > row_count:  # the file has more rows than the metadata declare
+            if batch_end > row_count:  # the column has more rows than the metadata declare
                 break
             numbers[decoded_rows:batch_end] = _as_float64(batch.column(0))  # the only column of the batch
             decoded_rows = batch_end
@@ -140,7 +151,14 @@ class ParquetTable(NumberTable):
     def _leaf_index(self, field_name: str) -> int:
         """Return the index under which Parquet stores a column that is not nested.
 
-        Nested columns have several indices, so that the index differs from the position of the column in the header.
+        A nested column of the file has several indices. The index of a later column is therefore larger than the
+        position of this column in the header.
+
+        Args:
+            field_name: Name of the column in the file.
+
+        Raises:
+            error: If no column, or more than one column, is stored under this name.
         """
         schema = self._parquet.schema
         indices = [index for index in range(len(schema)) if schema.column(index).path == field_name]
@@ -152,7 +170,15 @@ class ParquetTable(NumberTable):
         return indices[0]
 
     def _refuse_rounded_integers(self, numbers: Array, name: str) -> None:
-        """Raise `error` if a column has integers that the conversion to float64 may have rounded."""
+        """Refuse a column with integers that the conversion to float64 may have rounded.
+
+        Args:
+            numbers: The converted integers of the column, shape (n,); NaN for null.
+            name: Name of the column, for the error message.
+
+        Raises:
+            error: If the magnitude of a number is at least `FIRST_INEXACT_INTEGER`.
+        """
         inexact_rows = np.flatnonzero(np.abs(numbers) >= FIRST_INEXACT_INTEGER)
         if inexact_rows.size:
             row = inexact_rows[0]
@@ -163,7 +189,10 @@ class ParquetTable(NumberTable):
 
 
 def parquet_bytes(columns: Mapping[str, Array]) -> bytes:
-    """Return a Parquet file of columns of shape (n,), float64; NaN is written as null.
+    """Return the bytes of a Parquet file with columns of numbers. NaN is written as null.
+
+    Args:
+        columns: Columns by their names, each of shape (n,), float64.
 
     Raises:
         MissingExtra: If pyarrow is not installed.
@@ -180,21 +209,27 @@ def parquet_bytes(columns: Mapping[str, Array]) -> bytes:
 
 
 def require_pyarrow() -> None:
-    """Raise MissingExtra if pyarrow is not installed."""
+    """Check that pyarrow is installed.
+
+    Raises:
+        MissingExtra: If pyarrow is not installed.
+    """
     with require("parquet"):
         import pyarrow.parquet  # noqa: F401
 
 
 def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
-    """Check the marks at both ends of a file and the size of its metadata, before pyarrow reads all of the metadata.
+    """Check the marks at both ends of a Parquet file, and the size of the metadata.
+
+    The size is checked before pyarrow reads the metadata, because large metadata need much memory.
 
     Args:
-        file: The file.
+        file: The file, which is open for reading. Its position is 0 before and after the call.
         where: Name of the file, for error messages.
-        error: Class of the errors.
+        error: Class of the error that is raised.
 
     Raises:
-        error: If the file is not Parquet, was cut off, or has very large metadata.
+        error: If the file is not Parquet, is incomplete, or has very large metadata.
     """
     first_mark = file.read(len(MARK))
 
@@ -216,17 +251,20 @@ def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
 
 @contextmanager
 def _pyarrow_errors_converted(where: str, error: type[InputError]) -> Iterator[None]:
-    """Convert the exceptions of pyarrow in the block to `error`. Each kind of damage raises a different exception.
+    """Convert all exceptions that pyarrow raises for a damaged file in the `with` block to one class of errors.
 
     Args:
         where: Name of the file, for the error message.
         error: Class of the error that is raised.
+
+    Raises:
+        error: If the block raises one of the exceptions of pyarrow.
     """
     from pyarrow import ArrowException
 
     try:
         yield
-    except error:  # an error that the block has raised with its own message
+    except error:  # the block has raised an error with its own message; it may also be a ValueError
         raise
     except (ArrowException, OSError, ValueError, MemoryError, OverflowError) as cause:
         reason = cut(" ".join(str(cause).split()))
@@ -234,6 +272,7 @@ def _pyarrow_errors_converted(where: str, error: type[InputError]) -> Iterator[N
 
 
 def _is_number_type(given_type: "DataType") -> bool:
+    """Return whether a type of pyarrow contains only numbers and null. A column of nulls is an empty column."""
     from pyarrow import types
 
     checks = (types.is_integer, types.is_floating, types.is_decimal, types.is_null)
@@ -241,7 +280,11 @@ def _is_number_type(given_type: "DataType") -> bool:
 
 
 def _as_float64(column: "ArrowArray") -> Array:
-    """Return a column of numbers as float64, shape (n,); null becomes NaN."""
+    """Convert a column of pyarrow to float64, shape (n,). Null becomes NaN.
+
+    Args:
+        column: Column of integers, floating-point numbers, decimal numbers or nulls.
+    """
     import pyarrow
 
     if pyarrow.types.is_decimal(column.type):

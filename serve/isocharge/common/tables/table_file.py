@@ -1,4 +1,7 @@
-"""Files with columns of numbers. A file is Parquet if its name ends in `.parquet`, and otherwise CSV."""
+"""Opening and writing of files with columns of numbers.
+
+The format of a file is Parquet if its name ends in `.parquet`, and CSV otherwise.
+"""
 
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -13,22 +16,26 @@ from isocharge.common.tables.parquet_table import SUFFIX, ParquetTable, parquet_
 
 
 def is_parquet(path: Path) -> bool:
-    """Return whether a file is Parquet according to its name."""
+    """Return whether the name of a file ends in `.parquet`, in any mixture of capital and small letters."""
     return path.suffix.lower() == SUFFIX
 
 
 @contextmanager
 def open_table(path: Path, names: Collection[str], error: type[InputError], expected: str) -> Iterator[NumberTable]:
-    """Open a file and read its header.
+    """Open a file for the `with` block, and read its header.
 
     Args:
-        path: A Parquet file, which must be a regular file, or CSV in UTF-8 with or without a byte order mark.
+        path: The file. A Parquet file must be a regular file. A CSV file must be text in UTF-8, with or without a byte
+            order mark.
         names: Names of columns that have a meaning.
-        error: Class of the error that is raised for anything that is wrong with the file.
-        expected: The expected header, for messages.
+        error: Class of the error that is raised for every mistake in the file.
+        expected: Description of the expected header, for error messages.
+
+    Yields:
+        The table, whose columns have not been read yet.
 
     Raises:
-        error: If the file cannot be read, here or while the block reads the columns.
+        error: If the file cannot be read, either when it is opened or when the block reads the columns.
         MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
     if is_parquet(path):
@@ -38,17 +45,17 @@ def open_table(path: Path, names: Collection[str], error: type[InputError], expe
     else:
         with (
             _os_errors_converted(path, error, "a CSV file of presses"),
-            path.open(encoding="utf-8-sig", newline="") as text,  # the CSV reader interprets the line ends itself
+            path.open(encoding="utf-8-sig", newline="") as text,  # `newline=""`: the CSV reader handles the line ends
         ):
             yield CsvTable(bounded_lines(text), names, str(path), error, expected)
 
 
 def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
-    """Write columns to a file. An existing file is replaced.
+    """Write columns of numbers to a file. An existing file is replaced.
 
     Args:
-        path: The file.
-        columns: Columns by name, each of shape (n,).
+        path: The file, whose name determines the format.
+        columns: Columns by their names, each of shape (n,).
 
     Raises:
         OutputError: If the file cannot be written.
@@ -61,16 +68,19 @@ def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
 
 @contextmanager
 def _os_errors_converted(path: Path, error: type[InputError], expected: str) -> Iterator[None]:
-    """Convert the errors of the file system in the block to `error`.
+    """Convert an OSError that the `with` block raises to an error of a given class.
 
     Args:
         path: The file, for the error message.
         error: Class of the error that is raised.
         expected: Description of the expected file, for the error message.
+
+    Raises:
+        error: If the block raises an OSError that is not an error of isocharge.
     """
     try:
         yield
     except OSError as cause:
-        if isinstance(cause, IsochargeError):  # some classes, such as OutputError, inherit from OSError
+        if isinstance(cause, IsochargeError):  # some errors of isocharge, such as OutputError, inherit from OSError
             raise
         raise error(f"{path}: cannot be read ({cause.strerror or cause}); expected {expected}") from cause

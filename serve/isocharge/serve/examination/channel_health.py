@@ -24,18 +24,18 @@ SHORTEST_S = 0.5
 class ChannelHealth:
     """Health of one channel.
 
-    All values are in pC, after the conversion by the gain. All results are None if the channel has no value that can be
-    a charge.
+    The results are in pC if the gain of the channel is known, and otherwise in the unit of the board. All results are
+    None if no value of the channel can be a charge.
 
     Attributes:
-        name: Name that the device uses, or the number of the channel from 1.
+        name: Name that the device uses, or the number of the channel, counted from 1.
         offset_pC: Mean charge.
         noise_pC: Standard deviation of the charge without drift and hum.
         drift_pC_per_s: Slope of the charge.
         hum_pC: Amplitudes of the hum at 50 and at 60 Hz. An amplitude is None if the frame rate is too low or the time
             is too short to estimate it.
         span_pC: Difference between the largest and the smallest value.
-        unusable: Number of values that are not finite, or larger than the charges of any film.
+        unusable: Number of values that are not finite, or whose magnitude is larger than the charge of any film.
     """
 
     name: str
@@ -48,10 +48,10 @@ class ChannelHealth:
 
 
 def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz: float) -> ChannelHealth:
-    """Measure the offset, the noise, the drift and the hum of a channel.
+    """Measure the offset, the noise, the drift and the hum of a channel while the film is at rest.
 
-    A constant, a slope and the hum at each mains frequency are fitted to the values by least squares. The noise is the
-    standard deviation of the residuals. The function ignores NaN and values whose magnitude is larger than
+    A constant, a slope (the drift) and the hum at each mains frequency are fitted to the values by least squares. The
+    noise is the standard deviation of the residuals. The function ignores NaN and values whose magnitude is larger than
     `LARGEST_PC`.
 
     Args:
@@ -59,11 +59,14 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
         charge_pC: Values, shape (n,), pC.
         times_s: Times since the first frame, shape (n,), s.
         rate_Hz: Frames per second, Hz.
+
+    Returns:
+        The results. They are None if the channel has no usable value.
     """
-    is_usable = np.abs(charge_pC) <= LARGEST_PC
-    unusable = int(np.count_nonzero(~is_usable))
-    if unusable == is_usable.size:
-        return ChannelHealth(name, unusable=unusable)
+    is_usable = np.abs(charge_pC) <= LARGEST_PC  # false for NaN
+    unusable_count = int(np.count_nonzero(~is_usable))
+    if unusable_count == is_usable.size:
+        return ChannelHealth(name, unusable=unusable_count)
     usable_pC = charge_pC[is_usable]
     usable_times_s = times_s[is_usable]
 
@@ -80,8 +83,8 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
         noise_pC=float(fit.residual_pC.std()),
         drift_pC_per_s=fit.slope_pC_per_s,
         hum_pC=(hum_50_Hz_pC, hum_60_Hz_pC),
-        span_pC=float(np.ptp(usable_pC)),
-        unusable=unusable,
+        span_pC=float(np.ptp(usable_pC)),  # largest minus smallest value
+        unusable=unusable_count,
     )
 
 
@@ -102,6 +105,12 @@ class _DriftAndHum(NamedTuple):
 def _fit_drift_and_hum(charge_pC: Array, times_s: Array, hum_frequencies_Hz: Sequence[float]) -> _DriftAndHum:
     """Fit a straight line and a hum at each frequency to the values of a channel, by linear least squares.
 
+    The fitted function of the time t is
+
+        constant + slope * t + sum over the frequencies f of (cosine * cos(2 pi f t) + sine * sin(2 pi f t)).
+
+    The amplitude of the hum at a frequency is sqrt(cosine^2 + sine^2).
+
     Args:
         charge_pC: Values, shape (n,), pC.
         times_s: Times of the values, shape (n,), s.
@@ -110,7 +119,7 @@ def _fit_drift_and_hum(charge_pC: Array, times_s: Array, hum_frequencies_Hz: Seq
     Returns:
         Slope of the line, amplitude of the hum at each frequency, and residuals.
     """
-    # The columns are a constant, a slope, and a cosine and a sine for each frequency of the hum.
+    # Each column is the function that one coefficient multiplies, at the times of the values.
     columns = [np.ones_like(times_s), times_s]
     for hum_Hz in hum_frequencies_Hz:
         phase = 2.0 * np.pi * hum_Hz * times_s
@@ -118,7 +127,7 @@ def _fit_drift_and_hum(charge_pC: Array, times_s: Array, hum_frequencies_Hz: Seq
     design_matrix = np.column_stack(columns)
     coefficients = np.linalg.lstsq(design_matrix, charge_pC, rcond=None)[0]
 
-    # The coefficients of the hum alternate: a cosine and a sine for each frequency.
+    # The coefficients have the order of the columns, so those of the hum alternate between cosine and sine.
     _constant, slope_pC_per_s, *hum_coefficients = coefficients.tolist()
     cosines_pC = hum_coefficients[0::2]
     sines_pC = hum_coefficients[1::2]

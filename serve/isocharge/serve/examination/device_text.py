@@ -1,4 +1,4 @@
-"""Text of the device file that fits a board."""
+"""Text of the device file for a board."""
 
 from collections.abc import Iterator
 
@@ -25,26 +25,34 @@ def device_text(examination: Examination) -> str:
     """Return the device file of a board as TOML text.
 
     The file begins with comments that describe the board. The section `[gain]` comes last. If the channels are not in
-    pC, the section ends with comments for the conversion to pC, which the user completes.
+    pC, the section ends with lines for the conversion to pC. The lines for the conversion are comments, which the user
+    completes.
+
+    Args:
+        examination: Result of the port check, with the content of the device file.
     """
     head_comments = (*HEAD, *_description(examination))
     other_sections = {key: value for key, value in examination.device.items() if key != "gain"}
     text = to_toml(other_sections, head_comments)
 
-    # The heading of the section is also needed if the section consists only of comments.
+    # The section `[gain]` comes last, so that the lines to fill in belong to it.
     gain = examination.device.get("gain")
-    lines_to_fill_in = LINES_TO_FILL_IN.get(examination.unit, ())
+    lines_to_fill_in = LINES_TO_FILL_IN.get(examination.unit, ())  # empty if the channels are in pC
     if gain is not None:
         text += "\n" + to_toml({"gain": gain})
     elif lines_to_fill_in:
-        text += "\n[gain]\n"
+        text += "\n[gain]\n"  # the section then consists only of comments
     for line in lines_to_fill_in:
         text += f"{line}\n"
     return text
 
 
 def _description(examination: Examination) -> Iterator[str]:
-    """Yield comments that describe what the board sends."""
+    """Yield comments for the device file that describe what the board sends.
+
+    Args:
+        examination: Result of the port check.
+    """
     yield f"{examination.format}; {examination.rate_Hz:.4g} frames per second"
     if examination.unused:
         yield f"channels that no electrode uses: {printable(', '.join(examination.unused))}"

@@ -1,7 +1,7 @@
 """Check which channel belongs to which electrode. The user presses near each electrode in turn.
 
-The electrode next to a press collects the largest charge. The change of a channel under one press is compared with its
-changes under the other presses. The gains of the channels therefore need not be known or equal.
+The electrode next to a press collects the largest charge. The change of each channel under one press is compared with
+the changes of the same channel under the other presses. The gains of the channels therefore need not be known or equal.
 """
 
 import math
@@ -46,7 +46,7 @@ PRESS_TIMEOUT_S = 60.0
 
 @dataclass(frozen=True)
 class ElectrodeCheck:
-    """Result of the presses: the channel that changed most under the press near each electrode.
+    """Result of the electrode check: the channel that changed most under the press near each electrode.
 
     Attributes:
         expected: Channel of each electrode as it was assumed, by the names of the electrodes.
@@ -62,12 +62,12 @@ class ElectrodeCheck:
 
     @property
     def is_as_expected(self) -> bool:
-        """Whether every channel belongs to the electrode that was assumed."""
+        """Whether the presses have confirmed the assumed channel of every electrode."""
         return dict(self.expected) == dict(self.found)
 
     @property
     def sentences(self) -> Iterator[str]:
-        """Sentences that describe the result to the user."""
+        """Sentences for the user about the channel of each electrode, the order of the channels, and wrong signs."""
         for electrode, channel in self.found.items():
             yield f"press near {electrode}: channel {printable(channel)} answers most strongly"
         yield _order_sentence(self.expected, self.found)
@@ -81,7 +81,9 @@ class ElectrodeCheck:
 def _order_sentence(expected_channels: Mapping[str, str], found_channels: Mapping[str, str]) -> str:
     """Return a sentence that states whether the channels are swapped, turned, or in another order.
 
-    The channels are turned if each channel is connected the same number of places too far around the film.
+    The channels are turned if the channels of all electrodes are shifted by the same number of electrodes around the
+    film. For example, the channels of A, B and C are turned by one place if the presses near A, B and C change the
+    channels that were assumed to belong to B, C and A.
 
     Args:
         expected_channels: Channel of each electrode as it was assumed, by the names of the electrodes.
@@ -92,12 +94,17 @@ def _order_sentence(expected_channels: Mapping[str, str], found_channels: Mappin
     if not wrong_electrodes:
         return "every channel belongs to its electrode"
 
-    # For each electrode that was pressed, the electrode to which the answering channel was assumed to belong
-    electrode_of_channel = {channel: electrode for electrode, channel in expected_channels.items()}
-    assumed_electrodes = [electrode_of_channel[found_channels[electrode]] for electrode in electrodes]
-    if len(electrodes) > 2:  # two channels that are turned are also swapped, which is the simpler description
+    # For each electrode that was pressed, find the electrode to which the answering channel was assumed to belong.
+    expected_electrode = {channel: electrode for electrode, channel in expected_channels.items()}
+    assumed_electrodes = []
+    for electrode in electrodes:
+        answering_channel = found_channels[electrode]
+        assumed_electrodes.append(expected_electrode[answering_channel])
+
+    # With two electrodes, turned channels are also swapped. "Swapped" is the simpler description.
+    if len(electrodes) > 2:
         for places in range(1, len(electrodes)):
-            # This is the order of the electrodes if every channel is connected `places` electrodes too far.
+            # The assumed electrodes have this order if the channels are shifted by `places` electrodes.
             turned_electrodes = electrodes[places:] + electrodes[:places]
             if assumed_electrodes == turned_electrodes:
                 return f"the channels are turned by {places} of {len(electrodes)} places"
@@ -113,7 +120,7 @@ def check_electrodes(
     ask: Callable[[str], None],
     timeout_s: float = PRESS_TIMEOUT_S,
 ) -> ElectrodeCheck:
-    """Ask for a press near each electrode in turn, and find the channel that answers most strongly.
+    """Ask the user for a press near each electrode in turn, and find the channel that changes most under each press.
 
     Args:
         port: The open port.
@@ -122,13 +129,16 @@ def check_electrodes(
         ask: Function that is called with a sentence that asks the user for a press.
         timeout_s: Time to wait for each press, s.
 
+    Returns:
+        The assumed and the found channel of each electrode, the changes of the channels, and the inverted channels.
+
     Raises:
         PressCheckError: If a press does not come in time, or the presses do not distinguish the channels.
         PortLost: If the connection to the board is lost.
     """
     electrodes = list(channels)
     channel_names = list(channels.values())
-    blocks = _Blocks(port, device, channel_names)
+    blocks = _Blocks(port, device, channel_names)  # reads the port, and computes medians over short blocks of time
     measured_changes = []
     for electrode in electrodes:
         ask(f"press near electrode {electrode}, as close to it as you can, and let go")
@@ -138,7 +148,8 @@ def check_electrodes(
     # A channel is inverted if its value falls under the press near its own electrode.
     found_channels = {}
     inverted_channels = []
-    for row, column in enumerate(assign_channels(changes, electrodes)):
+    columns = assign_channels(changes, electrodes)  # column of the channel that belongs to each electrode
+    for row, column in enumerate(columns):
         channel = channel_names[column]
         found_channels[electrodes[row]] = channel
         if changes[row, column] < 0.0:
@@ -151,8 +162,9 @@ def check_electrodes(
 def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
     """Find the channel that changes most under the press near each electrode.
 
-    The forces of the presses and the gains of the channels differ. The rows and the columns of the changes are
-    therefore divided alternately by their means, which removes the forces and the gains (Sinkhorn and Knopp 1967).
+    The changes depend on the forces of the presses and on the gains of the channels. In order to remove the effects of
+    the forces and the gains, the rows and the columns of the matrix of changes are divided alternately by their means
+    (Sinkhorn and Knopp 1967).
 
     Args:
         changes: Change of each channel under the press near each electrode, shape (electrodes, channels), any unit.
@@ -166,9 +178,10 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
     """
     normalised = np.abs(changes) + 1e-30  # a channel that never changes must not cause a division by zero
     for _ in range(NORMALISATION_STEPS):
-        normalised = normalised / normalised.mean(axis=0)
-        normalised = normalised / normalised.mean(axis=1, keepdims=True)
+        normalised = normalised / normalised.mean(axis=0)  # removes the gain of each channel
+        normalised = normalised / normalised.mean(axis=1, keepdims=True)  # removes the force of each press
 
+    # The channel of each electrode is the column with the largest change in its row. Check that the choice is clear.
     columns = [int(column) for column in np.argmax(normalised, axis=1)]
     for row, column in enumerate(columns):
         other_changes = np.delete(normalised[row], column)  # empty if there is only one channel
@@ -187,28 +200,31 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
 
 
 def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str, Any]:
-    """Return the content of a device file in which the channel of each electrode is the one found by the presses.
+    """Return the content of a device file in which each electrode has the channel that the presses have shown.
 
-    Settings for single electrodes, such as gains and offsets, belong to the amplifiers and move with the channels.
+    Settings of single electrodes, such as gains and offsets, belong to the amplifiers, so they are moved together with
+    the channels.
 
     Args:
         table: Content of the device file with the assumed channels.
         check: Result of the presses.
     """
     # Each electrode receives the settings of the electrode to which its channel was assumed to belong.
-    electrode_of_channel = {channel: electrode for electrode, channel in check.expected.items()}
-    source_electrode = {electrode: electrode_of_channel[channel] for electrode, channel in check.found.items()}
+    expected_electrode = {channel: electrode for electrode, channel in check.expected.items()}
+    source_electrode = {electrode: expected_electrode[channel] for electrode, channel in check.found.items()}
     corrected = {name: _reassigned_settings(section, source_electrode) for name, section in table.items()}
     corrected["channels"] = dict(check.found)
     return corrected
 
 
 def _reassigned_settings(section: Any, source_electrode: Mapping[str, str]) -> Any:
-    """Return a section of a device file in which the settings of the electrodes are exchanged.
+    """Return a section of a device file in which each electrode receives the settings of a given electrode.
+
+    A setting with one value for each electrode is a table, such as `offset = {A = 1.0, B = 2.0}`. All other settings
+    are returned unchanged.
 
     Args:
-        section: The section. It is returned unchanged if it is not a table. Settings that do not have a value for each
-            electrode are also returned unchanged.
+        section: A table of settings by name, or a single value, which is returned unchanged.
         source_electrode: For each electrode, the electrode whose settings it receives.
     """
     if not isinstance(section, Mapping):
@@ -224,10 +240,10 @@ def _reassigned_settings(section: Any, source_electrode: Mapping[str, str]) -> A
 
 
 class _Blocks:
-    """Reads a port, and averages the values of some channels over blocks of `BLOCK_S`."""
+    """Reads a port, and computes the medians of the given channels over blocks of time of the length `BLOCK_S`."""
 
     def __init__(self, port: Port, device: Device, channels: list[str]) -> None:
-        """Begin without data.
+        """Store the port and the channels. The first data are read by `next_block`.
 
         Args:
             port: The open port.
@@ -239,31 +255,37 @@ class _Blocks:
         self._channels = channels
 
     def next_block(self, deadline_s: float) -> tuple[Array, Array] | None:
-        """Collect frames for `BLOCK_S`, or longer until a frame has arrived, and return their medians and noise.
+        """Collect the frames of one block of time, and return the median and the noise of each channel.
+
+        A block lasts for `BLOCK_S`, or longer until a first frame has arrived.
 
         Args:
-            deadline_s: Time on the monotonic clock until which frames are waited for, s.
+            deadline_s: Time on the monotonic clock until which the function waits for frames, s.
 
         Returns:
             Medians of the block and noise of one frame, each of shape (channels,), in the unit of the board; None if
             no frames come before the deadline.
         """
-        rows: list[list[float]] = []
+        rows: list[list[float]] = []  # the values of the channels in each frame
         end_s = time.monotonic() + BLOCK_S
         while time.monotonic() < end_s or not rows:
             remaining_s = deadline_s - time.monotonic()
             if remaining_s <= 0.0:
                 return None
             chunk = self._port.read(min(BLOCK_S, remaining_s))
-            if chunk is not None:
+            if chunk is not None:  # otherwise no bytes have arrived in time
                 rows += self._rows(chunk.data)
         values = np.array(rows)  # shape (frames, channels)
-        # Coarse values may have no noise between consecutive frames. The noise is then one step of the values.
+        # Consecutive values of a coarse converter may be equal. The noise is then the rounding error of whole numbers.
         noise = np.array([max(noise_of(column), resolution_of(column)) for column in values.T])
         return np.median(values, axis=0), noise
 
     def _rows(self, data: bytes) -> Iterator[list[float]]:
-        """Yield the values of the channels in each frame that has a finite number for every channel."""
+        """Yield the values of the channels in each frame that has a finite number for every channel.
+
+        Args:
+            data: Bytes from the port. They may end within a frame, which the next bytes complete.
+        """
         for frame in self._parser.feed(data):
             positions = [position_of(channel, frame) for channel in self._channels]  # None for a missing channel
             values = [frame.values[position] for position in positions if position is not None]
@@ -273,16 +295,20 @@ class _Blocks:
 
 
 def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
-    """Wait for a press that begins and ends, and return the largest change of each channel, shape (channels,).
+    """Wait for a press that begins and ends, and return the change of the channels at its peak.
 
-    The values are averaged over blocks of time. The change is the difference between a block and the rest level. Until
-    the press begins, the rest level is updated, so that it follows a slow drift. The press ends when the change has
-    become small again.
+    Each block contains the median of each channel over a short time. The change of a channel is the difference between
+    a block and the rest level. The press begins when the change of a channel is much larger than the noise. Before the
+    press begins, the rest level is updated in order to follow a slow drift. The press ends when the changes have become
+    small again.
 
     Args:
-        blocks: Source of the averaged values.
+        blocks: Source of the blocks.
         electrode: Electrode near which the press is expected, for the error message.
         timeout_s: Longest time to wait, s.
+
+    Returns:
+        Change of each channel in the block with the largest total change, shape (channels,), in the unit of the board.
 
     Raises:
         PressCheckError: If the press does not begin and end within `timeout_s`.
@@ -300,13 +326,14 @@ def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
             rest_level = rest_level + REST_UPDATE * change
             continue
 
-        change_size = np.abs(change).sum()
-        if change_size > np.abs(largest_change).sum():
+        total_change = np.abs(change).sum()
+        if total_change > np.abs(largest_change).sum():
             largest_change = change
-        if change_size < RELEASED_SHARE * np.abs(largest_change).sum():
+        is_released = total_change < RELEASED_SHARE * np.abs(largest_change).sum()
+        if is_released:
             return largest_change
 
-    # The time is over: either the press did not end, or it did not begin.
+    # No block came before the deadline. Either the press did not end, or it did not begin.
     if is_pressed:
         raise _restless_error(electrode, timeout_s)
     raise _missing_press_error(electrode, timeout_s)
@@ -315,16 +342,18 @@ def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
 def _wait_for_rest(blocks: _Blocks, electrode: str, deadline_s: float, timeout_s: float) -> tuple[Array, Array]:
     """Wait until the channels are quiet in `REST_BLOCKS` consecutive blocks.
 
-    The channels are quiet if the level of each channel varies by at most half of the change that begins a press.
+    A block contains the level (median) and the noise of each channel over a short time. The channels are quiet if the
+    level of each channel varies by at most half of the change that begins a press.
 
     Args:
         blocks: Source of the blocks.
         electrode: Electrode near which the next press is expected, for the error message.
-        deadline_s: Time on the monotonic clock until which the rest is waited for, s.
+        deadline_s: Time on the monotonic clock until which the function waits, s.
         timeout_s: Time to wait for the press, s, for the error message.
 
     Returns:
-        Rest level of the channels and noise of one frame, each of shape (channels,), in the unit of the board.
+        Rest level and noise of each channel, both of shape (channels,), in the unit of the board. The noise is the
+        standard deviation of a single frame.
 
     Raises:
         PressCheckError: If the channels are not quiet before the deadline.
@@ -335,18 +364,19 @@ def _wait_for_rest(blocks: _Blocks, electrode: str, deadline_s: float, timeout_s
         levels = np.array([level for level, _ in recent_blocks])  # shape (blocks, channels)
         noise = np.median([block_noise for _, block_noise in recent_blocks], axis=0)
         variation = np.ptp(levels, axis=0)  # largest minus smallest level of each channel
-        is_quiet = bool(np.all(variation <= 0.5 * CHANGE_SIGMAS * noise))
+        change_of_press = CHANGE_SIGMAS * noise  # smallest change that counts as the beginning of a press
+        is_quiet = bool(np.all(variation <= 0.5 * change_of_press))
         if len(recent_blocks) == REST_BLOCKS and is_quiet:
             return levels.mean(axis=0), noise
 
-    # The time is over: either the channels were not quiet, or no frames came.
+    # No block came before the deadline. Either the channels were not quiet, or no frames came.
     if recent_blocks:
         raise _restless_error(electrode, timeout_s)
     raise _missing_press_error(electrode, timeout_s)
 
 
 def _restless_error(electrode: str, timeout_s: float) -> PressCheckError:
-    """Return the error for charges that do not come to rest within `timeout_s`."""
+    """Return the error for charges that have not come to rest within `timeout_s`."""
     return PressCheckError(
         f"electrode {electrode}: the charges did not come to rest within {timeout_s:g} s; take the finger away after "
         "each press, and try again"
@@ -354,5 +384,5 @@ def _restless_error(electrode: str, timeout_s: float) -> PressCheckError:
 
 
 def _missing_press_error(electrode: str, timeout_s: float) -> PressCheckError:
-    """Return the error for a press that does not begin within `timeout_s`."""
+    """Return the error for a press that has not begun within `timeout_s`."""
     return PressCheckError(f"electrode {electrode}: no press came within {timeout_s:g} s; try again")

@@ -2,9 +2,9 @@
 
 The description states whether the charge of the press is constant, leaks, creeps or drifts.
 
-The gain of the board may be unknown, so a press is not defined by a charge in pC. The press begins with the first large
-change of the channels within 0.2 s. The size of the press is the component of the channels along this change, minus the
-rest level before the press. If the rest level drifts, it is extrapolated along a straight line.
+The gain of the board may be unknown. A press is therefore not recognised by a charge in pC, but by the first large
+change of the channels within 0.2 s. The size of the press is the projection of the channels onto the direction of this
+change, minus the rest level before the press. If the rest level drifts, it is extrapolated along a straight line.
 """
 
 from dataclasses import dataclass
@@ -52,12 +52,12 @@ END_BLOCKS = 5
 
 @dataclass(frozen=True)
 class HeldPress:
-    """Result of a held press.
+    """A press that was held during the port check, and the settings that correct the change of its charge.
 
     Attributes:
         begin_s: Time at which the press began, s since the first frame.
-        sections: Sections for a device file.
-        description: Description of the press, a sentence.
+        sections: Sections for a device file, as tables by name.
+        description: Sentence that describes how the charge of the press changes.
     """
 
     begin_s: float
@@ -69,8 +69,9 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     """Find a press that is held for at least `MIN_HELD_S`, and describe how its charge changes.
 
     The values are averaged over blocks of time. The press begins with the first large step between the blocks. The film
-    must be at rest before the press, and the step must be much larger than the usual change between blocks. All
-    channels are combined into one component, which is the projection of their values onto the direction of the step.
+    must be at rest before the press, and the step must be much larger than the usual change between blocks. The step is
+    a vector with one change for each channel. The values of all channels are combined into one component, which is
+    their projection onto the direction of the step.
 
     Args:
         values: Values of the channels, shape (n, channels), in any unit.
@@ -84,13 +85,13 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     if levels is None or len(levels) * BLOCK_S < min_duration_s:
         return None
 
-    # Find the blocks in which the press begins, has a constant force, and ends.
+    # Find the numbers of the blocks in which the force rises (begin), becomes constant (settled), and falls (end).
     step = _find_step(levels)
-    begin = step.rest_blocks + 1
-    settled = begin + round(SETTLE_S / BLOCK_S)
-    end = _end_of_press(step.component, settled, step.size)
+    begin_block = step.rest_blocks + 1
+    settled_block = begin_block + round(SETTLE_S / BLOCK_S)
+    end_block = _end_of_press(step.component, settled_block, step.size)
     has_rest = step.rest_blocks * BLOCK_S >= MIN_REST_S
-    is_long = (end - settled) * BLOCK_S >= MIN_HELD_S
+    is_long = (end_block - settled_block) * BLOCK_S >= MIN_HELD_S
     if not (step.is_large and has_rest and is_long):
         return None
 
@@ -98,9 +99,9 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     block_times_s = BLOCK_S * (np.arange(len(step.component)) + 0.5)  # middle of each block
     rest, drift_per_s = _extrapolate_rest(step.component, block_times_s, step.rest_blocks, step.size)
     press_size = step.component - rest
-    begin_s = BLOCK_S * begin
-    held_s = block_times_s[settled:end] - begin_s
-    description, sections = _describe(held_s, press_size[settled:end])
+    begin_s = BLOCK_S * begin_block
+    held_times_s = block_times_s[settled_block:end_block] - begin_s
+    description, sections = _describe(held_times_s, press_size[settled_block:end_block])
     if drift_per_s != 0.0:
         description, sections = _with_drift(description, sections, percent_per_s=100.0 * drift_per_s / step.size)
     return HeldPress(begin_s, sections, description)
@@ -123,33 +124,37 @@ class _Step(NamedTuple):
 
 
 def _find_step(levels: Array) -> _Step:
-    """Find the first change within two blocks that is at least half as large as the largest change.
+    """Find the step at the beginning of a press: the first change that is larger than half of the largest change.
 
     A change is the difference between two blocks with one block between them, because the force of a press rises during
     a part of one block. The press begins in this middle block.
 
     Args:
-        levels: Mean of each channel in each block, shape (blocks, channels), any unit.
+        levels: Mean of each channel in each block of time, shape (blocks, channels), any unit.
+
+    Returns:
+        The step, with the number of blocks before it, and the values of all blocks along its direction.
     """
-    changes = levels[2:] - levels[:-2]  # shape (blocks - 2, channels)
+    changes = levels[2:] - levels[:-2]  # change i is from block i to block i + 2; shape (blocks - 2, channels)
     change_sizes = np.linalg.norm(changes, axis=1)
     is_step = change_sizes > 0.5 * change_sizes.max()
-    step_position = int(np.argmax(is_step))  # position of the first True
-    size = float(change_sizes[step_position])
+    first_block = int(np.argmax(is_step))  # position of the first True: the block before the step
+    size = float(change_sizes[first_block])
     is_large = bool(size >= STEP_RATIO * np.median(change_sizes))
 
     # Project the levels onto the direction of the step, a unit vector of shape (channels,).
-    direction = changes[step_position] / max(size, SMALLEST_SIZE)
-    return _Step(rest_blocks=step_position, size=size, is_large=is_large, component=levels @ direction)
+    direction = changes[first_block] / max(size, SMALLEST_SIZE)  # no division by zero if the channels never change
+    return _Step(rest_blocks=first_block, size=size, is_large=is_large, component=levels @ direction)
 
 
 def _extrapolate_rest(
     component: Reals, block_times_s: Reals, rest_blocks: int, step_size: float
 ) -> tuple[Reals, float]:
-    """Extrapolate the rest level before a press to the time of the press.
+    """Extrapolate the rest level, which was measured before a press, to the time of the press.
 
-    A straight line is fitted to the blocks before the press. The rest level is constant, unless the slope of the line
-    is significant and large enough to affect the description.
+    A straight line is fitted to the blocks before the press. The line is used if its slope is significant and so large
+    that it would affect the description of the press. If the line is not used, the rest level is the mean of the blocks
+    before the press.
 
     Args:
         component: Mean of each block, projected onto the change of the channels by the press, shape (blocks,), any
@@ -159,22 +164,23 @@ def _extrapolate_rest(
         step_size: Change of the component when the press begins, in the unit of the component.
 
     Returns:
-        The rest in each block, shape (blocks,), and its slope per second, which is 0 if the rest is constant.
+        The rest level in each block, shape (blocks,), and its slope per second, which is 0 if the rest level is
+        constant.
     """
     rest_component = component[:rest_blocks]
     rest_times_s = block_times_s[:rest_blocks]
-    (slope, level), covariance = np.polyfit(rest_times_s, rest_component, deg=1, cov=True)
+    (slope_per_s, intercept), covariance = np.polyfit(rest_times_s, rest_component, deg=1, cov=True)
     slope_std = np.sqrt(covariance[0, 0])
-    is_significant = abs(slope) > DRIFT_SIGMAS * slope_std
-    # Within a held press, the drift would be mistaken for a change of the charge of the press.
-    is_disturbing = abs(slope) * MIN_HELD_S > STEADY_SHARE * step_size
+    is_significant = abs(slope_per_s) > DRIFT_SIGMAS * slope_std
+    # During a held press, the drift would be mistaken for a change of the charge of the press.
+    is_disturbing = abs(slope_per_s) * MIN_HELD_S > STEADY_SHARE * step_size
     if is_significant and is_disturbing:
-        return level + slope * block_times_s, float(slope)
+        return intercept + slope_per_s * block_times_s, float(slope_per_s)
     return np.full(len(component), rest_component.mean()), 0.0
 
 
 def _block_means(values: Array, times_s: Array) -> Array | None:
-    """Compute the means of the channels over blocks of `BLOCK_S`.
+    """Compute the mean of each channel over each block of time of the length `BLOCK_S`.
 
     The last block is left out, because it may be incomplete.
 
@@ -193,27 +199,29 @@ def _block_means(values: Array, times_s: Array) -> Array | None:
         return None
     sums = np.zeros((len(counts), values.shape[1]))  # shape (blocks, channels)
     for channel, channel_values in enumerate(values.T):
-        sums[:, channel] = np.bincount(block_numbers, weights=channel_values)[:-1]
+        sums[:, channel] = np.bincount(block_numbers, weights=channel_values)[:-1]  # adds up the values of each block
     return np.asarray(sums / counts[:, np.newaxis])
 
 
-def _end_of_press(component: Array, settled: int, step_size: float) -> int:
+def _end_of_press(component: Array, settled_block: int, step_size: float) -> int:
     """Return the number of the block at which the press ends.
 
-    The press ends where the values first fall by a large part of the step within two blocks. If there is no such fall,
-    the press is held to the end, and the result is the number of blocks.
+    The press ends where the component first falls by a large part of the step within two blocks. If the component never
+    falls by so much, the press is held to the end, and the result is the number of all blocks.
 
     Args:
         component: Mean of each block, projected onto the change of the channels by the press, shape (blocks,).
-        settled: First block in which the force is constant.
+        settled_block: Number of the first block in which the force is constant.
         step_size: Change of the component when the press begins.
     """
-    held_component = component[settled:]
+    held_component = component[settled_block:]
     changes = held_component[2:] - held_component[:-2]  # from each block to the second block after it
-    release_positions = np.flatnonzero(changes < -RELEASE_SHARE * step_size)
+    is_release = changes < -RELEASE_SHARE * step_size
+    release_positions = np.flatnonzero(is_release)
     if release_positions.size == 0:
         return len(component)
-    return settled + int(release_positions[0])
+    first_release = int(release_positions[0])
+    return settled_block + first_release  # the positions count from the block in which the force is constant
 
 
 def _with_drift(
@@ -221,13 +229,15 @@ def _with_drift(
 ) -> tuple[str, dict[str, dict[str, float]]]:
     """Add a drift of the rest level to the description and to the sections of a press.
 
-    The drift is removed by a section `[leak]` whose time constant is so large that it corrects no leak. If the press
-    leaks as well, `[leak]` already has the time constant of the press, and the measurement must be repeated.
+    The section `[leak]` of a device file corrects an exponential loss of charge with the time constant `tau_s`, and
+    removes the drift at rest as well. If the rest level drifts but the press loses no charge, `tau_s` is set to a value
+    that is so large that no loss is corrected. If the press also loses charge exponentially, `[leak]` already has the
+    time constant of the press. The description then asks the user to measure again without a drift.
 
     Args:
-        description: Description of the press.
+        description: Description of the press, a sentence.
         sections: Sections for a device file, as tables by name.
-        percent_per_s: Drift of the rest in percent of the press per second.
+        percent_per_s: Drift of the rest level in percent of the press per second.
 
     Returns:
         The completed description, and the completed sections.
@@ -242,26 +252,28 @@ def _with_drift(
     return sentence, completed_sections
 
 
-def _describe(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, float]]]:
+def _describe(held_times_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, float]]]:
     """Describe how the charge of a press changes: whether it is constant, leaks, creeps, or follows no clear law.
 
-    A drift of the rest level is not included.
+    A leak is an exponential loss of charge in the amplifier. Creep is a decrease of the charge of the film in
+    proportion to the logarithm of time. A drift of the rest level has already been subtracted from the charge.
 
     Args:
-        held_s: Times since the beginning of the press, shape (n,), s.
-        size: Size of the press at these times, shape (n,), any unit.
+        held_times_s: Times since the beginning of the press, shape (n,), s.
+        size: Charge of the press at these times, shape (n,), any unit.
 
     Returns:
         A sentence, and sections for a device file, as tables by name; empty if no setting is needed or known.
     """
+    # Means over some blocks at the beginning and at the end have less noise than single blocks.
     first_size = size[:END_BLOCKS].mean()
     last_size = size[-END_BLOCKS:].mean()
     lost_share = 1.0 - float(last_size / first_size)
     if abs(lost_share) < STEADY_SHARE:
-        return f"a held press keeps its charge for {held_s[-1]:.0f} s", {}
+        return f"a held press keeps its charge for {held_times_s[-1]:.0f} s", {}
 
     positive_size = np.maximum(size, 1e-9)  # the law is fitted to the logarithm of the size
-    times_and_sizes = list(zip(held_s.tolist(), positive_size.tolist(), strict=True))
+    times_and_sizes = list(zip(held_times_s.tolist(), positive_size.tolist(), strict=True))
     law = law_of_fading(times_and_sizes)
     if law.tau_s is not None:
         return f"a held press leaks: {law.settings} in a device file undoes it", law.sections
@@ -272,7 +284,7 @@ def _describe(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, floa
         )
         return sentence, law.sections
     sentence = (
-        f"a held press changes by {-100.0 * lost_share:.2g} % in {held_s[-1]:.0f} s, by no law that is clear: hold one "
-        "longer, with a weight"
+        f"a held press changes by {-100.0 * lost_share:.2g} % in {held_times_s[-1]:.0f} s, by no law that is clear: "
+        "hold one longer, with a weight"
     )
     return sentence, {}

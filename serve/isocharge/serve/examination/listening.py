@@ -1,4 +1,4 @@
-"""Reception of bytes from a port, search for its baud rate, and parsing of the frames."""
+"""Reception of bytes from a port, search for the baud rate of the port, and parsing of the frames."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -65,7 +65,9 @@ class ReceivedData:
     def span_s(self) -> float:
         """Time span in which the bytes arrived, s.
 
-        The result is the time from the first chunk to the last chunk plus the mean time between two chunks.
+        The result is the time from the first chunk to the last chunk plus the mean time between two chunks, so that n
+        chunks span n intervals. With fewer than two chunks, the result is the time of listening. The result is never
+        0, so that a rate computed from it is finite.
         """
         if len(self.chunks) < 2:
             return max(self.seconds, MIN_SPAN_S)
@@ -89,7 +91,8 @@ def listen(
 ) -> ReceivedData:
     """Find the baud rate of a port, and listen to the port at this baud rate.
 
-    The chosen baud rate is the first one at which the bytes are frames, or at which no bytes arrive.
+    The chosen baud rate is the first one at which most of the bytes belong to frames. The search also ends at a baud
+    rate at which no bytes arrive.
 
     Args:
         url: The port.
@@ -100,7 +103,7 @@ def listen(
         wait: Time to wait until the port can be opened, s.
 
     Returns:
-        The bytes at the chosen baud rate. This is the first baud rate of `bauds` if there are no frames at any of them.
+        The bytes at the chosen baud rate. If no baud rate of `bauds` is suitable, the first one is chosen.
 
     Raises:
         PortError: If the port cannot be opened.
@@ -115,14 +118,15 @@ def listen(
     if has_speed(url) and len(bauds) > 1:
         for baud in bauds:
             received = _listen_at_baud(url, baud, TRY_S, request, wait)
-            if not received.chunks or has_frames(received):
+            is_silent = not received.chunks
+            if is_silent or has_frames(received):
                 chosen_baud = baud
                 break
     return _listen_at_baud(url, chosen_baud, seconds, request, wait)
 
 
 def _listen_at_baud(url: str, baud: int, seconds: float, request: Request | None, wait: float) -> ReceivedData:
-    """Listen to a port at one baud rate, and return the received bytes.
+    """Open a port, listen at one baud rate, and return the received bytes with the times of their arrival.
 
     Args:
         url: The port.
@@ -138,8 +142,8 @@ def _listen_at_baud(url: str, baud: int, seconds: float, request: Request | None
             try:
                 chunk = port.read(remaining_s)
             except PortLost:
-                break
-            if chunk is not None:
+                break  # the bytes that were received before the loss are returned
+            if chunk is not None:  # otherwise no bytes have arrived in the remaining time
                 received.chunks.append(chunk)
     received.seconds = time.monotonic() - start_s
     received.echo_share = port.echo_share
@@ -153,7 +157,7 @@ class Capture:
     Attributes:
         parser: The parser, with its counters.
         frames: Good frames.
-        times_s: Time of each frame, by the device's clock if it sends one, s.
+        times_s: Time of each frame, s, by the clock of the device if the frames contain a time.
         gaps: Counters of the frame numbers.
         bytes_seen: Number of bytes that were received.
     """
@@ -166,20 +170,21 @@ class Capture:
 
     @property
     def intact_share(self) -> float:
-        """Share of bytes that were part of a good frame, dimensionless."""
+        """Share of the received bytes that were part of a good frame, dimensionless. It is 0 without frames."""
         if not self.frames:
             return 0.0
         return 1.0 - self.parser.counts.bytes_dropped / self.bytes_seen
 
     @property
     def rate_Hz(self) -> float:
-        """Frames per second, Hz; 0 for fewer than two frames."""
+        """Frames per second, Hz; 0 for fewer than two frames, and if their times do not increase."""
         if len(self.frames) < 2:
             return 0.0
         span_s = self.times_s[-1] - self.times_s[0]
         if span_s <= 0.0:
             return 0.0
-        return (len(self.frames) - 1) / span_s
+        interval_count = len(self.frames) - 1
+        return interval_count / span_s
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -188,6 +193,8 @@ class Capture:
 
     def values(self) -> tuple[Array, Array]:
         """Return the values of all frames that have as many channels as the last frame, and their times.
+
+        Frames with another number of channels are left out, because the values form one array.
 
         Returns:
             Values, shape (n, channels), and times since the first of these frames, shape (n,), s.
@@ -203,7 +210,7 @@ class Capture:
 
 
 def read_frames(received: ReceivedData, device: Device) -> Capture:
-    """Parse the frames in the bytes that were received from a port.
+    """Find the frames in the bytes that were received from a port, and determine their times.
 
     Args:
         received: The bytes.
@@ -216,6 +223,7 @@ def read_frames(received: ReceivedData, device: Device) -> Capture:
     clock = DeviceClock()
     for chunk in received.chunks:
         for frame in capture.parser.feed(chunk.data):
+            # The time is that of the device's clock, or the arrival time if the frame contains no time.
             frame_time = clock.read(frame.t_us, capture.parser.t_us_modulus, chunk.timestamp)
             capture.frames.append(frame)
             capture.times_s.append(frame_time.clock_s)

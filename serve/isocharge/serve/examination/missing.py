@@ -55,7 +55,13 @@ class BoardFindings:
 
 
 def missing_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield one sentence for each setting or property that is missing before contacts can be computed."""
+    """Yield one sentence for each setting or property that the board needs before contacts can be computed.
+
+    Without bytes or without frames, there is only one sentence, because nothing else is known.
+
+    Args:
+        findings: Results of the port check.
+    """
     capture = findings.capture
     if not capture.bytes_seen:
         yield (
@@ -76,15 +82,20 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
     yield from _channel_count_sentences(findings)
     if findings.unit != "pC":
         yield GAIN_REQUESTS[findings.unit]
+    tare_rule = findings.device.tare or TareRule()  # the defaults if the device file has no tare
     for channel in findings.channels:
         if channel.span_pC == 0.0:
             yield f"channel {printable(channel.name)} is dead: every value is {channel.offset_pC:g}"
-        if findings.unit == "pC":
-            yield from _charge_sentences(channel, findings.device.tare or TareRule())
+        if findings.unit == "pC":  # the limits of the charges are in pC
+            yield from _charge_sentences(channel, tare_rule)
 
 
 def _transmission_sentences(capture: Capture) -> Iterator[str]:
-    """Yield a sentence if bytes are damaged, and another sentence if frames are missing."""
+    """Yield a sentence if bytes were damaged during the transmission, and another sentence if frames were lost.
+
+    Args:
+        capture: The frames, with the share of intact bytes and the gaps in the frame numbers.
+    """
     if capture.intact_share < CLEAN_SHARE:
         damaged_share = 1.0 - capture.intact_share
         yield (
@@ -96,29 +107,38 @@ def _transmission_sentences(capture: Capture) -> Iterator[str]:
 
 
 def _channel_count_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield a sentence if the board has more or fewer channels than the model has electrodes."""
-    electrodes = findings.electrodes
+    """Yield a sentence if the board has more or fewer channels than the model has electrodes.
+
+    No sentence is needed without a model, or if the device file assigns a channel to every electrode.
+
+    Args:
+        findings: Results of the port check.
+    """
+    electrodes = findings.electrodes  # empty without a model
     channel_count = len(findings.channels)
     are_channels_assigned = set(findings.device.channels) >= set(electrodes)
     if not electrodes or channel_count == len(electrodes) or are_channels_assigned:
         return
-    channels = f"{channel_count} channels"
+    used_channels = f"{channel_count} channels"
     if findings.unused:
-        channels = f"{channel_count} of {len(findings.capture.names)} channels"
+        used_channels = f"{channel_count} of {len(findings.capture.names)} channels"
     yield (
-        f"the board uses {channels}, but the model has the electrodes {electrodes}: choose another model with --model, "
-        "or assign the channels in the section [channels] of a device file"
+        f"the board uses {used_channels}, but the model has the electrodes {electrodes}: choose another model with "
+        "--model, or assign the channels in the section [channels] of a device file"
     )
 
 
 def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
     """Yield a sentence for each property of the charges of a channel that prevents a tare or disturbs the contact.
 
+    The tare is the measurement of the charge at rest. A tare requires a small noise and a small offset of each channel.
+
     Args:
-        channel: Health of the channel, whose unit is pC.
+        channel: Offset, noise, drift and hum of the channel, pC.
         rule: Conditions of the tare.
     """
     name = printable(channel.name)
+    # The results are None if the channel has no usable value. The first sentence reports these values.
     noise_pC = channel.noise_pC or 0.0
     offset_pC = channel.offset_pC or 0.0
     drift_pC_per_s = channel.drift_pC_per_s or 0.0
@@ -146,25 +166,29 @@ def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
 
 
 def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield a sentence for each setting or property that is missing before held presses keep their force.
+    """Yield a sentence for each missing setting or property without which the force of a held press seems to change.
 
     The settings correct the leak of the amplifiers. Touches are also computed without these settings.
 
-    If the user has held a press during the check, the result of this press determines the settings. Otherwise a
-    sentence asks for the time constants of the amplifiers, unless the device file contains the time constants.
+    If the user has held a press during the check, the charge of this press determines the settings. If no press was
+    held, a sentence asks for the time constants of the amplifiers, unless the device file contains the time constants.
+
+    Args:
+        findings: Results of the port check. `held.sections` are the sections of a device file that correct the press.
     """
     if not findings.capture.frames:
         return
     device = findings.device
     held = findings.held
-    if findings.capture.frames[0].t_us is None and device.leak is not None:
+    has_device_clock = findings.capture.frames[0].t_us is not None
+    if device.leak is not None and not has_device_clock:
         yield (
             "send the time of a device clock in each frame (t_us, t_ms or t_s): without it the leak is corrected with "
             "the arrival times, which jitter"
         )
     if held is not None:
         for name, section in held.sections.items():
-            if name not in device.table:
+            if name not in device.table:  # the device file has no such section yet
                 yield f"put {section_text(name, section)} into a device file"
     elif device.leak is None:
         yield (

@@ -1,7 +1,7 @@
 """The port check, which examines the bytes that a board sends.
 
-The result contains the format and the rate of the frames, the health of the channels, a device file, and the missing
-settings.
+The result contains the format and the rate of the frames, the health of the channels, the content of a device file, and
+the settings that are still missing.
 """
 
 import math
@@ -52,8 +52,8 @@ class Examination:
         unit: Unit of the channels: "pC", or "counts" or "V" if the charge of one unit is not known.
         channels: Health of each channel that is used; empty without frames.
         unused: Channels that no electrode uses.
-        held: Description of a press that was held during the check, a sentence; empty if there was none.
-        touch: Description of a touch while the film should be at rest, a sentence; empty if there was none.
+        held: Sentence about a press that was held during the check; empty if there was none.
+        touch: Sentence about a touch while the film should be at rest; empty if there was none.
         missing: One sentence for each setting or property that is missing before contacts can be computed.
         missing_for_held_presses: One sentence for each setting or property that is missing before held presses keep
             their force. Touches are computed without them.
@@ -95,7 +95,9 @@ def examine(
     request: Request | None = None,
     wait: float = 0.0,
 ) -> Examination:
-    """Check a port. The film must not be touched during the check, except for a press that is held.
+    """Listen on a port, and examine what the board sends.
+
+    The film must not be touched during the check, except for a single press that is held for some seconds.
 
     Args:
         url: Device path or URL, as `Port` takes it.
@@ -104,7 +106,7 @@ def examine(
         device: Settings of the board; by default the format of the frames is recognised.
         electrodes: Electrodes of the model that will be used; empty for any model.
         gain: Keys of the section `[gain]`, if there is no device file.
-        request: Request that the board needs; by default that of the device.
+        request: Request that the board needs for each frame; by default the request in the device file.
         wait: Time to wait until the port can be opened, s.
 
     Raises:
@@ -117,7 +119,12 @@ def examine(
 
 
 def _is_clear(received: ReceivedData, device: Device) -> bool:
-    """Return whether most of the bytes belong to frames, which shows that the baud rate is right."""
+    """Return whether most of the bytes belong to frames, which shows that the baud rate is right.
+
+    Args:
+        received: Bytes that were received at the baud rate.
+        device: Settings of the board. For `ANY_BOARD`, the format of the frames is recognised from the bytes.
+    """
     if device is ANY_BOARD:
         frames = recognise(received.data, received.span_s, are_datagrams=received.are_datagrams)
         device = device_from_table({"frames": frames or {}}, "board")
@@ -149,6 +156,8 @@ def examine_received(
 ) -> Examination:
     """Examine the bytes that were received from a port.
 
+    The film must not have been touched during this time, except for a single press that was held.
+
     Args:
         received: The bytes, with the port and the time of listening.
         device: Settings of the board; by default the format of the frames is recognised and a device file is proposed.
@@ -161,31 +170,33 @@ def examine_received(
     Raises:
         DeviceError: If the gain is wrong, or for other electrodes.
     """
-    # Without a device file, the format of the frames and the settings are proposed from the bytes.
+    # Without a device file (`ANY_BOARD`), the format of the frames and the settings are proposed from the bytes.
     proposal = Proposal(dict(device.table), electrodes)
     is_proposed = device is ANY_BOARD
     if is_proposed:
         proposal = propose(received, electrodes, gain or {})
         device = _proposed_device(proposal, is_gain_stated=bool(gain))
 
-    # Read the frames, and examine the channels in the time before a held press.
+    # Read the frames, and examine the channels in the time before a held press. With a gain, all values are converted
+    # to pC.
     capture = read_frames(received, device)
     unit = "pC" if device.gain is not None else unit_of(capture)
-    electrode_at = electrode_positions(capture, device)
-    unused = tuple(name for position, name in enumerate(capture.names) if position not in electrode_at)
+    electrode_at_position = electrode_positions(capture, device)
+    unused = tuple(name for position, name in enumerate(capture.names) if position not in electrode_at_position)
     held = find_held_press(*capture.values()) if capture.frames else None
-    rest_end_s = math.inf if held is None else held.begin_s
-    channels = tuple(_channels(capture, device, electrode_at, rest_end_s))
-    touch = _touch_sentence(capture, device, electrode_at, held, unit)
+    rest_end_s = math.inf if held is None else held.begin_s  # the film is at rest until a held press begins
+    channels = tuple(_measure_channels(capture, device, electrode_at_position, rest_end_s))
+    touch_sentence = _touch_sentence(capture, device, electrode_at_position, held, unit)
 
-    # Complete the device file, and test whether the film can be tared with its settings.
-    table = _completed_table(proposal.table, held, without_offsets=is_proposed and bool(touch))
-    board = BoardFindings(capture, channels, unused, device, proposal.electrodes, unit, held, touch)
-    electrode_names = proposal.electrodes or tuple(electrode_at.values())
-    is_at_rest = bool(electrode_at) and not touch
+    # Complete the device file, and test whether the film can be tared with its settings. Proposed offsets that were
+    # measured on a touched film are wrong.
+    table = _completed_table(proposal.table, held, without_offsets=is_proposed and bool(touch_sentence))
+    findings = BoardFindings(capture, channels, unused, device, proposal.electrodes, unit, held, touch_sentence)
+    electrode_names = proposal.electrodes or tuple(electrode_at_position.values())
+    is_at_rest = bool(electrode_at_position) and not touch_sentence
     works = is_at_rest and _can_be_tared(received, table, electrode_names)
 
-    # The first frame shows whether the frames have a number and a time.
+    # The first frame shows whether the frames have a number and a time. Without frames, both are None.
     first_frame = capture.frames[0] if capture.frames else Frame(None, None, ())
     is_numbered = first_frame.seq is not None
     counts = capture.parser.counts
@@ -205,9 +216,9 @@ def examine_received(
         channels=channels,
         unused=unused,
         held="" if held is None else held.description,
-        touch=touch,
-        missing=tuple(missing_sentences(board)),
-        missing_for_held_presses=tuple(held_press_sentences(board)),
+        touch=touch_sentence,
+        missing=tuple(missing_sentences(findings)),
+        missing_for_held_presses=tuple(held_press_sentences(findings)),
         works=works,
         device=table,
     )
@@ -217,42 +228,51 @@ def _completed_table(table: Mapping[str, Any], held: HeldPress | None, *, withou
     """Return the content of a device file, completed with the sections that follow from a held press.
 
     Args:
-        table: Content of the device file. Its sections take precedence.
-        held: The press; None if there was none.
-        without_offsets: Whether the offsets are removed. Offsets that were measured on a touched film are wrong.
+        table: Sections of the device file by name. They take precedence over the sections of the press.
+        held: The press, with sections that correct the change of its charge; None if there was none.
+        without_offsets: Whether the key `offset` of the section `[gain]` is removed. Offsets that were measured on a
+            touched film are wrong.
+
+    Returns:
+        The completed sections by name. The given table is not changed.
     """
     completed = dict(table)
     if held is not None:
         for name, section in held.sections.items():
-            completed.setdefault(name, section)
+            completed.setdefault(name, section)  # keeps a section that the device file already has
     if without_offsets and "gain" in completed:
-        gain_without_offset = {key: value for key, value in completed["gain"].items() if key != "offset"}
-        del completed["gain"]
-        if gain_without_offset:  # an empty section is not valid
-            completed["gain"] = gain_without_offset
+        gain = completed.pop("gain")
+        remaining_gain = {key: value for key, value in gain.items() if key != "offset"}
+        if remaining_gain:  # an empty section is not valid
+            completed["gain"] = remaining_gain
     return completed
 
 
 def _touch_sentence(
-    capture: Capture, device: Device, electrode_at: Mapping[int, str], held: HeldPress | None, unit: str
+    capture: Capture, device: Device, electrode_at_position: Mapping[int, str], held: HeldPress | None, unit: str
 ) -> str:
-    """Return a sentence if the film was touched before any held press; otherwise an empty text.
+    """Return a sentence for the user if the film was touched before any held press; otherwise an empty text.
+
+    The film should be at rest before a held press.
 
     Args:
         capture: The frames.
         device: Settings of the board, with its gain.
-        electrode_at: Name of the electrode by the position of its channel in the frame.
+        electrode_at_position: Name of the electrode by the position of its channel in the frame.
         held: The held press; None if there was none.
         unit: Unit of the channels: "pC", "counts" or "V".
     """
-    if not capture.frames or not electrode_at:
+    if not capture.frames or not electrode_at_position:
         return ""
+    # The last moments before a held press do not count as rest, because the force is already rising.
     rest_end_s = math.inf if held is None else held.begin_s - PRESS_MARGIN_S
-    charges, times_s = _rest_charges(capture, device, electrode_at, rest_end_s)
+    charges, times_s = _rest_charges(capture, device, electrode_at_position, rest_end_s)
     touch = find_touch(charges, times_s, unit_is_pC=unit == "pC")
     if touch is None:
         return ""
-    positions_in_frame = list(electrode_at)
+
+    # The charges have one column for each electrode. Find the channel of the column that was touched.
+    positions_in_frame = list(electrode_at_position)
     position_in_frame = positions_in_frame[touch.position]
     name = printable(capture.names[position_in_frame])
     return (
@@ -262,11 +282,11 @@ def _touch_sentence(
 
 
 def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
-    """Return whether a tare of the film succeeds with the settings of a device file.
+    """Return whether a tare of the film (measurement of its charge at rest) succeeds with a device file.
 
-    If the device file has no tare, or there are too few frames to judge, the result is also true. Twice as many frames
-    as a tare needs are enough to judge. The result is false if there are no frames, or if reading the frames raises an
-    error.
+    The result is also true if the device file switches the tare off, or if there are too few frames to judge. Twice as
+    many frames as a tare needs are enough to judge. The result is false if there are no frames, or if reading the
+    frames raises an error.
 
     Args:
         received: Bytes that the board sent while the film was at rest.
@@ -275,6 +295,7 @@ def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: 
     """
     frame_count = 0
     try:
+        # Process the bytes again as a reader of the board does, until a frame has a tare.
         device = device_from_table(table, "board")
         stream = ReadingStream(electrodes, device)
         for chunk in received.chunks:
@@ -285,8 +306,10 @@ def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: 
     except IsochargeError:
         return False
 
-    # No frame was tared. This proves that a tare fails only if there were enough frames.
-    return device.tare is not None and 0 < frame_count < 2 * device.tare.frames
+    # No frame has a tare. This only shows that a tare fails if there were enough frames.
+    if device.tare is None or frame_count == 0:  # there were no frames
+        return False
+    return frame_count < 2 * device.tare.frames
 
 
 def electrode_positions(capture: Capture, device: Device) -> dict[int, str]:
@@ -300,45 +323,46 @@ def electrode_positions(capture: Capture, device: Device) -> dict[int, str]:
     return {position: electrode for position, electrode in positions.items() if position is not None}
 
 
-def _channels(
-    capture: Capture, device: Device, electrode_at: Mapping[int, str], until_s: float
+def _measure_channels(
+    capture: Capture, device: Device, electrode_at_position: Mapping[int, str], rest_end_s: float
 ) -> Iterator[ChannelHealth]:
-    """Yield the health of each channel that belongs to an electrode.
+    """Yield the health (offset, noise, drift and hum) of each channel that belongs to an electrode.
 
     Args:
         capture: The frames.
         device: Settings of the board, with its gain.
-        electrode_at: Name of the electrode by the position of its channel in the frame.
-        until_s: Time until which the film is at rest, s from the first frame. Later frames are left out.
+        electrode_at_position: Name of the electrode by the position of its channel in the frame.
+        rest_end_s: Time until which the film is at rest, s from the first frame. Later frames are left out.
     """
     if not capture.frames:
         return
-    charges_pC, times_s = _rest_charges(capture, device, electrode_at, until_s)
-    for position, charge_pC in zip(electrode_at, charges_pC.T, strict=True):
+    charges_pC, times_s = _rest_charges(capture, device, electrode_at_position, rest_end_s)
+    for position, charge_pC in zip(electrode_at_position, charges_pC.T, strict=True):
         yield measure_channel_health(capture.names[position], charge_pC, times_s, capture.rate_Hz)
 
 
 def _rest_charges(
-    capture: Capture, device: Device, electrode_at: Mapping[int, str], until_s: float
+    capture: Capture, device: Device, electrode_at_position: Mapping[int, str], rest_end_s: float
 ) -> tuple[Array, Array]:
     """Return the charges of the frames in which the film is at rest, and the times of these frames.
 
     Args:
         capture: The frames.
         device: Settings of the board, with its gain.
-        electrode_at: Name of the electrode by the position of its channel in the frame.
-        until_s: Time until which the film is at rest, s from the first frame.
+        electrode_at_position: Name of the electrode by the position of its channel in the frame.
+        rest_end_s: Time until which the film is at rest, s from the first frame. Later frames are left out.
 
     Returns:
-        Charges in the order of `electrode_at`, shape (n, n_electrode). Their unit is pC if the gain is known, and the
-        unit of the board otherwise. Times, shape (n,), s.
+        Two arrays. The first array contains the charges, shape (n, n_electrode), with the columns in the order of
+        `electrode_at_position`. Their unit is pC if the gain is known, and the unit of the board otherwise. The second
+        array contains the times since the first frame, shape (n,), s.
     """
-    values, times_s = capture.values()
-    is_rest = times_s < until_s
-    positions_in_frame = list(electrode_at)
+    values, times_s = capture.values()  # shape (frames, channels) and shape (frames,)
+    is_rest = times_s < rest_end_s
+    positions_in_frame = list(electrode_at_position)
     charges = values[is_rest][:, positions_in_frame]
     if device.gain is not None:
-        for column, electrode in enumerate(electrode_at.values()):
-            with np.errstate(over="ignore"):
+        for column, electrode in enumerate(electrode_at_position.values()):
+            with np.errstate(over="ignore"):  # an unusable value may become infinite, and is ignored later
                 charges[:, column] = device.gain.charge_pC(electrode, charges[:, column])
     return charges, times_s[is_rest]

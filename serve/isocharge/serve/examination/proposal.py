@@ -1,6 +1,6 @@
-"""Proposal of the device file that fits a board: its frames, the channels of the electrodes, and their offsets.
+"""Proposal of a device file for a board: the frames, the channel of each electrode, and the offsets of the channels.
 
-The charge of one count cannot be derived from the bytes. The user has to state it.
+The charge of one count cannot be derived from the bytes. The user has to state this charge.
 """
 
 import math
@@ -53,7 +53,7 @@ ELECTRODES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
 def rest_of(values: Array) -> float:
-    """Compute the rest level of a channel, which is the median of its finite values; 0 if there are none."""
+    """Compute the rest level of a channel, which is the median of its finite values. It is 0 without finite values."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else 0.0
 
@@ -61,9 +61,9 @@ def rest_of(values: Array) -> float:
 def noise_of(values: Array) -> float:
     """Estimate the noise of a channel from the differences between consecutive values.
 
-    Presses have little effect on these differences. If the noise is normally distributed, the median difference is
-    0.6745 * sqrt(2) standard deviations. If the median difference of coarse counts is 0, the mean difference is used,
-    which is 2 / sqrt(pi) standard deviations.
+    Presses have little effect on these differences. If the noise is normally distributed, the median magnitude of a
+    difference is 0.6745 * sqrt(2) standard deviations. For coarse counts, most differences may be 0. In this case, the
+    mean magnitude of the differences is used, which is 2 / sqrt(pi) standard deviations.
 
     Args:
         values: Values of the channel, shape (n,), any unit. Values that are not finite are left out.
@@ -72,13 +72,13 @@ def noise_of(values: Array) -> float:
         The standard deviation in the unit of the values; 0 if there are fewer than two finite values.
     """
     finite = values[np.isfinite(values)].astype(float)
-    steps = np.abs(np.diff(finite))
-    if not len(steps):
+    differences = np.abs(np.diff(finite))
+    if len(differences) == 0:
         return 0.0
-    median_step = float(np.median(steps))
-    if median_step > 0.0:
-        return median_step / (0.6745 * math.sqrt(2.0))
-    return float(steps.mean()) * math.sqrt(math.pi) / 2.0
+    median_difference = float(np.median(differences))
+    if median_difference > 0.0:
+        return median_difference / (0.6745 * math.sqrt(2.0))
+    return float(differences.mean()) * math.sqrt(math.pi) / 2.0
 
 
 class Proposal(NamedTuple):
@@ -86,7 +86,7 @@ class Proposal(NamedTuple):
 
     Attributes:
         table: Content of the file; empty if the frames are not recognised.
-        electrodes: Electrodes of the model, or as many names as there are live channels.
+        electrodes: Electrodes of the model. Without a model, one name for each channel whose values vary.
     """
 
     table: dict[str, Any]
@@ -96,14 +96,17 @@ class Proposal(NamedTuple):
 def propose(received: ReceivedData, electrodes: tuple[str, ...], gain: Mapping[str, Any]) -> Proposal:
     """Propose the device file for a board.
 
-    The bytes determine the format of the frames, the channels of the electrodes, and the offsets of the channels. The
-    section `[gain]` is proposed if the user states the gain, if the channels have large offsets, or if their unit is
-    not pC.
+    The bytes determine the format of the frames, the channels of the electrodes, and the offsets of the channels. An
+    offset is the value of a channel without charge. The section `[gain]` is proposed if the user states the gain, if
+    the channels have large offsets, or if their unit is not pC.
 
     Args:
         received: Bytes that the board sent.
         electrodes: Electrodes of the model; empty for any model.
         gain: Gain as the user states it: pC_per_unit, or V_per_unit and feedback_pF; empty if it is unknown.
+
+    Returns:
+        The sections of the device file, which are empty if no frames are recognised, and the names of the electrodes.
     """
     frames = _recognise_frames(received)
     if frames is None:
@@ -115,32 +118,40 @@ def propose(received: ReceivedData, electrodes: tuple[str, ...], gain: Mapping[s
 
     values, times_s = capture.values()
     positions = _choose_channels(capture, values, electrodes)
-    if positions:
+    if positions:  # otherwise there are fewer suitable channels than electrodes
         table["channels"] = {electrode: capture.names[position] for electrode, position in positions.items()}
 
-    # Measure the offsets in the frames before a held press.
+    # Measure the offsets in the frames in which the film is at rest, which end before a held press.
     held = find_held_press(values, times_s)
     rest_values = values if held is None else values[times_s < held.begin_s]
     rest_columns = {electrode: rest_values[:, position] for electrode, position in positions.items()}
-    has_large_offset = any(abs(rest_of(column)) > TareRule().offset_limit_pC for column in rest_columns.values())
-    if gain or has_large_offset or unit_of(capture) != "pC":
+    largest_tared_offset_pC = TareRule().offset_limit_pC  # a tare fails if a channel rests at a larger value
+    has_large_offset = any(abs(rest_of(column)) > largest_tared_offset_pC for column in rest_columns.values())
+    is_in_pC = unit_of(capture) == "pC"
+    if gain or has_large_offset or not is_in_pC:
         known_gain = dict(gain)
-        if not known_gain and unit_of(capture) == "pC":
+        if not known_gain and is_in_pC:
             known_gain = {"pC_per_unit": 1.0}  # only the offsets are needed
-        table["gain"] = _offsets(rest_columns, known_gain) | known_gain
+        table["gain"] = _offset_setting(rest_columns, known_gain) | known_gain
     return Proposal(table, electrodes or tuple(positions))
 
 
 def _recognise_frames(received: ReceivedData) -> dict[str, Any] | None:
-    """Return the section `[frames]` of a device file for received bytes; None if no format is recognised.
+    """Recognise the format of the frames, and return it as the section `[frames]` of a device file.
 
     If the board needs a request for each frame, the section contains the request.
+
+    Args:
+        received: Bytes that the board sent, and the request that was sent to the board.
+
+    Returns:
+        The settings of the section by name; None if no format is recognised.
     """
     frames = recognise(received.data, received.span_s, are_datagrams=received.are_datagrams)
     request = received.request
     if frames is None or request is None:
-        return frames
-    frames["request"] = request.data.hex(" ").upper()
+        return frames  # no format is recognised, or the board sends frames without a request
+    frames["request"] = request.data.hex(" ").upper()  # bytes as hexadecimal numbers, such as "3F 0A"
     frames["request_Hz"] = request.rate_Hz
     if request.echo:
         frames["echo"] = True
@@ -150,23 +161,27 @@ def _recognise_frames(received: ReceivedData) -> dict[str, Any] | None:
 def unit_of(capture: Capture) -> str:
     """Return the unit of the values of a board whose gain is unknown: "pC", "counts" or "V".
 
-    The rules are applied in the following order.
+    The unit is guessed from the names and the values of the channels. The first rule that applies determines the unit.
 
     - Binary frames of isocharge, channels whose names end in `_pC`, and small values that never change are in pC.
     - Whole numbers are counts.
     - Channels whose names end in `V`, and small numbers with little noise, are in volts.
     - All other numbers are assumed to be in pC.
+
+    Args:
+        capture: The frames that were received. Without frames, the result is "pC".
     """
     names_state_pC = all(name.endswith("_pC") for name in capture.names)
     if not capture.frames or capture.parser.format == BINARY or names_state_pC:
         return "pC"
-    values, _ = capture.values()
-    finite_rows = values[np.isfinite(values).all(axis=1)]
+    values, _times_s = capture.values()  # shape (frames, channels)
+    finite_rows = values[np.isfinite(values).all(axis=1)]  # frames in which all values are finite
     largest = float(np.abs(finite_rows).max(initial=0.0))
     is_constant = len(finite_rows) == 0 or bool((finite_rows == finite_rows[0]).all())
     if is_constant and largest <= LARGEST_STILL_PC:
         return "pC"
-    if bool((finite_rows == np.round(finite_rows)).all()):
+    has_whole_numbers = bool((finite_rows == np.round(finite_rows)).all())
+    if has_whole_numbers:
         return "counts"
 
     largest_noise = max(noise_of(column) for column in finite_rows.T)
@@ -180,8 +195,9 @@ def unit_of(capture: Capture) -> str:
 def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...]) -> dict[str, int]:
     """Choose the channel of each electrode.
 
-    If there are channels with the names of the electrodes, these channels are chosen. Otherwise the electrodes are
-    assigned in their order to channels whose values vary. Without a model, each varying channel is an electrode.
+    If there are channels with the names of the electrodes, these channels are chosen. If the channels have other names,
+    the electrodes are assigned, in their order, to channels whose values vary. Without a model, each varying channel is
+    an electrode.
 
     Args:
         capture: The frames.
@@ -191,6 +207,7 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
     Returns:
         Position of the channel in the frame by the name of the electrode; empty if there are too few channels.
     """
+    # The name of a channel may contain the name of an electrode, such as `A_pC` for A.
     names = capture.names
     named_positions = {electrode_of(channel): position for position, channel in enumerate(names)}
     if electrodes and set(electrodes) <= set(named_positions):
@@ -198,6 +215,7 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
 
     candidates = _varying_channels(values)
     if not electrodes:
+        # Without a model, use the names in the channels if they are single capital letters. Otherwise use A, B, C, ...
         channel_electrodes = tuple(electrode_of(names[position]) for position in candidates)
         are_usual_names = set(channel_electrodes) <= set(ELECTRODES)
         electrodes = channel_electrodes if are_usual_names else tuple(ELECTRODES[: len(candidates)])
@@ -206,7 +224,7 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
         candidates = list(range(len(names)))  # a channel that never changes keeps its place and is reported
     if len(candidates) < len(electrodes):
         return {}
-    positions = _most_alike(values, candidates, len(electrodes))
+    positions = _channels_of_similar_noise(values, candidates, len(electrodes))
     return dict(zip(electrodes, positions, strict=True))
 
 
@@ -214,59 +232,73 @@ def _varying_channels(values: Array) -> list[int]:
     """Return the positions of the channels that vary. Channels with much less noise than the others are left out.
 
     All positions are returned if no channel varies. A channel with a value that is not finite does not vary.
+
+    Args:
+        values: Values of all channels, shape (n, channels).
     """
-    columns = [column if np.isfinite(column).all() else np.zeros(1) for column in values.T]
-    varying = [position for position, column in enumerate(columns) if np.ptp(column) > 0.0]
-    if not varying:
-        return list(range(len(columns)))
-    noise = {position: noise_of(columns[position]) for position in varying}
-    usual_noise = float(np.median(list(noise.values())))
-    return [position for position in varying if noise[position] >= QUIET_SHARE * usual_noise]
+    noise_at_position = {}  # noise of each channel that varies
+    for position, column in enumerate(values.T):
+        if np.isfinite(column).all() and np.ptp(column) > 0.0:
+            noise_at_position[position] = noise_of(column)
+    if not noise_at_position:
+        channel_count = values.shape[1]
+        return list(range(channel_count))
+    usual_noise = float(np.median(list(noise_at_position.values())))
+    return [position for position, noise in noise_at_position.items() if noise >= QUIET_SHARE * usual_noise]
 
 
-def _most_alike(values: Array, candidates: list[int], count: int) -> list[int]:
-    """Choose the adjacent channels whose noise is most similar, and return their positions.
+def _channels_of_similar_noise(values: Array, candidates: list[int], count: int) -> list[int]:
+    """Choose the group of adjacent candidates whose noise is most similar, and return their positions.
 
-    For each group of adjacent channels, the ratio of the largest to the smallest noise is rounded to a power of ten, so
-    that small differences do not matter. The first group with the smallest rounded ratio is chosen.
+    For each group of `count` candidates that follow each other, the ratio of the largest to the smallest noise is
+    rounded to a power of ten, so that small differences do not matter. The first group with the smallest rounded ratio
+    is chosen.
 
     Args:
         values: Values of all channels, shape (n, channels).
         candidates: Positions of the channels to choose from.
-        count: Number of channels to choose.
+        count: Number of channels to choose, at most the number of candidates.
     """
     noise = [noise_of(values[:, position]) for position in candidates]
-    log_noise = np.log10(np.maximum(noise, SMALLEST_NOISE))
-    differences = []  # difference of the logarithms in each group, as a whole number
+    log_noise = np.log10(np.maximum(noise, SMALLEST_NOISE))  # the lower limit avoids the logarithm of 0
+    rounded_log_ratios = []  # logarithm of the rounded ratio of each group
     for first in range(len(candidates) - count + 1):
         log_noise_of_group = log_noise[first : first + count]
-        differences.append(round(float(np.ptp(log_noise_of_group))))
-    best_first = int(np.argmin(differences))
+        log_ratio = float(np.ptp(log_noise_of_group))  # largest minus smallest logarithm
+        rounded_log_ratios.append(round(log_ratio))
+    best_first = int(np.argmin(rounded_log_ratios))
     return candidates[best_first : best_first + count]
 
 
-def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the key `offset` of the section `[gain]`: the values of the channels without charge.
+def _offset_setting(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the setting `offset` of the section `[gain]`, which contains the values of the channels without charge.
 
-    The key has one value if all electrodes have the same offset. The result is empty if all electrodes rest at 0. Half
-    of the range of a converter is preferred to the measured rest level, unless the difference would prevent a tare.
+    If a channel rests near half of the range of a converter, half of the range is its offset. For a channel with
+    another rest level, the measured rest level is the offset. If the difference between offset and rest level would
+    prevent a tare at any electrode, the measured rest levels are used for all electrodes.
 
     Args:
         columns: Values of the channel of each electrode at rest, each of shape (n,), in the unit of the board.
         gain: The other keys of the section; empty if they are not known.
-    """
-    rests = {electrode: rest_of(column) for electrode, column in columns.items()}
-    offsets = {electrode: _offset(column) for electrode, column in columns.items()}
 
+    Returns:
+        The key with its value, which is one number if all electrodes have the same offset, and otherwise a table of
+        numbers by electrode; empty if all electrodes rest at 0.
+    """
+    rest_levels = {electrode: rest_of(column) for electrode, column in columns.items()}
+    offsets = {electrode: _proposed_offset(column) for electrode, column in columns.items()}
+
+    # A rest level whose magnitude is at most the limit of the electrode counts as 0.
     limits = _zero_limits(columns, gain)
-    all_rest_at_zero = all(abs(rest) <= limits[electrode] for electrode, rest in rests.items())
+    all_rest_at_zero = all(abs(rest) <= limits[electrode] for electrode, rest in rest_levels.items())
     if all_rest_at_zero:
         return {}
 
-    # With half of the range as the offset, the remaining rest level must be small enough for a tare.
-    prevents_tare = any(abs(rest - offsets[electrode]) > limits[electrode] for electrode, rest in rests.items())
+    # With half of the range as the offset, the remaining rest level must be small enough for a tare. This limit is only
+    # known with the gain.
+    prevents_tare = any(abs(rest - offsets[electrode]) > limits[electrode] for electrode, rest in rest_levels.items())
     if gain and prevents_tare:
-        offsets = {electrode: _rounded(rest) for electrode, rest in rests.items()}
+        offsets = {electrode: _round_rest_level(rest) for electrode, rest in rest_levels.items()}
     different_offsets = set(offsets.values())
     if len(different_offsets) == 1:
         return {"offset": different_offsets.pop()}
@@ -276,27 +308,28 @@ def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str,
 def _zero_limits(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, float]:
     """Return the largest magnitude of the rest level of each electrode that counts as 0, in the unit of the board.
 
-    If the gain is known, the limit is half of the largest offset that a tare accepts. Otherwise the limit is derived
-    from the noise.
+    If the gain is known, the limit is half of the largest offset that a tare accepts. If the gain is not known, the
+    limit is derived from the noise.
 
     Args:
         columns: Values of the channel of each electrode at rest, each of shape (n,), in the unit of the board.
         gain: The other keys of the section `[gain]`; empty if they are not known.
     """
     if gain:
-        limit = 0.5 * TareRule().offset_limit_pC / _largest_pC(gain)
+        limit = 0.5 * TareRule().offset_limit_pC / _largest_charge_of_unit(gain)
         return dict.fromkeys(columns, limit)
     return {electrode: max(REST_SIGMAS * noise_of(column), SMALLEST_LIMIT) for electrode, column in columns.items()}
 
 
-def _largest_pC(gain: Mapping[str, Any]) -> float:
-    """Compute a charge, pC, that one unit of the board does not exceed in magnitude at any electrode.
+def _largest_charge_of_unit(gain: Mapping[str, Any]) -> float:
+    """Compute an upper limit for the magnitude of the charge of one unit of the board, pC.
 
-    The charge is `pC_per_unit`, or the product of `V_per_unit` and `feedback_pF`. The largest values of the two
+    The charge of one unit is `pC_per_unit`, or the product of `V_per_unit` and `feedback_pF`. The limit is valid for
+    all electrodes. The limit can be larger than the charge of any electrode, because the largest values of the two
     settings may belong to different electrodes.
 
     Args:
-        gain: The keys of the section `[gain]` that state the charge. Each is a number, or has one for each electrode.
+        gain: The settings that state the charge. Each setting is a number, or a table of numbers by electrode.
     """
     product_pC = 1.0
     for setting in gain.values():
@@ -305,23 +338,27 @@ def _largest_pC(gain: Mapping[str, Any]) -> float:
     return product_pC
 
 
-def _offset(column: Array) -> float | int:
-    """Return the value that a channel has if there is no charge.
+def _proposed_offset(column: Array) -> float | int:
+    """Return the value that a channel probably has without charge, in the unit of the board.
 
-    If the rest level is near half of the range of a converter, half of the range is returned. Otherwise the rest level
-    is returned.
+    A converter usually rests at zero or at half of its range, which is 2^(bits - 1) counts. If the values are whole
+    numbers and the rest level is near half of the range of a usual converter, half of the range is returned. Otherwise
+    the rounded rest level is returned.
+
+    Args:
+        column: Values of the channel at rest, shape (n,).
     """
     rest = rest_of(column)
     has_whole_numbers = bool((column == np.round(column)).all())
     if has_whole_numbers:
         for bits in CONVERTER_BITS:
-            half_range = 1 << (bits - 1)
+            half_range = 1 << (bits - 1)  # 2^(bits - 1)
             if abs(rest - half_range) <= HALF_SCALE_SHARE * half_range:
                 return half_range
-    return _rounded(rest)
+    return _round_rest_level(rest)
 
 
-def _rounded(rest: float) -> float | int:
+def _round_rest_level(rest: float) -> float | int:
     """Round a rest level to six digits, or to a whole number if it is 1000 or more."""
     value = float(f"{rest:.6g}")
     if abs(rest) >= 1000.0 or value.is_integer():

@@ -6,8 +6,8 @@ within half a second. Warming, creep and the slow noise of amplifiers cause slow
 The values are replaced by their medians over blocks of 0.1 s, because hum averages out in a block. A single damaged
 value does not change the median of a block.
 
-A press that is held with constant force for the whole time does not change the charges. Such a press cannot be
-distinguished from an amplifier that rests at another level.
+A press that is held with a constant force during the whole check does not change the charges. A press with a constant
+force cannot be distinguished from an amplifier with another rest level.
 """
 
 from typing import NamedTuple
@@ -38,7 +38,7 @@ MAX_SLOW_CHANGE_PC = 100.0
 
 
 class TouchFound(NamedTuple):
-    """The largest change of a charge during the time in which the film should be at rest.
+    """The touched channel, and the largest change of its charge while the film should be at rest.
 
     Attributes:
         position: Position of the channel in the frame.
@@ -52,10 +52,11 @@ class TouchFound(NamedTuple):
 
 
 def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | None:
-    """Search for a touch.
+    """Search for a touch in the values of a film that should be at rest.
 
-    A channel is touched if its value changes fast by more than noise can explain. If the values are in pC, a large slow
-    change is a touch, too.
+    A channel is touched if its value changes within half a second by more than noise can explain. If the values are in
+    pC, a large slow change is a touch, too. The values are first replaced by medians over short blocks of time, so that
+    hum and single damaged values have little effect.
 
     Args:
         values: Values of the channels, shape (n, channels).
@@ -64,12 +65,12 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
             noise only.
 
     Returns:
-        The largest change of a channel that is a touch; None if there is none.
+        The touched channel with the largest change; None if no channel is touched.
     """
-    blocks = block_medians(values, times_s)
+    blocks = block_medians(values, times_s)  # shape (blocks, channels)
     if len(blocks) < MIN_BLOCKS:
         return None
-    # The median of three consecutive blocks, shape (blocks - 2, channels)
+    # Smooth the blocks with the median of three consecutive blocks. The result has the shape (blocks - 2, channels).
     smoothed = np.median([blocks[:-2], blocks[1:-1], blocks[2:]], axis=0)
     touches: list[TouchFound] = []
     for position, channel_levels in enumerate(smoothed.T):
@@ -77,11 +78,11 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
             continue
         min_change = _smallest_touch(values[:, position], unit_is_pC)
 
-        # The change of the channel within each window of half a second, and during the whole time
+        # Compute the change of the channel within each window of half a second, and during the whole time.
         windows = sliding_window_view(channel_levels, min(STEEP_BLOCKS, len(channel_levels)))
         window_changes = np.ptp(windows, axis=1)  # shape (windows,)
         total_change = float(np.ptp(channel_levels))
-        is_fast_touch = window_changes.max() > min_change
+        is_fast_touch = window_changes.max() > min_change  # faster than warming or the drift of an amplifier
         is_slow_touch = unit_is_pC and total_change > max(min_change, MAX_SLOW_CHANGE_PC)
         if is_fast_touch or is_slow_touch:
             # A window begins one block later than its index, because smoothing has removed the first block.
@@ -104,7 +105,7 @@ def _smallest_touch(channel_values: Array, unit_is_pC: bool) -> float:
 
 
 def block_medians(values: Array, times_s: Array) -> Array:
-    """Compute the median of each channel over each complete block.
+    """Compute the median of each channel over each complete block of time of the length `BLOCK_S`.
 
     Args:
         values: Values of the channels, shape (n, channels).
@@ -115,17 +116,25 @@ def block_medians(values: Array, times_s: Array) -> Array:
         block, which may be incomplete. NaN if a block of a channel has no finite value.
     """
     block_numbers = np.floor(times_s / BLOCK_S).astype(int)  # number of the block of each frame
-    begins_block = np.diff(block_numbers, prepend=-1) != 0
+    begins_block = np.diff(block_numbers, prepend=-1) != 0  # true for the first frame, whose block has the number 0
     first_rows = np.flatnonzero(begins_block)  # first frame of each block
     blocks = np.split(values, first_rows[1:])
-    whole_blocks = blocks[:-1]
-    if not whole_blocks:
-        return np.zeros((0, values.shape[1]))
-    return np.array([_finite_medians(block) for block in whole_blocks])
+    complete_blocks = blocks[:-1]  # the last block may be incomplete
+    if not complete_blocks:
+        channel_count = values.shape[1]
+        return np.zeros((0, channel_count))
+    return np.array([_finite_medians(block) for block in complete_blocks])
 
 
 def _finite_medians(block: Array) -> Array:
-    """Return the median of the finite values of each column, shape (channels,); NaN for a column without any."""
+    """Compute the median of the finite values of each column.
+
+    Args:
+        block: Values, shape (n, channels), some of which may be NaN or infinite.
+
+    Returns:
+        Medians, shape (channels,); NaN for a column without a finite value.
+    """
     medians = np.full(block.shape[1], np.nan)
     for position, column in enumerate(block.T):
         finite = column[np.isfinite(column)]

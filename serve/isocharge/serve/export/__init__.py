@@ -1,4 +1,4 @@
-"""Prediction records for other tools: MCAP files with ROS 2 messages.
+"""Export of prediction records to MCAP files with ROS 2 messages, which other tools can read.
 
 MCAP files need the extra `record`.
 

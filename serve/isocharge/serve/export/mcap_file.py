@@ -1,4 +1,4 @@
-"""MCAP files with prediction records, the wrench of each press and its pose.
+"""MCAP files that contain prediction records, and the wrench and the pose of each press.
 
 | topic | message | written for |
 |---|---|---|
@@ -6,9 +6,9 @@
 | `/isocharge/wrench` | `geometry_msgs/msg/WrenchStamped` | every record with a force, including 0 N out of contact |
 | `/isocharge/pose` | `geometry_msgs/msg/PoseWithCovarianceStamped` | every record with a position |
 
-Log time and publish time are the `timestamp` of the record. The file is written in complete chunks at least once per
-second. If the process is killed, the file has no index. The command `mcap recover` and viewers can then read all
-records except those of the last second.
+The log time and the publish time of a message are the `timestamp` of the record. At least once per second, a complete
+chunk of messages is written to the file. If the process is killed, the file has no index. Viewers and the command `mcap
+recover` can nevertheless read all records except the records of the last second.
 """
 
 import json
@@ -57,7 +57,7 @@ class McapFile:
     Attributes:
         path: The file.
         records: Number of records written.
-        is_abandoned: Whether the file is closed without an index. Set it after an error of `write`.
+        is_abandoned: Whether the file is closed without an index. Set this attribute to True after an error of `write`.
     """
 
     def __init__(
@@ -73,8 +73,8 @@ class McapFile:
             path: The file, which must not exist.
             electrodes: Names of the electrodes, for the schema.
             encoding: Encoding of the records: JSON with a schema for viewers, or ROS 2 messages for tools that refuse
-                other messages (`ros2 bag`, rosbags).
-            now: Monotonic clock, s.
+                all other messages (`ros2 bag`, rosbags).
+            now: Function that returns the time of a monotonic clock, s.
         """
         self.path = path
         self.records = 0
@@ -86,14 +86,14 @@ class McapFile:
         self._lock = threading.Lock()
 
     def __enter__(self) -> Self:
-        """Create the file, and write its beginning and the three channels, one for each topic.
+        """Create the file, write its header, and register one channel for each of the three topics.
 
         Raises:
             OutputExists: If the file exists already.
             OutputError: If the file cannot be created.
         """
         self._file = AtomicWriter(self.path)
-        self._writer = Writer(self._file)  # type: ignore[arg-type]  # it uses only write, tell and flush
+        self._writer = Writer(self._file)  # type: ignore[arg-type]  # uses only write, tell and flush
         self._flush_time_s = self._now()
         with as_output_errors(self.path):
             self._writer.start(profile="ros2", library="isocharge")
@@ -115,10 +115,10 @@ class McapFile:
                 self._writer.finish()  # type: ignore[no-untyped-call]
 
     def write(self, record: PredictionRecord) -> None:
-        """Write a record, its wrench if the force is known, and its pose if something touches.
+        """Write a record, its wrench if the force is known, and its pose if something touches the film.
 
         Raises:
-            InputError: If a time stamp of ROS 2 cannot express the time of the record.
+            InputError: If a time stamp of ROS 2 cannot represent the time of the record.
             OSError: If the disk is full or was removed.
         """
         values = record.json_values
@@ -135,18 +135,19 @@ class McapFile:
             self._add_messages(messages, time_ns)
 
     def _add_messages(self, messages: dict[str, bytes | None], time_ns: int) -> None:
-        """Add the messages of one record, and flush the writer every `FLUSH_INTERVAL_S` seconds.
+        """Add the messages of one record, and flush the writer if the last flush was `FLUSH_INTERVAL_S` ago or earlier.
 
-        The caller must hold the lock.
+        The caller must hold the lock of the file.
 
         Args:
             messages: Message for each topic; None if the record has no message for the topic.
             time_ns: Time of the record, ns.
         """
-        sequence = self.records & MAX_SEQUENCE_NUMBER  # the number has 32 bits and wraps
-        for topic, data in messages.items():
-            if data is not None:
-                self._writer.add_message(self._channels[topic], time_ns, data, publish_time=time_ns, sequence=sequence)
+        sequence = self.records & MAX_SEQUENCE_NUMBER  # the number has 32 bits and wraps to 0
+        for topic, message in messages.items():
+            if message is not None:
+                channel = self._channels[topic]
+                self._writer.add_message(channel, time_ns, message, publish_time=time_ns, sequence=sequence)
         self.records += 1
         if self._now() - self._flush_time_s >= FLUSH_INTERVAL_S:
             self._writer.flush()  # type: ignore[no-untyped-call]
@@ -155,7 +156,7 @@ class McapFile:
     def _record_channel(self) -> int:
         """Register the channel of the records in the file, and return its identifier.
 
-        The records are ROS 2 texts or, with their JSON schema, JSON.
+        The messages of this channel are either ROS 2 texts, or JSON with a JSON schema.
         """
         if self._encoding is RecordEncoding.ros2:
             return self._ros_channel(RECORD_TOPIC, STRING, STRING_DEFINITION)
@@ -164,13 +165,13 @@ class McapFile:
         schema_id = self._writer.register_schema(SCHEMA_NAME, "jsonschema", schema_text)
         return self._writer.register_channel(RECORD_TOPIC, "json", schema_id)
 
-    def _ros_channel(self, topic: str, kind: str, definition: str) -> int:
-        """Register a channel of ROS 2 messages, and return its identifier.
+    def _ros_channel(self, topic: str, message_type: str, definition: str) -> int:
+        """Register a channel of ROS 2 messages in the file, and return its identifier.
 
         Args:
             topic: Topic of the messages.
-            kind: Name of the message type.
-            definition: Definition of the message type.
+            message_type: Name of the message type, such as "std_msgs/msg/String".
+            definition: Definition of the message type in the notation of ROS 2.
         """
-        schema_id = self._writer.register_schema(kind, "ros2msg", definition.encode())
+        schema_id = self._writer.register_schema(message_type, "ros2msg", definition.encode())
         return self._writer.register_channel(topic, "cdr", schema_id)

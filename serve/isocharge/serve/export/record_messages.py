@@ -1,17 +1,20 @@
-"""Conversion of prediction records to ROS 2 messages in CDR: the wrench of the press, its pose, and the record as text.
+"""Conversion of prediction records to ROS 2 messages: the wrench of a press, the pose of a press, and a record as text.
 
-The coordinate frame of the messages has the name in the field `frame_id` of the record, which is the name of the
-sensor. The section Coordinates of README.md defines the origin and the axes x and y of this frame. ROS requires
-right-handed frames, so z points towards the probe, against the direction of the push.
+The name of the coordinate frame of the messages is the field `frame_id` of the record. This field is the name of the
+sensor, unless the user has given the film another name. The section Coordinates of README.md defines the origin and the
+axes x and y of this coordinate frame. ROS requires right-handed coordinate frames. The axis z therefore points from the
+film towards the probe, against the direction of the push.
 
-The wrench is the load of the probe on the film. A press of F at (x, y) has the force (0, 0, -F) and the torque (-y F, x
-F, 0) about the origin. The pose is the point of contact in the plane of the unloaded film. The pose has no rotation,
-and its covariance contains the standard deviations of the model. If contacts are tracked, the wrench and the pose
-describe the tracked contact, as on the live page. The record also contains the contact of the single frame.
+The wrench is the load of the probe on the film. If a probe presses with the force F at (x, y), the wrench has the force
+(0, 0, -F) and the torque (-y F, x F, 0) about the origin. The pose is the point of contact in the plane of the unloaded
+film. The rotation of the pose is zero. The covariance of the pose is computed from the standard deviations that the
+model reports. If contacts are tracked, the wrench and the pose describe the tracked contact, as on the live page. The
+record as text also contains the contact that was estimated from the single frame.
 
-A ROS message consists of a header and numbers of double precision. The messages are encoded here, because
-`mcap-ros2-support` provides its encoder only as a part of its own writer, which cannot write JSON and takes 15 times as
-long. The tests decode the messages with `mcap-ros2-support` and with rosbags.
+The messages are encoded in CDR, the binary format of ROS 2. The messages of the wrench and of the pose consist of a
+header and numbers of double precision. This module has its own encoder, because the encoder of `mcap-ros2-support` is
+available only as a part of a writer, which is much slower and cannot write JSON. The tests decode the messages with
+`mcap-ros2-support` and with rosbags.
 """
 
 import math
@@ -80,10 +83,10 @@ STRING_DEFINITION = "string data\n"
 
 
 def time_of(record: Mapping[str, Any]) -> int:
-    """Return the `timestamp` of a record in nanoseconds, rounded to a microsecond.
+    """Return the `timestamp` of a record in nanoseconds, rounded to a whole microsecond.
 
     Raises:
-        InputError: If a time stamp of ROS 2 cannot express this time.
+        InputError: If a time stamp of ROS 2 cannot represent this time.
     """
     seconds: float | None = record["timestamp"]
     if seconds is None or not 0.0 <= seconds < MAX_TIMESTAMP_S:
@@ -95,24 +98,31 @@ def time_of(record: Mapping[str, Any]) -> int:
 
 
 def contact_of(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the values of a record. If there is a tracked contact, it replaces the contact of the frame."""
-    tracked = record.get("tracked")
-    if tracked is None or record["force_N"] is None:
+    """Return the values of a record, in which a tracked contact replaces the contact of the single frame.
+
+    The values are unchanged if the record has no tracked contact, or if its force is unknown.
+
+    Args:
+        record: Values of the prediction record by name.
+    """
+    tracked_contact = record.get("tracked")
+    if tracked_contact is None or record["force_N"] is None:
         return record
-    return {**record, **tracked}
+    return {**record, **tracked_contact}
 
 
 def wrench_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
     """Return the load of the probe on the film as a ROS 2 message WrenchStamped, in N and N m.
 
-    A press of force F at (x, y) has the force (0, 0, -F) and the torque (-y F, x F, 0) about the origin.
+    If a probe presses with the force F at (x, y), the message has the force (0, 0, -F) and the torque (-y F, x F, 0)
+    about the origin.
 
     Args:
         record: Values of the prediction record by name.
         time_ns: Time of the record, ns.
 
     Returns:
-        The message, with zeros out of contact; None if the force is unknown.
+        The message, whose numbers are zero if nothing touches the film; None if the force is unknown.
     """
     values = contact_of(record)  # a tracked contact replaces the contact of the frame
     force_N = values["force_N"]
@@ -135,7 +145,7 @@ def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
         time_ns: Time of the record, ns.
 
     Returns:
-        The message; None if nothing touches.
+        The message; None if nothing touches the film.
     """
     values = contact_of(record)  # a tracked contact replaces the contact of the frame
     x_mm = values["x_mm"]
@@ -152,7 +162,7 @@ def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
 
 
 def _pose_covariance(x_std_m: float, y_std_m: float, xy_correlation: float) -> list[float]:
-    """Return the covariance matrix of a pose, row by row, m^2 and rad^2.
+    """Return the 36 elements of the covariance matrix of a pose, row by row, in m^2 and rad^2.
 
     The matrix has 6 rows and 6 columns: x, y, z and the rotations about these axes. Only x and y are correlated.
 
@@ -162,7 +172,7 @@ def _pose_covariance(x_std_m: float, y_std_m: float, xy_correlation: float) -> l
         xy_correlation: Correlation of the errors of x and y, dimensionless.
     """
     covariance = [0.0] * 36
-    diagonal = slice(0, 36, 7)
+    diagonal = slice(0, 36, 7)  # neighbouring elements of the diagonal are 7 positions apart
     rotation_variances = [ROTATION_VARIANCE_rad2] * 3
     covariance[diagonal] = [x_std_m**2, y_std_m**2, DEFLECTION_STD_m**2, *rotation_variances]
 
@@ -175,19 +185,20 @@ def _pose_covariance(x_std_m: float, y_std_m: float, xy_correlation: float) -> l
 
 
 def string_message(text: str) -> bytes:
-    """Return a text as a std_msgs/msg/String."""
+    """Encode a text as a ROS 2 message std_msgs/msg/String."""
     return ENCAPSULATION + _string(text)
 
 
 def _stamped(frame_id: str, time_ns: int, values: tuple[float, ...]) -> bytes:
-    """Return a message that consists of a header and numbers.
+    """Encode a ROS 2 message that consists of a header and numbers of double precision.
 
-    The numbers begin at a multiple of 8 bytes after the encapsulation.
+    CDR requires that the numbers begin at a multiple of 8 bytes after the encapsulation. The header is therefore padded
+    with zeros.
 
     Args:
         frame_id: Name of the coordinate frame.
         time_ns: Time of the message, ns.
-        values: The numbers.
+        values: The numbers in the order of the message type.
     """
     seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
     header = struct.pack("<iI", seconds, nanoseconds) + _string(frame_id)
@@ -196,13 +207,13 @@ def _stamped(frame_id: str, time_ns: int, values: tuple[float, ...]) -> bytes:
 
 
 def _string(text: str) -> bytes:
-    """Encode a text in CDR: its length, its bytes in UTF-8, and a zero."""
+    """Encode a text in CDR: the number of the following bytes, the text in UTF-8, and a zero byte."""
     data = text.encode() + b"\0"
     return struct.pack("<I", len(data)) + data
 
 
 class RecordEncoding(StrEnum):
-    """Encoding of the records in an MCAP file: JSON with a schema, or the same text in ROS 2 messages."""
+    """Encoding of the records in an MCAP file: JSON with a schema, or the same JSON text in ROS 2 messages."""
 
     json = "json"
     ros2 = "ros2"

@@ -1,7 +1,7 @@
-"""Parsers from bytes to frames, one module for each wire format. They do not depend on a port.
+"""Parsers that convert bytes to frames, with one module for each wire format. The parsers do not depend on a port.
 
 May import: flags.
 
-Each format has a parser class derived from `frame.Parser`, and a section class in `formats`. A device file names the
-format by the tag of the section class.
+Each format has two classes. The parser class is derived from `frame.Parser`, and the section class declares the keys of
+the section `[frames]` in a device file. The key `format` of this section contains the tag of the section class.
 """

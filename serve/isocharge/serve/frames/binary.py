@@ -1,9 +1,9 @@
-"""The binary frame of isocharge, encoded by COBS.
+"""Encoding and decoding of the binary frames of isocharge, which have the byte stuffing COBS.
 
-The fields are (version u8, seq u16, t_us u32, n u8, flags u8, n x f32 pC, CRC u16). All numbers are little-endian. The
-CRC is CRC-16/CCITT-FALSE over all bytes before it. A zero byte ends each frame and occurs nowhere else. After damaged
-bytes, the parser therefore continues with the frame after the next zero. A damaged frame does not affect its
-neighbours.
+The fields of a frame are, in this order: version (u8), frame counter (u16), clock in us (u32), number n of charges
+(u8), flags (u8), n charges in pC (f32), and checksum (u16). All numbers are little-endian. The checksum is the
+CRC-16/CCITT-FALSE of all bytes before it. Each frame ends with a zero byte, and COBS ensures that no other byte of a
+frame is zero. If bytes are damaged, the parser therefore continues with the frame that begins after the next zero byte.
 """
 
 import binascii
@@ -22,10 +22,10 @@ DELIMITER = b"\0"
 """The byte that ends a frame."""
 
 HEADER = struct.Struct("<BHIBB")
-"""Version, frame counter, clock in us, number of charges, flags."""
+"""Format of the fields before the charges: version, frame counter, clock in us, number of charges, and flags."""
 
 CRC = struct.Struct("<H")
-"""The checksum."""
+"""Format of the checksum."""
 
 MAX_CHARGES = 255
 """Largest number of charges in a frame, because one byte contains the number."""
@@ -38,38 +38,42 @@ MAX_STUFFED_LENGTH = MAX_FRAME_LENGTH + 1 + MAX_FRAME_LENGTH // MAX_BLOCK
 
 
 def encode_frame(frame: Frame) -> bytes:
-    """Return the bytes of a frame with its delimiter. A missing counter or clock is encoded as zero.
+    """Encode a frame as bytes, including its delimiter. A missing counter or clock is encoded as zero.
 
     Raises:
         struct.error: If a number does not fit its field.
     """
-    count = len(frame.values)
-    body = HEADER.pack(FRAME_VERSION, frame.seq or 0, frame.t_us or 0, count, frame.flags)
-    body += struct.pack(f"<{count}f", *frame.values)
-    return cobs_encode(body + CRC.pack(crc16(body))) + DELIMITER
+    charge_count = len(frame.values)
+    header = HEADER.pack(FRAME_VERSION, frame.seq or 0, frame.t_us or 0, charge_count, frame.flags)
+    charges = struct.pack(f"<{charge_count}f", *frame.values)
+    body = header + charges
+    crc = CRC.pack(crc16(body))
+    return cobs_encode(body + crc) + DELIMITER
 
 
 def decode_frame(piece: bytes) -> Frame:
     """Decode a frame and check its CRC.
 
     Args:
-        piece: Bytes of the frame with byte stuffing, without the delimiter.
+        piece: Bytes of the frame as they are sent, encoded by COBS, without the delimiter.
 
     Raises:
         ChecksumError: If the CRC is wrong.
-        ValueError: If the bytes are not a frame.
+        ValueError: If the bytes are not a frame of this version.
     """
     data = cobs_decode(piece)
     if len(data) < HEADER.size + CRC.size:
         raise ValueError("the frame is shorter than a frame without charges")
     body = data[: -CRC.size]  # header and charges
-    stated_crc = data[-CRC.size :]
-    if CRC.pack(crc16(body)) != stated_crc:
+    sent_crc = data[-CRC.size :]
+    computed_crc = CRC.pack(crc16(body))
+    if computed_crc != sent_crc:
         raise ChecksumError("the CRC is wrong")
-    version, seq, t_us, count, flags = HEADER.unpack_from(body)
-    if version != FRAME_VERSION or len(body) != HEADER.size + 4 * count:  # a charge has 4 bytes
+    version, seq, t_us, charge_count, flags = HEADER.unpack_from(body)
+    body_length = HEADER.size + 4 * charge_count  # each charge is a float of 4 bytes
+    if version != FRAME_VERSION or len(body) != body_length:
         raise ValueError("the frame has another version, or another number of charges than it states")
-    charges = struct.unpack_from(f"<{count}f", body, HEADER.size)
+    charges = struct.unpack_from(f"<{charge_count}f", body, HEADER.size)
     return Frame(seq, t_us, charges, flags)
 
 

@@ -1,8 +1,9 @@
-"""Checksums of frames. The checksums have the names that catalogues and manuals use.
+"""Checksums of frames, under the names that catalogues and manuals use for them.
 
-A cyclic redundancy check (CRC) has the parameters of Williams's model ("A painless guide to CRC error detection
-algorithms", 1993). Names and values are those of Cook's catalogue of parametrised CRC algorithms, where
-CRC-16/CCITT-FALSE is called CRC-16/IBM-3740. A device file describes a check without a name by its parameters.
+A cyclic redundancy check (CRC) is described by the parameters that Williams defines in "A painless guide to CRC error
+detection algorithms" (1993). Names and parameters are taken from Cook's catalogue of parametrised CRC algorithms. This
+catalogue also lists other names, for example CRC-16/IBM-3740 for CRC-16/CCITT-FALSE. A device file can describe a CRC
+that has no name here by its parameters.
 """
 
 from collections.abc import Callable
@@ -19,8 +20,8 @@ class Crc:
         width: Number of bits: 8, 16, 24 or 32.
         polynomial: Polynomial without its highest power. The highest bit is the coefficient of the highest power.
         start: Initial value of the register, in the bit order of the polynomial.
-        reflected: Whether bytes and register are processed from the lowest bit.
-        final: Value that is combined with the register by an exclusive or at the end.
+        reflected: Whether the bits of the bytes and of the register are processed from the lowest to the highest bit.
+        final: Value with which the register is combined by an exclusive or after the last byte.
     """
 
     width: int
@@ -31,26 +32,30 @@ class Crc:
 
     @cached_property
     def table(self) -> tuple[int, ...]:
-        """Value of the register after each of the 256 possible bytes, if the register was zero before."""
+        """Lookup table with one entry for each of the 256 possible values of a byte.
+
+        The entry of a byte is the value of the register after this byte, if the register was zero before.
+        """
         return tuple(map(self._table_entry, range(256)))
 
     @cached_property
     def initial_register(self) -> int:
-        """Initial value of the register, in the bit order of the register."""
+        """The initial value `start`, with its bits in the order of the register."""
         return self._in_register_order(self.start)
 
     def _in_register_order(self, number: int) -> int:
-        """Convert a number to the bit order of the register, which is reversed if the check is reflected."""
+        """Reverse the bits of a number if the check is reflected. Otherwise, return the number unchanged."""
         if not self.reflected:
             return number
         bits = f"{number:0{self.width}b}"
         return int(bits[::-1], 2)
 
     def _table_entry(self, byte: int) -> int:
-        """Return the value of the register after one byte, if the register was zero before.
+        """Compute the value of the register after one byte, if the register was zero before this byte.
 
-        The register is shifted by one bit at a time. If the bit that leaves the register is 1, the polynomial is
-        subtracted, which is an exclusive or.
+        The register of `width` bits contains the remainder of a division by the polynomial. The register is shifted by
+        one bit for each bit of the byte. If the bit that leaves the register is 1, the polynomial is subtracted from
+        the register. All coefficients are computed modulo 2, so the subtraction is an exclusive or.
         """
         polynomial = self._in_register_order(self.polynomial)
         if self.reflected:  # the byte enters at the low end of the register, and its lowest bit leaves first
@@ -70,43 +75,46 @@ class Crc:
             register <<= 1
             if leaving_bit:
                 register ^= polynomial
-        register_mask = (1 << self.width) - 1
+        register_mask = (1 << self.width) - 1  # removes the bits that have left the register
         return register & register_mask
 
     def __call__(self, data: bytes) -> int:
-        """Compute the check value of some bytes.
+        """Compute the check value of a sequence of bytes.
 
         For each byte, the register is shifted by 8 bits. The 8 bits that leave the register are combined with the byte
-        by an exclusive or. The result is an index of the table, whose entry is combined with the register in the same
-        way.
+        by an exclusive or. This operation gives the index of an entry in `table`. The entry is combined with the
+        shifted register by another exclusive or. After the last byte, the register is combined with the value `final`
+        by an exclusive or as well.
         """
         table = self.table
         register = self.initial_register
         if self.reflected:  # the lowest bit leaves the register first
             for byte in data:
-                register = (register >> 8) ^ table[(register ^ byte) & 0xFF]
+                index = (register ^ byte) & 0xFF
+                register = (register >> 8) ^ table[index]
             return register ^ self.final
 
         # The highest bits leave the register first.
-        shift = self.width - 8
-        mask = (1 << self.width) - 1
+        highest_byte_shift = self.width - 8
+        register_mask = (1 << self.width) - 1  # removes the bits that have left the register
         for byte in data:
-            register = ((register << 8) & mask) ^ table[(register >> shift) ^ byte]
+            index = (register >> highest_byte_shift) ^ byte
+            register = ((register << 8) & register_mask) ^ table[index]
         return register ^ self.final
 
 
 def _fletcher_16(data: bytes) -> int:
-    """Compute Fletcher's checksum (1982).
+    """Compute Fletcher's checksum (1982), which has two bytes.
 
-    The low byte of the checksum is the sum of the bytes, and the high byte is the sum of all intermediate sums, both
-    modulo 255.
+    The low byte of the checksum is the sum of all data bytes, modulo 255. The high byte is the sum of all values that
+    the low byte had after each data byte, modulo 255.
     """
     byte_sum = 0
     sum_of_sums = 0
     for byte in data:
         byte_sum = (byte_sum + byte) % 255
         sum_of_sums = (sum_of_sums + byte_sum) % 255
-    return sum_of_sums << 8 | byte_sum
+    return (sum_of_sums << 8) | byte_sum
 
 
 @dataclass(frozen=True)
@@ -114,8 +122,8 @@ class Checksum:
     """A checksum.
 
     Attributes:
-        compute: Function from the covered bytes to the checksum.
-        size: Number of bytes that the checksum takes in a frame; 0 for a frame without one.
+        compute: Function that computes the checksum from the bytes that it covers.
+        size: Number of bytes of the checksum in a frame; 0 if the frame has no checksum.
     """
 
     compute: Callable[[bytes], int]
@@ -150,6 +158,6 @@ CHECKSUMS = {
 }
 """All checksums, by name.
 
-The checksum `sum-8/negative` makes the sum of all bytes zero. The checksum `sum-8/inverted` is the sum with every bit
-inverted.
+The checksum `sum-8/negative` is chosen such that the sum of all bytes, including the checksum, is zero modulo 256. The
+checksum `sum-8/inverted` is the sum of the bytes with every bit inverted.
 """

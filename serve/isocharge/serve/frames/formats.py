@@ -1,4 +1,7 @@
-"""The frame formats that a device file can name in `[frames] format`, each with its keys and its parser."""
+"""Frame formats that a device file can select with the key `format` of its section `[frames]`.
+
+Each class of a section declares the keys of one format, and creates the parser of this format.
+"""
 
 import re
 from collections.abc import Mapping
@@ -9,17 +12,17 @@ from isocharge.serve.frames.frame_layout import FrameLayout, FrameSection
 from isocharge.serve.frames.text import TextParser
 
 _PIECE = re.compile(rb"[^\0\n]*[\0\n]|[^\0\n]+")
-"""Bytes up to and including the end of a binary frame or of a line."""
+"""Bytes up to the next byte that ends a binary frame (zero) or a line of text (line feed), including this byte."""
 
 
 class AutoParser(Parser):
     """Parser that recognises whether a board sends the binary frames of isocharge or lines of text.
 
-    Bytes that come before the format is recognised are dropped.
+    Bytes that arrive before the format is recognised are dropped.
 
     Args:
         columns: Names for the columns of a CSV; see `TextParser`.
-        meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the board uses; see `TextParser`.
+        meanings: Meaning (`seq`, `t_us`, `t_ms` or `t_s`) of each name that the board uses; see `TextParser`.
     """
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
@@ -30,20 +33,23 @@ class AutoParser(Parser):
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
 
-        Until the format is recognised, each piece of the data is passed to the parsers of all formats. The first parser
-        that finds a frame is used from then on.
+        Until the format is recognised, the data are split into pieces. A piece ends with a zero byte or a line feed,
+        because one of these bytes ends each frame. Each piece is passed to the parsers of all formats. As soon as one
+        of the parsers finds a frame, all further data are passed to this parser alone.
         """
-        if len(self._candidates) == 1:
+        is_recognised = len(self._candidates) == 1
+        if is_recognised:
             return self._feed_recognised(self._candidates[0], data)
         for match in _PIECE.finditer(data):
             piece = match.group()
-            self.counts.count_dropped(len(piece))
+            self.counts.count_dropped(len(piece))  # until the counters of the recognised parser replace these counters
             for candidate in self._candidates:
                 frames = candidate.feed(piece)
                 if frames:  # the format is recognised, and the rest of the data is passed to this parser alone
                     self._candidates = (candidate,)
                     self.counts = candidate.counts
-                    return frames + self._feed_recognised(candidate, data[match.end() :])
+                    rest = data[match.end() :]
+                    return frames + self._feed_recognised(candidate, rest)
         return []
 
     def reset(self) -> None:
@@ -52,9 +58,10 @@ class AutoParser(Parser):
             candidate.reset()
 
     def _feed_recognised(self, parser: Parser, data: bytes) -> list[Frame]:
-        """Return the frames that the parser of the recognised format finds, and copy its format and its moduli.
+        """Pass data to the parser of the recognised format, and return the frames that it finds.
 
-        The format and the moduli are copied in each call, because the parser may learn them only after many frames.
+        The description of the format and the moduli of the counter and the clock are copied from the parser. Both are
+        copied in each call, because the parser may recognise them only after many frames.
 
         Args:
             parser: Parser of the recognised format.
@@ -68,7 +75,7 @@ class AutoParser(Parser):
 
 
 class TextFrames(FrameSection, tag="text", frozen=True):
-    """Lines of text.
+    """Section for a board that sends lines of text.
 
     Attributes:
         columns: Names of the columns of a CSV.
@@ -86,7 +93,7 @@ class TextFrames(FrameSection, tag="text", frozen=True):
 
     @property
     def meanings(self) -> Mapping[str, str]:
-        """Meaning of each name that the board uses: `seq`, `t_us`, `t_ms` or `t_s`."""
+        """Meaning of each name that the board uses for its counter or a clock: `seq`, `t_us`, `t_ms` or `t_s`."""
         meanings = {self.seq: "seq", self.t_us: "t_us", self.t_ms: "t_ms", self.t_s: "t_s"}
         return {name: meaning for name, meaning in meanings.items() if name}
 
@@ -96,7 +103,10 @@ class TextFrames(FrameSection, tag="text", frozen=True):
 
 
 class AutoFrames(TextFrames, tag="auto", frozen=True):
-    """The binary frames of isocharge, or lines of text. The parser recognises which of them the board sends."""
+    """Section for a board that sends either the binary frames of isocharge or lines of text.
+
+    The parser recognises which of these two formats the board sends.
+    """
 
     def parser(self) -> Parser:
         """Create a parser."""
@@ -104,7 +114,7 @@ class AutoFrames(TextFrames, tag="auto", frozen=True):
 
 
 class BinaryFrames(FrameSection, tag="binary", frozen=True):
-    """The binary frames of isocharge."""
+    """Section for a board that sends the binary frames of isocharge."""
 
     def parser(self) -> Parser:
         """Create a parser."""

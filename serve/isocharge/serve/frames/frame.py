@@ -1,7 +1,8 @@
-"""Classes that all frame formats use: the frame, base classes of parsers, counters, and columns of a row of numbers.
+"""Classes that all frame formats have in common, such as the frame and the base classes of the parsers.
 
-A parser converts bytes to frames, and is independent of the source of the bytes. The frames and counters do not depend
-on how the bytes are divided into chunks. The memory of a parser is bounded for any input.
+A parser converts bytes to frames, and is independent of the source of the bytes. Except for datagrams, the frames and
+counters do not depend on how the bytes are divided into chunks. A parser stores only a limited number of bytes, even if
+it never finds a frame.
 """
 
 from abc import ABC, abstractmethod
@@ -18,7 +19,7 @@ T_US_MODULUS = 1 << 32
 """Time at which a 32-bit clock in microseconds wraps to 0, us."""
 
 SATURATED_BIT = 0x01
-"""Bit in the flags of a frame that reports an amplifier at its limit. The other bits are reserved and sent as zero."""
+"""Bit in the flags of a frame that reports an amplifier at its limit. All other bits are reserved and sent as zero."""
 
 SEQ = "seq"
 """Name of the field with the frame counter."""
@@ -27,20 +28,20 @@ FLAGS = "flags"
 """Name of the field with the flags of a frame."""
 
 TIMES_US = {"t_us": 1.0, "t_ms": 1e3, "t_s": 1e6}
-"""Names of the field with the clock of a device, and the unit of each, us."""
+"""Unit of the clock of a device, us, by the name of the field that contains the clock."""
 
 Raw = TypeVar("Raw")
 """Type of the data from which a frame is decoded: bytes, or the numbers of a row."""
 
 
 class SequenceGaps:
-    """Uses the frame counters to detect missing frames, repeated frames and restarts of the board.
+    """Detector of missing frames, repeated frames and restarts of the board, which compares successive frame counters.
 
     Attributes:
         lost: Number of frames that are missing between received frames.
         repeated: Number of frames with the same counter as the previous frame.
-        restarts: Number of times that the counter went back, for example after a reset of the device. Frames that were
-            lost during a restart are not counted.
+        restarts: Number of times that the counter decreased without a wrap, for example after a reset of the device.
+            Frames that were lost during a restart are not counted.
     """
 
     def __init__(self) -> None:
@@ -51,17 +52,19 @@ class SequenceGaps:
         self._last_seq: int | None = None
 
     def reset(self) -> None:
-        """Treat the next frame as the first frame of a new connection. No gap is then counted before this frame.
+        """Treat the next frame as the first frame of a new connection, so that no gap is counted before this frame.
 
-        The counters are kept.
+        The numbers of lost frames, repeated frames and restarts are kept.
         """
         self._last_seq = None
 
     def update(self, seq: int | None, modulus: int = SEQ_MODULUS) -> tuple[str, ...]:
-        """Count the next frame.
+        """Compare the counter of the next frame with the counter of the previous frame.
+
+        Missing frames, repeated frames and restarts are counted.
 
         Args:
-            seq: Counter of the frame; None if the format has no counter.
+            seq: Counter of the next frame; None if the format has no counter.
             modulus: Value at which the counter wraps to 0.
 
         Returns:
@@ -71,7 +74,7 @@ class SequenceGaps:
             return ()
         last_seq = self._last_seq
         self._last_seq = seq
-        if last_seq is None:
+        if last_seq is None:  # this is the first frame of a connection
             return ()
         step = (seq - last_seq) % modulus  # from 0 to modulus - 1, also if the counter has wrapped
         if step == 1:
@@ -79,7 +82,7 @@ class SequenceGaps:
         if step == 0:
             self.repeated += 1
             return (REPEAT,)
-        if step >= modulus // 2:  # the counter went back
+        if step >= modulus // 2:  # modulo `modulus`, a step back is the same as a large step forward
             self.restarts += 1
             return (RESTART,)
         self.lost += step - 1
@@ -87,36 +90,37 @@ class SequenceGaps:
 
 
 class CounterWrap:
-    """Learns the value at which a counter in text wraps to 0, because text does not show the width of a counter.
+    """Estimator of the modulus of a counter in text, which is the value at which the counter wraps to 0.
 
-    If the counter decreases, it has either wrapped or restarted. A wrap is assumed if a usual modulus explains the
-    decrease. The modulus must be larger than all previous values, and the step modulo this modulus must be about as
-    small as the previous steps.
+    The modulus has to be estimated, because text does not show how many bits a counter has. If the counter decreases,
+    it has either wrapped or restarted. A wrap is assumed if the decrease is consistent with one of the moduli that
+    boards usually have.
     """
 
-    def __init__(self, usual_moduli: Iterable[int], initial_modulus: int, max_steps: int) -> None:
+    def __init__(self, usual_moduli: Iterable[int], initial_modulus: int, max_step_ratio: int) -> None:
         """Begin without any value.
 
         Args:
             usual_moduli: Moduli that boards use, in ascending order.
             initial_modulus: Modulus to assume until the counter wraps.
-            max_steps: Largest step across a wrap, as a multiple of the previous step.
+            max_step_ratio: Largest ratio of a step across a wrap to the previous step.
         """
         self._usual_moduli = tuple(usual_moduli)
         self._modulus = initial_modulus
-        self._max_steps = max_steps
+        self._max_step_ratio = max_step_ratio
         self._last_value: int | None = None
-        self._last_step = 1  # the latest increase
+        self._last_increase = 1  # difference of the last two values of which the second was larger
         self._largest_value = 0
 
     def update(self, value: int | None) -> int:
-        """Process the next value of the counter, and return the modulus.
+        """Process the next value of the counter, and return the present estimate of its modulus.
 
         Args:
-            value: The value; None if a connection has ended.
+            value: Next value of the counter; None if a connection has ended. The value after None is not compared with
+                earlier values.
 
         Returns:
-            The modulus that was learned, or the initial modulus before the first wrap.
+            The modulus that was estimated at the latest wrap, or the initial modulus before the first wrap.
         """
         last_value = self._last_value
         self._last_value = value
@@ -125,26 +129,29 @@ class CounterWrap:
         if value < last_value:
             self._modulus = self._modulus_after_decrease(value - last_value)
         elif value > last_value:
-            self._last_step = value - last_value
+            self._last_increase = value - last_value
         self._largest_value = max(self._largest_value, value)
         return self._modulus
 
     def _modulus_after_decrease(self, step: int) -> int:
-        """Return the smallest usual modulus that explains a negative step.
+        """Return the estimate of the modulus after the counter has decreased.
 
-        If no modulus explains the step, the present modulus is returned.
+        The result is the smallest usual modulus that is consistent with a wrap. If no usual modulus is consistent with
+        a wrap, a restart is assumed, and the present estimate of the modulus is returned.
 
-        A modulus explains the step if it is larger than all values, and if the step modulo the modulus is at most
-        `max_steps` times the previous step.
+        A modulus is consistent with a wrap if it is larger than all values so far, and if the step across the wrap is
+        plausible. The step across the wrap is the difference of the last two values, computed modulo this modulus. The
+        step is plausible if it is at most `max_step_ratio` times the last increase and at most half of the modulus. A
+        step of more than half of the modulus would rather be a step back.
 
         Args:
-            step: Present value minus previous value, negative.
+            step: Present value minus previous value, which is negative.
         """
-        max_step = self._max_steps * self._last_step
-        for modulus in self._usual_moduli:
-            step_across_wrap = step % modulus  # positive, although `step` is negative
-            has_plausible_step = step_across_wrap <= min(max_step, modulus // 2)
-            if self._largest_value < modulus and has_plausible_step:
+        max_step = self._max_step_ratio * self._last_increase
+        for modulus in self._usual_moduli:  # in ascending order
+            step_across_wrap = step % modulus  # not negative, although `step` is negative
+            is_plausible = step_across_wrap <= min(max_step, modulus // 2)
+            if self._largest_value < modulus and is_plausible:
                 return modulus
         return self._modulus
 
@@ -170,7 +177,9 @@ class Frame:
 
 @dataclass(slots=True)
 class FrameCounts:
-    """Counters of a parser. A piece is a sequence of bytes that should be a frame, such as a line of text.
+    """Counters of a parser.
+
+    A piece is a sequence of bytes that the parser expects to be one frame, such as a line of text.
 
     Attributes:
         frames: Number of intact frames.
@@ -216,62 +225,69 @@ class FrameCounts:
 
 
 class ChecksumError(ValueError):
-    """The checksum of a piece is wrong. The parser counts it."""
+    """The checksum of a piece is wrong. The parser counts this error and continues."""
 
 
 class Columns:
-    """Meaning of the numbers of a row: frame counter, clock, flags, or channel.
+    """Meanings of the numbers in a row: each number is the frame counter, a clock, the flags or a channel.
 
     Args:
         names: Names of all numbers; an empty text for a number without a name.
-        scales: Factor by which each number is multiplied, in the unit of the field per count.
-        flags: Position of the number that contains the flags; None if there is no such number.
+        scales: Factor by which each number is multiplied, in the unit of the channel or of the clock per count.
+        flags_column: Position of the number that contains the flags; None if there is no such number.
 
     Attributes:
-        seq: Position of the frame counter; None if there is none.
-        time: Position of the clock; None if there is none.
-        time_unit_us: Unit of the clock, us.
-        channels: Position and factor of each channel.
+        seq_column: Position of the frame counter; None if there is none.
+        clock_column: Position of the clock; None if there is none.
+        clock_unit_us: Duration of one count of the clock, us.
+        channels: Position of each channel, and factor by which its number is multiplied.
         names: Names of the channels; empty if they have no names.
     """
 
-    def __init__(self, names: Sequence[str], scales: Sequence[float], flags: int | None = None) -> None:
+    def __init__(self, names: Sequence[str], scales: Sequence[float], flags_column: int | None = None) -> None:
         """Find the columns of the frame counter, of the clock and of the channels by their names.
 
-        If there are several clocks, the first in the order of `TIMES_US` is used. Each column that is neither a
-        counter, nor a clock, nor the flags is a channel.
+        If there are several clocks, the first clock in the order of `TIMES_US` is used, and the other clocks are
+        ignored. Each column that contains neither the counter, nor a clock, nor the flags is a channel.
 
         Args:
             names: Names of all columns; an empty text for a column without a name.
             scales: Factor by which the numbers of each column are multiplied.
-            flags: Position of the column with the flags; None if there is no such column.
+            flags_column: Position of the column with the flags; None if there is no such column.
         """
-        clock_columns = [names.index(name) for name in TIMES_US if name in names]
-        self.seq = names.index(SEQ) if SEQ in names else None
-        self.time = clock_columns[0] if clock_columns else None
-        self.time_unit_us = 1.0
-        if self.time is not None:
-            clock_name = names[self.time]
-            self.time_unit_us = TIMES_US[clock_name] * scales[self.time]
+        self.seq_column = names.index(SEQ) if SEQ in names else None
+        self.flags_column = flags_column
 
-        other_columns = {self.seq, flags, *clock_columns}
-        self.channels = [(column, scale) for column, scale in enumerate(scales) if column not in other_columns]
+        clock_columns = [names.index(name) for name in TIMES_US if name in names]
+        self.clock_column = clock_columns[0] if clock_columns else None
+        self.clock_unit_us = 1.0
+        if self.clock_column is not None:
+            clock_name = names[self.clock_column]  # such as "t_ms"
+            self.clock_unit_us = TIMES_US[clock_name] * scales[self.clock_column]
+
+        columns_without_channel = {self.seq_column, self.flags_column, *clock_columns}
+        self.channels = [
+            (column, scale) for column, scale in enumerate(scales) if column not in columns_without_channel
+        ]
         self.names: tuple[str, ...] = ()
-        if any(names):
+        has_names = any(names)
+        if has_names:
             self.names = tuple(names[column] for column, _ in self.channels)
-        self._flags = flags
 
     def frame(self, numbers: Sequence[Any]) -> Frame:
-        """Return the frame of a row of numbers.
+        """Convert a row of numbers to a frame.
+
+        Args:
+            numbers: One number for each column.
 
         Raises:
             ValueError, OverflowError: If the frame counter or the clock is not finite.
         """
         return Frame(
-            seq=None if self.seq is None else round(numbers[self.seq]),
-            t_us=None if self.time is None else round(numbers[self.time] * self.time_unit_us),
-            values=tuple([numbers[position] * scale for position, scale in self.channels]),
-            flags=0 if self._flags is None else int(numbers[self._flags]),
+            seq=None if self.seq_column is None else round(numbers[self.seq_column]),
+            t_us=None if self.clock_column is None else round(numbers[self.clock_column] * self.clock_unit_us),
+            values=tuple([numbers[column] * scale for column, scale in self.channels]),
+            flags=0 if self.flags_column is None else int(numbers[self.flags_column]),
             names=self.names,
         )
 
@@ -284,7 +300,7 @@ class Parser(ABC):
     """
 
     def __init__(self, format: str, seq_modulus: int = SEQ_MODULUS, t_us_modulus: int = T_US_MODULUS) -> None:
-        """Begin without bytes.
+        """Begin without stored bytes.
 
         Args:
             format: Description of the format, for the user.
@@ -295,7 +311,7 @@ class Parser(ABC):
         self.seq_modulus = seq_modulus
         self.t_us_modulus = t_us_modulus
         self.counts = FrameCounts()
-        self._tail = b""
+        self._tail = b""  # bytes of an unfinished frame
 
     @abstractmethod
     def feed(self, data: bytes) -> list[Frame]:
@@ -306,13 +322,13 @@ class Parser(ABC):
         self.counts.count_dropped(len(self._tail))
         self._tail = b""
 
-    def _attempt(self, decode: Callable[[Raw], Frame], raw: Raw, size: int) -> list[Frame]:
-        """Decode one frame and count it.
+    def _try_decode(self, decode: Callable[[Raw], Frame], raw: Raw, dropped_size: int) -> list[Frame]:
+        """Try to decode one frame, and count either an intact frame or rejected bytes.
 
         Args:
             decode: Function that decodes a frame, and raises ValueError or OverflowError if `raw` is not a frame.
-            raw: Argument of `decode`: bytes or numbers.
-            size: Number of bytes that are dropped if `raw` is not a frame.
+            raw: Bytes or numbers that are passed to `decode`.
+            dropped_size: Number of bytes that are counted as dropped if `raw` is not a frame.
 
         Returns:
             A list with the frame; an empty list if `raw` is not a frame.
@@ -320,18 +336,20 @@ class Parser(ABC):
         try:
             frame = decode(raw)
         except (ValueError, OverflowError) as error:
-            self.counts.count_rejected(size, wrong_checksum=isinstance(error, ChecksumError))
+            self.counts.count_rejected(dropped_size, wrong_checksum=isinstance(error, ChecksumError))
             return []
         self.counts.count_frame()
         return [frame]
 
 
 class DelimitedParser(Parser):
-    """Base class of parsers for pieces between delimiters of one byte. Pieces longer than any frame are dropped.
+    """Base class of parsers for pieces of bytes that end with a delimiter of one byte.
+
+    A piece is a frame or a part of a frame, such as a line of text. Pieces that are too long are dropped.
 
     Args:
         delimiter: The byte after each piece.
-        max_length: Length of the longest piece that is decoded, bytes.
+        max_length: Length of the longest piece that is not dropped, bytes.
         parser_arguments: Arguments of `Parser`.
     """
 
@@ -340,46 +358,50 @@ class DelimitedParser(Parser):
         super().__init__(*parser_arguments)
         self._delimiter = delimiter
         self._max_length = max_length
-        self._is_overlong = False
+        self._beginning_was_dropped = False  # whether the unfinished piece is too long, so that its bytes are dropped
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
 
-        Bytes after the last delimiter are stored for the next call. If the stored bytes are longer than any frame, they
-        are dropped together with all bytes up to the next delimiter.
+        The bytes are divided into pieces at the delimiters. The bytes after the last delimiter are an unfinished piece,
+        which is stored for the next call. If an unfinished piece is longer than `max_length`, it is dropped together
+        with all bytes up to the next delimiter.
         """
         *pieces, tail = (self._tail + data).split(self._delimiter)
         frames = []
         for piece in pieces:
-            # The first piece may be the end of overlong bytes, whose beginning was dropped by an earlier call.
-            if self._is_overlong or len(piece) > self._max_length:
-                self._is_overlong = False
+            # The first piece may be the end of a long piece, whose beginning was dropped by an earlier call.
+            if self._beginning_was_dropped or len(piece) > self._max_length:
+                self._beginning_was_dropped = False
                 self.counts.count_rejected(len(piece) + 1)  # with the delimiter
             else:
                 frames += self._parse_piece(piece)
         self._tail = tail
-        if self._is_overlong or len(tail) > self._max_length:
-            self._is_overlong = True
-            super().reset()  # drops the tail
+        if self._beginning_was_dropped or len(tail) > self._max_length:
+            self._beginning_was_dropped = True
+            super().reset()  # drops the tail, but does not set `_beginning_was_dropped` to False
         return frames
 
     def reset(self) -> None:
         """Drop the bytes of an unfinished piece, because the next bytes come from another connection."""
         super().reset()
-        self._is_overlong = False
+        self._beginning_was_dropped = False
 
     @abstractmethod
     def _parse_piece(self, piece: bytes) -> list[Frame]:
-        """Return the frames that a piece completes. A piece that is rejected must be counted."""
+        """Return the frames that a piece completes.
+
+        An implementation must count every piece that it rejects.
+        """
 
 
 class StuffedParser(DelimitedParser):
-    """Parser of frames with byte stuffing. Every piece is a frame. Empty pieces are ignored.
+    """Parser of frames with byte stuffing. Every piece that is not empty should be a frame.
 
     Args:
         delimiter: The byte after each frame.
         max_length: Length of the longest stuffed frame, bytes.
-        decode: Function from the bytes of a piece to its frame. It raises ValueError if the piece is not a frame.
+        decode: Function that decodes the frame in a piece. It raises ValueError if the piece is not a frame.
         parser_arguments: Arguments of `Parser`.
     """
 
@@ -391,6 +413,10 @@ class StuffedParser(DelimitedParser):
         self._decode = decode
 
     def _parse_piece(self, piece: bytes) -> list[Frame]:
+        """Decode a piece, and return a list with its frame.
+
+        The list is empty if the piece is empty or is not a frame.
+        """
         if not piece:
             return []
-        return self._attempt(self._decode, piece, len(piece) + 1)
+        return self._try_decode(self._decode, piece, dropped_size=len(piece) + 1)  # with the delimiter

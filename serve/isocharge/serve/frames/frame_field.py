@@ -1,4 +1,4 @@
-"""A field of a described frame, with its type, its name and its range."""
+"""Definition of one field of a frame whose layout is described in a device file."""
 
 import struct
 import sys
@@ -21,16 +21,18 @@ STRUCT_FORMATS = {
     "f32": "f",
     "f64": "d",
 }
-"""Format of the module `struct` for each type of a field. Numbers of three bytes are read as bytes."""
+"""Format of each type of a field in the notation of the module `struct`.
+
+A number of three bytes is read as bytes, because `struct` has no format for such numbers."""
 
 LARGEST_FLOATS = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": sys.float_info.max}
-"""Largest number of each type of a field that is not an integer (IEEE 754)."""
+"""Largest number that each floating-point type of a field can represent (IEEE 754)."""
 
 PADDING = "pad"
-"""Type of bytes that are not read."""
+"""Type of a field whose bytes are not read."""
 
 MAX_PADDING = 4096
-"""Largest padding, bytes. The limit prevents that a typing error requests a gigabyte."""
+"""Largest number of bytes of padding. Because of this limit, a typing error cannot request a gigabyte."""
 
 ByteOrder = Literal["little", "big"]
 Hexadecimal = Annotated[
@@ -43,10 +45,10 @@ class Field(Settings, frozen=True):
 
     Attributes:
         kind: Type of the field.
-        name: Meaning of the field, or name of the channel; empty for padding.
+        name: Name of the channel, or a name with a meaning, such as `seq`; empty for padding.
         scale: Value of one count, in the unit of the channel or of the clock.
         count: Number of bytes of padding.
-        value: Bytes that the padding of every frame must have, in hexadecimal.
+        value: Bytes that the padding must have in every frame, in hexadecimal; None if any bytes are allowed.
     """
 
     kind: Literal["pad", "u8", "u16", "u24", "u32", "i8", "i16", "i24", "i32", "f32", "f64"] = field(name="type")
@@ -58,7 +60,8 @@ class Field(Settings, frozen=True):
     def __post_init__(self) -> None:
         """Check the keys of the field.
 
-        Padding may have a count or a value, but needs no name. All other fields need a name, and may have neither.
+        Padding may have a count or a value, but needs no name. All other fields need a name, and may have neither a
+        count nor a value.
 
         Raises:
             WrongKey: For the first key that is missing or not valid.
@@ -70,19 +73,23 @@ class Field(Settings, frozen=True):
         if not self.name:
             raise WrongKey("name")
         expected_none = f"none, because only the type {PADDING} may have one"
-        if self.count != 1:
+        if self.count != 1:  # 1 is the default, which means that no count is given
             raise WrongKey("count", expected_none, self.count)
         if self.value is not None:
             raise WrongKey("value", expected_none, self.value)
 
     @property
     def struct_format(self) -> str:
-        """Format of the field for the module `struct`."""
+        """Format of the field in the notation of the module `struct`.
+
+        For example, the format of four bytes of padding is `4x`.
+        """
         if self.kind != PADDING:
             return STRUCT_FORMATS[self.kind]
-        if self.value:
-            return f"{len(bytes.fromhex(self.value))}x"
-        return f"{self.count}x"
+        padding_size = self.count
+        if self.value:  # the bytes that the padding must have, in hexadecimal
+            padding_size = len(bytes.fromhex(self.value))
+        return f"{padding_size}x"
 
     @property
     def size(self) -> int:
@@ -99,7 +106,9 @@ class Field(Settings, frozen=True):
         """Largest number that the field can contain."""
         if self.kind in LARGEST_FLOATS:
             return LARGEST_FLOATS[self.kind]
-        return self.modulus // 2 - 1 if self.is_signed else self.modulus - 1
+        if self.is_signed:
+            return self.modulus // 2 - 1
+        return self.modulus - 1
 
     @property
     def smallest_count(self) -> float:
@@ -114,33 +123,39 @@ class Field(Settings, frozen=True):
         return self.kind.startswith("i")
 
     def holds(self, value: float) -> bool:
-        """Return whether a value, in the unit of the channel, is inside the range of the field."""
+        """Return whether the field can contain a value, which is given in the unit of the channel."""
         return self.smallest_count <= value / self.scale <= self.largest_count
 
     def limited(self, value: float) -> float:
-        """Return the value that is nearest to `value`, in the unit of the channel, among those that the field holds."""
+        """Return the value nearest to `value` that the field can contain.
+
+        Both values are in the unit of the channel.
+        """
         return self._limited_count(value / self.scale) * self.scale
 
     def _limited_count(self, count: float) -> float:
-        """Return the number that is nearest to `count` and inside the range of the field."""
+        """Return the number nearest to `count` that is inside the range of the field."""
         return min(max(count, self.smallest_count), self.largest_count)
 
     def pack(self, value: float, byte_order: ByteOrder) -> float | bytes:
-        """Return a value in the form that `struct` packs.
+        """Convert a value to the form in which `struct` can pack it.
 
-        A counter or a clock that does not fit its field wraps. A channel that does not fit is set to its limit.
+        The result is a number, or bytes for a field of three bytes. A counter or clock in an integer field wraps around
+        if it exceeds the range of the field. Every other value is limited to the range of the field.
 
         Args:
-            value: The value, in the unit of the field.
-            byte_order: Byte order of the frame. Only fields of three bytes, which `struct` cannot pack, need it.
+            value: Value in the unit of the channel or of the clock.
+            byte_order: Byte order of the frame. It is used only for fields of three bytes.
 
         Raises:
             ValueError: If the value of an integer field is not a number.
         """
-        has_scale = self.name not in (SEQ, FLAGS)  # a parser reads the frame counter and the flags without a scale
-        count = value / self.scale if has_scale else value
+        count = value
+        if self.name not in (SEQ, FLAGS):  # a parser reads the frame counter and the flags without a scale
+            count = value / self.scale
         is_float = self.kind in LARGEST_FLOATS
-        if self.name in (SEQ, *TIMES_US) and not is_float:
+        wraps = self.name in (SEQ, *TIMES_US) and not is_float
+        if wraps:
             count = (round(count) - self.smallest_count) % self.modulus + self.smallest_count
         limited_count = self._limited_count(count)
         if is_float:

@@ -1,10 +1,13 @@
-"""Frames whose layout a device file describes: a sync pattern, fields of fixed size, and a checksum.
+"""Frames whose layout is described in a device file.
+
+A frame consists of an optional sync pattern, fields of fixed size, and an optional checksum. The section `[frames]` of
+the device file contains the following keys.
 
     [frames]
     format = "described"
     framing = "sync"               # or "cobs", "slip", "hdlc", "datagram"; optional
     sync = "20 4E"                 # hexadecimal; optional with another framing
-    length = 16                    # of the whole frame, bytes, without stuffing; checked against the fields
+    length = 8                     # of the whole frame, bytes, without stuffing; checked against the fields
     byte_order = "little"          # or "big"; optional
     checksum = "crc-16/modbus"     # a name of `isocharge.serve.frames.checksums`, or the parameters of a CRC:
                                    # {width = 16, polynomial = "1021", start = "FFFF", reflected = false, final = "0"}
@@ -12,17 +15,19 @@
     checksum_order = "little"      # optional; the default is the byte order of the fields
     fields = [                     # in their order, from after the sync to before the checksum
         {name = "Fx", type = "i16", scale = 0.01},
-        ...
+        {name = "Fy", type = "i16", scale = 0.01},
     ]
 
-The section above lists all keys of such a frame. The types of the fields are u8, u16, u24, u32, i8, i16, i24, i32, f32,
-f64 and `pad`. Padding is either `count` bytes without a meaning, or a `value` in hexadecimal that every frame must
-have, such as its length. A field named `seq` is the frame counter, `t_us`, `t_ms` or `t_s` is the clock, and `flags`
-contains the bits of `isocharge.serve.frames.frame`. All other fields are channels.
+The types of the fields are u8, u16, u24, u32, i8, i16, i24, i32, f32, f64 and `pad`. Padding (`pad`) has either a
+`count` of bytes without a meaning, or a constant `value` in hexadecimal, which every frame must contain. For example,
+the constant value can be the length of the frame. The field `seq` is the frame counter. A field with the name `t_us`,
+`t_ms` or `t_s` is the clock. The field `flags` contains bits such as `SATURATED_BIT` (`isocharge.serve.frames.frame`).
+All other fields are channels.
 
-If the checksum of a frame with a sync pattern is wrong, the parser searches for the pattern again from the next byte.
-The pattern may have occurred by chance inside the data, and an intact frame may begin there. Stuffed frames end at
-their delimiter, and a datagram contains only whole frames. If a piece or a datagram is damaged, all of it is dropped.
+If a frame with a sync pattern is damaged, the parser searches for the next sync pattern from the following byte. The
+reason is that the pattern may have occurred by chance inside the data of another frame, and an intact frame may begin a
+few bytes later. With byte stuffing, all bytes between two delimiters are dropped if they are not an intact frame. In a
+datagram, only the damaged frames are dropped, unless the length of the datagram is wrong.
 """
 
 import struct
@@ -52,10 +57,10 @@ MAX_REQUEST_RATE_Hz = 100_000.0
 """Highest rate of requests, Hz."""
 
 SYNC = "sync"
-"""Framing in which a frame begins with its sync pattern."""
+"""Name of the framing in which every frame begins with a sync pattern."""
 
 DATAGRAM = "datagram"
-"""Framing in which a datagram contains one or more whole frames."""
+"""Name of the framing in which every datagram contains one or more whole frames."""
 
 Framing = Literal["sync", "cobs", "slip", "hdlc", "datagram"]
 HexadecimalNumber = Annotated[
@@ -64,7 +69,10 @@ HexadecimalNumber = Annotated[
 
 
 class CrcParameters(Settings, frozen=True):
-    """Parameters of a cyclic redundancy check that has no name; see `isocharge.serve.frames.checksums.Crc`."""
+    """Parameters of a cyclic redundancy check that has no name.
+
+    The keys have the same meanings as the attributes of `isocharge.serve.frames.checksums.Crc`.
+    """
 
     width: Literal[8, 16, 24, 32]
     polynomial: HexadecimalNumber
@@ -73,9 +81,12 @@ class CrcParameters(Settings, frozen=True):
     final: HexadecimalNumber = "0"
 
     def __post_init__(self) -> None:
+        """Check the numbers, and raise WrongKey for the first number that has more bits than the checksum."""
         for key in ("polynomial", "start", "final"):
-            if int(getattr(self, key), 16) >> self.width:
-                raise WrongKey(key, f"a number of {self.width} bits in hexadecimal, as in '1021'", getattr(self, key))
+            text = getattr(self, key)
+            has_too_many_bits = int(text, 16) >= 1 << self.width
+            if has_too_many_bits:
+                raise WrongKey(key, f"a number of {self.width} bits in hexadecimal, as in '1021'", text)
 
     @property
     def checksum(self) -> Checksum:
@@ -91,12 +102,12 @@ class CrcParameters(Settings, frozen=True):
 
 
 class FrameSection(Settings, frozen=True, tag_field="format"):
-    """Keys that the section `[frames]` has for every format. They describe requests to the board.
+    """Keys that the section `[frames]` has for every format. They describe how frames are requested from the board.
 
     Attributes:
-        request: Bytes to send for each frame, in hexadecimal; None for a board that sends frames by itself.
+        request: Bytes that request one frame, in hexadecimal; None for a board that sends frames without a request.
         request_Hz: Largest number of requests per second.
-        echo: Whether the line returns every byte that is sent, so that the request has to be removed from the answer.
+        echo: Whether the line returns every byte that is sent. The request is then removed from the received bytes.
     """
 
     request: Hexadecimal | None = None
@@ -105,12 +116,12 @@ class FrameSection(Settings, frozen=True, tag_field="format"):
 
 
 class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only=True):
-    """The layout of a frame. The attributes are keys of the section `[frames]`.
+    """Layout of a frame. The attributes are the keys of the section `[frames]` in a device file.
 
     Attributes:
         length: Length of the whole frame without stuffing, bytes.
         fields_and_padding: Fields of the frame, including padding.
-        framing: How one frame is separated from the next.
+        framing: Method by which the beginning of each frame is found in the stream.
         sync_bytes: Bytes with which every frame begins, in hexadecimal.
         byte_order: Byte order of the fields.
         checksum: Name of the checksum, or parameters of a CRC.
@@ -128,25 +139,30 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     checksum_order: ByteOrder | None = None
 
     def __post_init__(self) -> None:
-        """Check that the fields form a frame, and that the length and the checksum fit the fields.
+        """Check that all keys of the layout are present, valid and consistent with each other.
 
         Raises:
             WrongKey: For the first key that is missing or not valid.
         """
-        names = [field.name for field in self.fields]
         if isinstance(self.checksum, str) and self.checksum not in CHECKSUMS:
-            raise WrongKey("checksum", f"one of {', '.join(CHECKSUMS)}, or the parameters of a CRC", self.checksum)
+            checksum_names = ", ".join(CHECKSUMS)
+            raise WrongKey("checksum", f"one of {checksum_names}, or the parameters of a CRC", self.checksum)
         if self.framing == SYNC and self.sync_bytes is None:
-            raise WrongKey("sync")
-        if len(set(names)) < len(names):
+            raise WrongKey("sync")  # the key is missing
+
+        names = [field.name for field in self.fields]
+        has_duplicate_names = len(set(names)) < len(names)
+        if has_duplicate_names:
             raise WrongKey("fields", "names that differ", names)
         if not self.channels:
             raise WrongKey("fields", "one or more that are channels", names)
-        end = len(self.sync) + self.body.size
-        if self.length != end + self.check.size:
-            raise WrongKey("length", f"{end + self.check.size} for these fields", self.length)
-        if self.checksum_from >= end:
-            raise WrongKey("checksum_from", f"less than {end}, inside the frame", self.checksum_from)
+
+        checksum_start = len(self.sync) + self.body.size  # position of the checksum, which is at the end of the frame
+        expected_length = checksum_start + self.check.size
+        if self.length != expected_length:
+            raise WrongKey("length", f"{expected_length} for these fields", self.length)
+        if self.checksum_from >= checksum_start:
+            raise WrongKey("checksum_from", f"less than {checksum_start}, inside the frame", self.checksum_from)
 
     @cached_property
     def sync(self) -> bytes:
@@ -157,7 +173,8 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     def body(self) -> struct.Struct:
         """Format of the bytes between the sync pattern and the checksum."""
         byte_order = "<" if self.byte_order == "little" else ">"
-        return struct.Struct(byte_order + "".join(field.struct_format for field in self.fields_and_padding))
+        formats = [field.struct_format for field in self.fields_and_padding]
+        return struct.Struct(byte_order + "".join(formats))
 
     @cached_property
     def fields(self) -> tuple[Field, ...]:
@@ -166,51 +183,56 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     @cached_property
     def channels(self) -> tuple[Field, ...]:
-        """The fields that are neither frame counter, clock nor flags."""
+        """The fields that contain neither the frame counter, nor a clock, nor the flags."""
         return tuple(self.fields[position] for position, _ in self.columns.channels)
 
     @cached_property
     def check(self) -> Checksum:
-        """The checksum given by the key `checksum`, which is a name or the parameters of a CRC."""
+        """The checksum that the key `checksum` selects by a name or describes by the parameters of a CRC."""
         if isinstance(self.checksum, str):
             return CHECKSUMS[self.checksum]
         return self.checksum.checksum
 
     @cached_property
     def columns(self) -> Columns:
-        """Meaning of each field: frame counter, clock, flags or channel."""
+        """Meanings of the fields: each field is the frame counter, a clock, the flags or a channel."""
         names = [field.name for field in self.fields]
         scales = [field.scale for field in self.fields]
-        flags = names.index(FLAGS) if FLAGS in names else None
-        return Columns(names, scales, flags)
+        flags_column = names.index(FLAGS) if FLAGS in names else None
+        return Columns(names, scales, flags_column)
 
     @property
     def seq_modulus(self) -> int:
-        """Value at which the field `seq` wraps to 0."""
-        position = self.columns.seq
-        return SEQ_MODULUS if position is None else self.fields[position].modulus
+        """Value at which the field `seq` wraps to 0; `SEQ_MODULUS` if there is no such field."""
+        position = self.columns.seq_column
+        if position is None:  # frames have no counter
+            return SEQ_MODULUS
+        return self.fields[position].modulus
 
     @property
     def t_us_modulus(self) -> int:
-        """Time at which the field of the clock wraps to 0, us."""
-        position = self.columns.time
-        if position is None:
+        """Time in us at which the field of the clock wraps to 0; `T_US_MODULUS` if there is no such field."""
+        position = self.columns.clock_column
+        if position is None:  # frames have no clock
             return T_US_MODULUS
-        return round(self.fields[position].modulus * self.columns.time_unit_us)
+        return round(self.fields[position].modulus * self.columns.clock_unit_us)
 
     @cached_property
     def three_byte_fields(self) -> tuple[tuple[int, bool], ...]:
-        """Position of each field of three bytes, and whether the field is signed.
+        """Fields of three bytes, each as its position and whether it is signed.
 
-        The module `struct` cannot read such fields.
+        Fields of three bytes are converted separately, because the module `struct` cannot read them as numbers.
         """
         return tuple((position, field.kind == "i24") for position, field in enumerate(self.fields) if field.size == 3)
 
     @cached_property
     def constants(self) -> tuple[tuple[int, bytes], ...]:
-        """Position and value of the bytes that are the same in every frame, except the sync pattern."""
-        position = len(self.sync)
+        """Constant bytes that follow the sync pattern in every frame, each as a position and the bytes from there on.
+
+        Constant bytes are padding for which the device file states a `value`.
+        """
         constants = []
+        position = len(self.sync)  # the first field follows the sync pattern
         for part in self.fields_and_padding:
             if part.value:
                 constants.append((position, bytes.fromhex(part.value)))
@@ -219,8 +241,10 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     def checksum_of(self, data: bytes) -> bytes:
         """Compute the checksum that follows `data`, which is a frame without its checksum."""
-        value = self.check.compute(data[self.checksum_from :])
-        return value.to_bytes(self.check.size, self.checksum_order or self.byte_order)
+        covered_bytes = data[self.checksum_from :]
+        value = self.check.compute(covered_bytes)
+        byte_order = self.checksum_order or self.byte_order
+        return value.to_bytes(self.check.size, byte_order)
 
     def decode(self, data: bytes) -> Frame:
         """Decode one frame.
@@ -236,30 +260,35 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         """
         if len(data) != self.length or not data.startswith(self.sync):
             raise ValueError("the length or the sync pattern is wrong")
-        end = self.length - self.check.size
-        if self.check.size and self.checksum_of(data[:end]) != data[end:]:
+        has_checksum = self.check.size > 0
+        checksum_start = self.length - self.check.size
+        if has_checksum and self.checksum_of(data[:checksum_start]) != data[checksum_start:]:
             raise ChecksumError("the checksum is wrong")
         for position, constant in self.constants:
             if not data.startswith(constant, position):
                 raise ValueError(f"the constant at byte {position} is wrong")
         numbers = self.body.unpack_from(data, len(self.sync))
-        if self.three_byte_fields:
+        if self.three_byte_fields:  # `struct` has unpacked these fields as bytes
             return self.columns.frame(self._convert_three_byte_fields(numbers))
         return self.columns.frame(numbers)
 
     def _convert_three_byte_fields(self, numbers: tuple[Any, ...]) -> list[Any]:
-        """Convert the fields of three bytes to integers. The other numbers stay the same."""
+        """Convert the fields of three bytes to integers. All other numbers stay the same.
+
+        Args:
+            numbers: Value of each field as `struct` has unpacked it, which is bytes for a field of three bytes.
+        """
         converted = list(numbers)
         for position, is_signed in self.three_byte_fields:
             converted[position] = int.from_bytes(numbers[position], self.byte_order, signed=is_signed)
         return converted
 
     def frame_of_zeros(self) -> Frame:
-        """Return a frame whose channels are 0."""
+        """Return a frame in which all numbers are 0."""
         return self.columns.frame([0] * len(self.fields))
 
     def encode(self, frame: Frame) -> bytes:
-        """Return the bytes that a board sends for a frame, with byte stuffing and delimiter.
+        """Return the bytes that a board sends for a frame, including byte stuffing and delimiter if there are any.
 
         The first value of the frame belongs to the first channel, the second value to the second channel, and so on.
 
@@ -267,7 +296,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             ValueError: If the frame has another number of values than there are channels, or a value is not a number.
         """
         data = self.encode_unstuffed(frame)
-        if self.framing not in STUFFINGS:
+        if self.framing not in STUFFINGS:  # frames with a sync pattern and datagrams have no stuffing
             return data
         stuffing = STUFFINGS[self.framing]
         return stuffing.encode(data) + stuffing.delimiter
@@ -282,35 +311,40 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         """
         seq = 0 if frame.seq is None else frame.seq
         t_us = 0 if frame.t_us is None else frame.t_us
+
+        # Values by the name of the field. The clock is given in all units, because its field may have any of the names.
         values: dict[str, float] = {SEQ: seq, FLAGS: frame.flags}
         for clock_name, unit_us in TIMES_US.items():
             values[clock_name] = t_us / unit_us
         for channel, value in zip(self.channels, frame.values, strict=True):
             values[channel.name] = value
-        packed = [field.pack(values[field.name], self.byte_order) for field in self.fields]
-        data = bytearray(self.sync + self.body.pack(*packed))
-        for position, constant in self.constants:
+
+        packed_values = [field.pack(values[field.name], self.byte_order) for field in self.fields]
+        data = bytearray(self.sync + self.body.pack(*packed_values))
+        for position, constant in self.constants:  # `struct` has packed all padding as zeros
             data[position : position + len(constant)] = constant
         return bytes(data) + self.checksum_of(bytes(data))
 
     def parser(self) -> Parser:
-        """Create a parser."""
+        """Create a parser for frames with this layout."""
         if self.framing == SYNC:
             return SyncParser(self)
         if self.framing == DATAGRAM:
             return DatagramParser(self)
 
+        # SLIP and HDLC at most double the length. COBS adds 1 byte, and 1 more for every 254 bytes.
         stuffing = STUFFINGS[self.framing]
-        max_length = 2 * self.length + 2  # at worst, stuffing doubles the length
+        max_length = 2 * self.length + 2
 
         def decode_stuffed(piece: bytes) -> Frame:
+            """Remove the byte stuffing from a piece, and decode the frame that it contains."""
             return self.decode(stuffing.decode(piece))
 
         return StuffedParser(stuffing.delimiter, max_length, decode_stuffed, *_parser_arguments(self))
 
 
 def _parser_arguments(layout: FrameLayout) -> tuple[str, int, int]:
-    """Return the arguments of `Parser` for a layout, which are the description of the format and the two moduli."""
+    """Return the description of the format and the two moduli of a layout, which are the arguments of `Parser`."""
     names = ", ".join(field.name for field in layout.fields)
     return f"described frames of {layout.length} bytes: {names}", layout.seq_modulus, layout.t_us_modulus
 
@@ -319,35 +353,35 @@ class SyncParser(Parser):
     """Parser for a layout whose frames begin with a sync pattern."""
 
     def __init__(self, layout: FrameLayout) -> None:
-        """Begin without bytes."""
+        """Begin without stored bytes."""
         super().__init__(*_parser_arguments(layout))
         self.layout = layout
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
 
-        A frame may begin wherever the sync pattern occurs. If the bytes after the pattern are not a frame, the search
-        continues one byte later. Bytes of an unfinished frame are stored for the next call.
+        A frame may begin wherever the sync pattern occurs. If the bytes from the pattern onwards are not a frame, the
+        search for the pattern continues one byte later. Bytes of an unfinished frame are stored for the next call.
         """
         sync = self.layout.sync
         length = self.layout.length
         unparsed = self._tail + data
+        last_complete_start = len(unparsed) - length  # a frame that begins after this position is unfinished
         frames = []
-        position = 0  # all bytes before this position have been parsed
-        start = unparsed.find(sync)
-        while 0 <= start <= len(unparsed) - length:
-            if start > position:
-                self.counts.count_dropped(start - position)
-            # If the bytes are no frame, one byte is dropped, and a frame may begin at the next byte.
-            decoded = self._attempt(self.layout.decode, unparsed[start : start + length], 1)
+        parsed_end = 0  # all bytes before this position have been parsed
+        start = unparsed.find(sync, parsed_end)  # -1 if the pattern does not occur
+        while 0 <= start <= last_complete_start:
+            self.counts.count_dropped(start - parsed_end)  # bytes between the previous frame and the pattern
+            # If the bytes are not a frame, one byte is dropped, because a frame may begin at the next byte.
+            decoded = self._try_decode(self.layout.decode, unparsed[start : start + length], dropped_size=1)
             frames += decoded
-            position = start + length if decoded else start + 1
-            start = unparsed.find(sync, position)
+            parsed_end = start + length if decoded else start + 1
+            start = unparsed.find(sync, parsed_end)
 
-        tail_start = start
-        if start < 0:  # no sync pattern was found, but the end of the data may contain its beginning
-            tail_start = max(position, len(unparsed) - len(sync) + 1)
-        self.counts.count_dropped(tail_start - position)
+        tail_start = start  # the beginning of an unfinished frame
+        if start < 0:  # no sync pattern was found, but the end of the data may contain the beginning of the pattern
+            tail_start = max(parsed_end, len(unparsed) - len(sync) + 1)
+        self.counts.count_dropped(tail_start - parsed_end)
         self._tail = unparsed[tail_start:]
         return frames
 
@@ -356,7 +390,7 @@ class DatagramParser(Parser):
     """Parser for datagrams, each of which contains one or more whole frames."""
 
     def __init__(self, layout: FrameLayout) -> None:
-        """Begin without bytes."""
+        """Begin without stored bytes."""
         super().__init__(*_parser_arguments(layout))
         self.layout = layout
 
@@ -366,10 +400,11 @@ class DatagramParser(Parser):
         A datagram whose length is not a multiple of the length of a frame is rejected as a whole.
         """
         length = self.layout.length
-        if len(data) % length:
+        has_only_whole_frames = len(data) % length == 0
+        if not has_only_whole_frames:
             self.counts.count_rejected(len(data))
             return []
         frames = []
         for start in range(0, len(data), length):
-            frames += self._attempt(self.layout.decode, data[start : start + length], length)
+            frames += self._try_decode(self.layout.decode, data[start : start + length], dropped_size=length)
         return frames

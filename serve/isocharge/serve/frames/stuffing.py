@@ -1,17 +1,17 @@
-"""Byte stuffing, which encodes frames so that the byte that separates frames never occurs inside a frame.
+"""Byte stuffing, an encoding in which the byte that separates frames never occurs inside a frame.
 
-- COBS, Consistent Overhead Byte Stuffing (Cheshire and Baker 1999), ends a frame with a zero. Each zero in the data is
-  replaced by the distance to the next zero. The first byte is the distance to the first zero. A distance of 255 stands
-  for 254 bytes without a zero after them.
-- SLIP (RFC 1055) and the asynchronous framing of HDLC (RFC 1662) separate frames by a special byte. If this byte occurs
-  in the data, two other bytes are sent instead.
+- COBS (Consistent Overhead Byte Stuffing, Cheshire and Baker 1999) ends each frame with a zero byte. Each zero byte in
+  the data is replaced by the distance to the next zero byte. An additional byte at the beginning contains the distance
+  to the first zero byte. The distance 255 stands for 254 bytes of data that are not followed by a zero byte.
+- SLIP (RFC 1055) and the asynchronous framing of HDLC (RFC 1662) separate frames by a reserved byte. If the reserved
+  byte occurs in the data, two other bytes are sent in its place.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 MAX_BLOCK = 254
-"""Largest number of bytes without a zero that one distance of COBS can cover."""
+"""Largest number of data bytes that can follow one distance byte of COBS."""
 
 
 class Stuffing(NamedTuple):
@@ -19,9 +19,9 @@ class Stuffing(NamedTuple):
 
     Attributes:
         delimiter: The byte between frames.
-        encode: Function from the bytes of a frame to the bytes that are sent before the delimiter.
-        decode: Function from the bytes between two delimiters to the bytes of the frame. It raises ValueError for bytes
-            that no encoder produces.
+        encode: Function that converts the bytes of a frame to the bytes that are sent before the delimiter.
+        decode: Function that converts the bytes between two delimiters to the bytes of the frame. It raises ValueError
+            for bytes that no encoder produces.
     """
 
     delimiter: bytes
@@ -30,28 +30,31 @@ class Stuffing(NamedTuple):
 
 
 def cobs_encode(data: bytes) -> bytes:
-    """Encode bytes so that the result contains no zero.
+    """Encode bytes by COBS, so that the result contains no zero byte.
 
     The result is at most 1 + len(data) // 254 bytes longer than `data`.
     """
-    *blocks, last = data.split(b"\0")
-    encoded = [_encode_block(block, ends_in_zero=True) for block in blocks]
-    return b"".join([*encoded, _encode_block(last, ends_in_zero=False)])
+    *blocks_before_zeros, last_block = data.split(b"\0")
+    encoded = [_encode_block(block, ends_in_zero=True) for block in blocks_before_zeros]
+    encoded.append(_encode_block(last_block, ends_in_zero=False))
+    return b"".join(encoded)
 
 
 def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
-    """Encode bytes without zeros, and the zero that follows them if there is one.
+    """Encode a block of bytes without zeros, together with the zero after the block if there is one.
 
-    The bytes are cut into pieces of at most `MAX_BLOCK` bytes. A distance byte is put before each piece: the length of
-    the piece plus 1. A distance of `MAX_BLOCK` + 1 means that no zero follows the piece.
+    The block is cut into pieces of at most `MAX_BLOCK` bytes. Each piece is preceded by a distance byte, which contains
+    the length of the piece plus 1. A decoder adds a zero after each piece, except after a piece with the distance
+    `MAX_BLOCK` + 1 and after the last piece of a frame.
 
     Args:
-        block: The bytes.
-        ends_in_zero: Whether a zero follows the bytes.
+        block: Bytes that contain no zero.
+        ends_in_zero: Whether a zero follows the block. It is False only for the last block of a frame.
     """
     encoded = bytearray()
     rest = block
-    # A last piece of exactly `MAX_BLOCK` bytes gets this distance only if a zero follows the bytes.
+    # No zero is added after a piece of `MAX_BLOCK` bytes. If a zero follows such a piece, an empty piece is encoded
+    # after it, and the decoder adds the zero after the empty piece.
     while len(rest) > MAX_BLOCK or (len(rest) == MAX_BLOCK and ends_in_zero):
         encoded.append(MAX_BLOCK + 1)
         encoded += rest[:MAX_BLOCK]
@@ -63,9 +66,9 @@ def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
 def cobs_decode(data: bytes) -> bytes:
     """Decode bytes that `cobs_encode` has encoded.
 
-    The data consist of blocks. Each block begins with a distance byte, which is followed by distance - 1 bytes of the
-    result. A zero is inserted between the contents of two blocks, unless the distance byte of the first block has its
-    largest value.
+    The data consist of blocks. Each block begins with a distance byte, which is followed by `distance - 1` decoded
+    bytes. A zero is added after the decoded bytes of each block, except after a block with the distance 255 and after
+    the last block.
 
     Raises:
         ValueError: If a distance points beyond the end, or `data` contains a zero.
@@ -79,38 +82,48 @@ def cobs_decode(data: bytes) -> bytes:
             raise ValueError(f"byte {position} is {distance}, but {len(data) - position - 1} bytes or a zero follow")
         decoded += block
         position += distance
-        zero_follows = distance <= MAX_BLOCK and position < len(data)
+        is_last_block = position >= len(data)
+        zero_follows = distance <= MAX_BLOCK and not is_last_block
         if zero_follows:
             decoded.append(0)
     return bytes(decoded)
 
 
 def _slip_encode(data: bytes) -> bytes:
-    """Encode bytes with the byte stuffing of SLIP, so that the result does not contain the byte C0."""
+    """Apply the byte stuffing of SLIP, so that the result does not contain the byte C0."""
     return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc")
 
 
 def _slip_decode(piece: bytes) -> bytes:
-    """Decode bytes with the byte stuffing of SLIP; raise ValueError if no encoder produces them."""
+    """Remove the byte stuffing of SLIP.
+
+    Raises:
+        ValueError: If no encoder produces these bytes.
+    """
     decoded = piece.replace(b"\xdb\xdc", b"\xc0").replace(b"\xdb\xdd", b"\xdb")
+    # Every byte DB must be the beginning of one of the two sequences.
     if piece.count(b"\xdb") != piece.count(b"\xdb\xdc") + piece.count(b"\xdb\xdd"):
         raise ValueError("expected DC or DD after the byte DB")
     return decoded
 
 
 def _hdlc_encode(data: bytes) -> bytes:
-    """Encode bytes with the byte stuffing of HDLC, so that the result does not contain the byte 7E."""
+    """Apply the byte stuffing of HDLC, so that the result does not contain the byte 7E."""
     return data.replace(b"\x7d", b"\x7d\x5d").replace(b"\x7e", b"\x7d\x5e")
 
 
 def _hdlc_decode(piece: bytes) -> bytes:
-    """Decode bytes with the byte stuffing of HDLC; raise ValueError if no encoder produces them.
+    """Remove the byte stuffing of HDLC.
 
-    The byte 7D is dropped, and the sixth bit of the byte after it is inverted.
+    The byte 7D announces a byte in which the encoder has inverted the bit 0x20. The decoder drops the byte 7D, and
+    inverts the bit 0x20 of the following byte again.
+
+    Raises:
+        ValueError: If the byte 7D is not followed by another byte.
     """
-    first_part, *other_parts = piece.split(b"\x7d")
+    first_part, *parts_after_7d = piece.split(b"\x7d")
     decoded = bytearray(first_part)
-    for part in other_parts:
+    for part in parts_after_7d:
         if not part:
             raise ValueError("expected a byte after 7D")
         decoded.append(part[0] ^ 0x20)

@@ -1,20 +1,20 @@
-"""Parser of frames in lines of text. The layout of the lines is recognised from the first good lines.
+"""Parser for boards that send frames as lines of text.
 
-A board sends one row of numbers for each frame, or a cycle of several lines with one name each. The layout is
-recognised when the same row or the same cycle has occurred three times in succession. After recognition, lines of
-another layout are dropped and counted.
+A board sends either one line for each frame, or a cycle of several lines, each of which contains a part of the frame.
+The parser recognises the layout when lines with the same layout, or the same cycle of lines, have occurred three times
+in succession. From then on, lines with another layout are dropped and counted.
 
-Reading may start in the middle of a cycle. The lines are therefore sorted by name, with the frame counter and the clock
-before the channels, and the first line of this order begins the cycle. Reading may also start in the middle of a line,
-so a first line of numbers without names is dropped.
+Reading may start in the middle of a cycle. The lines of a cycle are therefore sorted by name, with the frame counter
+and the clock before the channels. The line that comes first in this order begins the cycle. Reading may also start in
+the middle of a line. The first line is therefore dropped if it contains numbers without names.
 
 Text has no checksum, except for sentences in the style of NMEA 0183. A damaged digit in an otherwise intact line is
-therefore not detected. A line without a reading that occurs repeatedly, such as the echo of a request, is dropped and
-does not prevent recognition.
+therefore not detected. A line that cannot be parsed but occurs repeatedly, such as the echo of a request, is dropped
+and does not prevent the recognition of the layout.
 
 A column with the name `seq` is the frame counter. A column with the name `t_us`, `t_ms` or `t_s` is the clock of the
-device. All other names are channels. The values at which the counter and the clock wrap are learned when they wrap for
-the first time.
+device. All other columns are channels. The values at which the counter and the clock wrap to 0 are unknown at first.
+The parser estimates each of these values when it observes the first wrap.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,72 +33,75 @@ from isocharge.serve.frames.frame import (
 from isocharge.serve.frames.text_lines import Line, Notation, parse_line
 
 MAX_LINE_LENGTH = 4096
-"""Length of the longest line that is read, bytes."""
+"""Length of the longest line that is parsed, bytes."""
 
 MAX_CYCLE_LINES = 64
 """Largest number of lines that make one frame."""
 
 RECOGNITION_REPEATS = 3
-"""Number of times that a layout must occur in a row to be recognised."""
+"""Number of times in succession that a layout must occur before it is recognised."""
 
 MAX_VALUES = 256
 """Largest number of values in a line."""
 
 SEQ_MODULI = (100, 256, 1000, 10_000, SEQ_MODULUS, 1 << 32)
-"""Values at which frame counters usually wrap."""
+"""Values at which frame counters usually wrap to 0."""
 
-MAX_SEQ_STEPS = 2
-"""Largest step of the frame counter across a wrap, as a multiple of the previous step."""
+MAX_SEQ_STEP_RATIO = 2
+"""Largest ratio of the step of the frame counter across a wrap to the previous step."""
 
-MAX_TIME_STEPS = 16
-"""Largest step of the clock across a wrap, as a multiple of the previous step."""
+MAX_CLOCK_STEP_RATIO = 16
+"""Largest ratio of the step of the clock across a wrap to the previous step."""
 
 
 class Layout:
-    """Layout of the values in one line, or in a cycle of several lines.
+    """Arrangement of the values of a frame in one line, or in a cycle of several lines.
 
     Attributes:
-        columns: Meaning of each value.
+        columns: Meanings of the values as frame counter, clock or channels.
     """
 
-    def __init__(self, notation: Notation, names: tuple[str, ...], width: int, lines: int = 1) -> None:
-        """Store the layout.
+    def __init__(self, notation: Notation, names: tuple[str, ...], value_count: int, line_count: int = 1) -> None:
+        """Store the layout, and find the columns of the frame counter, the clock and the channels by their names.
 
         Args:
             notation: Notation of the lines.
             names: Names of all values; empty for a CSV without a header.
-            width: Number of values.
-            lines: Number of lines in a cycle; 1 for rows.
+            value_count: Number of values in a frame.
+            line_count: Number of lines that contain the values of a frame; 1 if each line is a frame.
         """
         self.notation = notation
         self.names = names
-        self.width = width
-        self.lines = lines
-        self.columns = Columns(names or ("",) * width, (1.0,) * width)
+        self.value_count = value_count
+        self.line_count = line_count
+        column_names = names or ("",) * value_count  # a column without a name has an empty name
+        scales = (1.0,) * value_count  # values in text have no scale
+        self.columns = Columns(column_names, scales)
 
 
 class TextParser(DelimitedParser):
-    """Parser of lines of text, which recognises their layout.
+    """Parser that recognises the layout of lines of text and converts the lines to frames.
 
     Attributes:
-        layout: The layout; None until it is recognised.
+        layout: Layout of the lines; None until it is recognised.
     """
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
-        """Begin without a layout.
+        """Begin without a layout. The parser recognises the layout from the first lines.
 
         Args:
-            columns: Names for the columns of a CSV.
-            meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the device uses.
+            columns: Names for the columns of a CSV; empty if they are not known.
+            meanings: Meaning of names that the device uses for its counter and its clock: for each such name, one of
+                `seq`, `t_us`, `t_ms` and `t_s`.
         """
         super().__init__(b"\n", MAX_LINE_LENGTH, "text of a layout that is not clear yet")
         self.layout: Layout | None = None
         self._columns = columns
         self._meanings = dict(meanings or {})
-        self._seq_wrap = CounterWrap(SEQ_MODULI, SEQ_MODULUS, MAX_SEQ_STEPS)
-        self._clock_wrap = clock_wrap(1.0)
+        self._seq_wrap = CounterWrap(SEQ_MODULI, SEQ_MODULUS, MAX_SEQ_STEP_RATIO)
+        self._clock_wrap = clock_wrap(1.0)  # until the layout states the unit of the clock
         self._last_unreadable_line = b""
-        self._is_first_line = True
+        self._is_first_line = True  # whether the next line is the first line of a connection
 
         # Lines from which the layout is recognised, with their sizes in bytes
         self._unrecognised: list[tuple[Line, int]] = []
@@ -112,11 +115,17 @@ class TextParser(DelimitedParser):
         super().reset()
         self._drop_cycle()
         self._is_first_line = True
-        self._seq_wrap.update(None)
+        self._seq_wrap.update(None)  # None means that the connection has ended
         self._clock_wrap.update(None)
 
     def _parse_piece(self, piece: bytes) -> list[Frame]:
-        """Return the frames that a line completes. While the layout is not known, the line is used to recognise it."""
+        """Parse a line, and return the frames that it completes.
+
+        Lines are collected until their layout can be recognised. The frames of the collected lines are returned then.
+
+        Args:
+            piece: Bytes of the line, without the line feed.
+        """
         size = len(piece) + 1  # with the line feed
         is_first_line = self._is_first_line
         self._is_first_line = False
@@ -125,99 +134,112 @@ class TextParser(DelimitedParser):
         except ValueError:
             return self._reject_unreadable(piece, size)
         if self._meanings and line.names:
-            line = line._replace(names=tuple(self._meanings.get(name, name) for name in line.names))
+            # Replace the names that the device uses for its counter and its clock by `seq`, `t_us`, `t_ms` or `t_s`.
+            names = tuple(self._meanings.get(name, name) for name in line.names)
+            line = line._replace(names=names)
 
         # A first line may have lost its beginning: "801.2" cut to "1.2" is still a number.
         if is_first_line and line.notation is Notation.csv:
             self._reject_unrecognised()
             return self._reject(size)
-        if line.notation is Notation.nothing:
+        if line.notation is Notation.nothing:  # such as a comment
             return []
         if line.notation is Notation.header:
-            return self._name_columns(line, size)
+            self._name_columns(line, size)
+            return []
         if self.layout is None:
             return self._recognise(line, size)
         return self._read(self.layout, line, size)
 
     def _reject(self, size: int) -> list[Frame]:
-        """Count a rejected line."""
+        """Count a rejected line, and return an empty list, because the line completes no frame."""
         self.counts.count_rejected(size)
         return []
 
     def _reject_unreadable(self, piece: bytes, size: int) -> list[Frame]:
         """Count a line that cannot be parsed.
 
-        A line that is equal to the previous line that could not be parsed is the echo of a request. The other lines are
-        then kept for recognition.
+        If the line is equal to the previous line that could not be parsed, it is probably the echo of a request. The
+        lines that were collected to recognise a layout are then kept. Otherwise, the collected lines are dropped.
 
         Args:
-            piece: The line.
+            piece: Bytes of the line.
             size: Number of bytes of the line.
+
+        Returns:
+            An empty list.
         """
-        if piece != self._last_unreadable_line:
+        is_echo = piece == self._last_unreadable_line
+        if not is_echo:
             self._reject_unrecognised()
         self._last_unreadable_line = piece
         return self._reject(size)
 
     def _reject_unrecognised(self) -> None:
-        """Count the lines that were collected to recognise a layout, and drop them."""
+        """Drop all lines that were collected to recognise a layout, and count them as rejected."""
         for _, size in self._unrecognised:
             self.counts.count_rejected(size)
         self._unrecognised = []
 
-    def _name_columns(self, header: Line, size: int) -> list[Frame]:
+    def _name_columns(self, header: Line, size: int) -> None:
         """Use the names in a header as the names of the columns, unless the columns already have names.
 
-        The header is counted as rejected if the columns cannot have its names. Such a header appears if the board was
-        reset, or if a line only looks like a header. The result is always empty.
+        If the layout is already recognised and its columns cannot have these names, the header is counted as rejected.
+        A header can appear at this stage because the board was reset, or because a line only looks like a header.
 
         Args:
-            header: The header.
+            header: Parsed line with the names of the columns.
             size: Number of bytes of the line.
         """
+        has_column_names = bool(self._columns)
         if self.layout is None:
-            if not self._columns:
+            if not has_column_names:
                 self._columns = header.names
-            return []
-        can_be_named = self.layout.notation is Notation.csv and not self._columns
-        if can_be_named and self.layout.width == len(header.names):
-            self._set_layout(Layout(Notation.csv, header.names, self.layout.width))
-            return []
-        return self._reject(size)
+            return
+        can_be_named = self.layout.notation is Notation.csv and not has_column_names
+        if can_be_named and self.layout.value_count == len(header.names):
+            self._set_layout(Layout(Notation.csv, header.names, self.layout.value_count))
+        else:
+            self._reject(size)
 
     def _set_layout(self, layout: Layout) -> None:
-        """Use a layout for all further lines."""
+        """Use a layout for all further lines, and describe it in the attribute `format`."""
         self.layout = layout
-        self._clock_wrap = clock_wrap(layout.columns.time_unit_us)
-        names = ", ".join(layout.names) or f"{layout.width} columns without names"
+        self._clock_wrap = clock_wrap(layout.columns.clock_unit_us)
+        names = ", ".join(layout.names) or f"{layout.value_count} columns without names"
         self.format = f"text, {layout.notation}: {printable(names)}"
 
     def _recognise(self, line: Line, size: int) -> list[Frame]:
-        """Collect lines until their layout repeats, and return the frames in the lines with this layout.
+        """Add a line to the collected lines, and return their frames if their layout can now be recognised.
 
-        Until then, the result is empty. The lines before the repeated lines are counted as rejected.
+        A layout is recognised if the latest lines consist of `RECOGNITION_REPEATS` equal cycles. A cycle consists of
+        one or several lines that together contain one frame. Collected lines before these cycles are counted as
+        rejected.
 
         Args:
             line: The next line.
             size: Number of bytes of the line.
+
+        Returns:
+            The frames of all equal cycles; an empty list if no layout is recognised yet.
         """
         self._unrecognised.append((line, size))
-        period = _period([collected for collected, _ in self._unrecognised])
-        is_recognised = period > 0 and len(line.values) <= MAX_VALUES
+        cycle_length = _repeated_cycle_length([collected_line for collected_line, _ in self._unrecognised])
+        is_recognised = cycle_length > 0 and len(line.values) <= MAX_VALUES
         if not is_recognised:
+            # Keep as many lines as the longest cycles need, and reject the older lines.
             while len(self._unrecognised) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
                 _, oldest_size = self._unrecognised.pop(0)
                 self._reject(oldest_size)
             return []
 
-        # The last lines form `RECOGNITION_REPEATS` cycles of `period` lines. The lines before them are rejected.
-        first_repeated = len(self._unrecognised) - RECOGNITION_REPEATS * period
+        first_repeated = len(self._unrecognised) - RECOGNITION_REPEATS * cycle_length
         repeated_lines = self._unrecognised[first_repeated:]
         self._unrecognised = self._unrecognised[:first_repeated]
         self._reject_unrecognised()
 
         # One cycle determines the layout, with which all repeated lines are read.
-        first_cycle = [cycle_line for cycle_line, _ in repeated_lines[:period]]
+        first_cycle = [cycle_line for cycle_line, _ in repeated_lines[:cycle_length]]
         layout = self._layout_of(first_cycle)
         self._set_layout(layout)
         frames = []
@@ -226,59 +248,74 @@ class TextParser(DelimitedParser):
         return frames
 
     def _layout_of(self, lines: list[Line]) -> Layout:
-        """Return the layout of the lines of one cycle, which is a single line for most boards.
+        """Determine the layout of a frame from the lines of one cycle. For most boards, a cycle is a single line.
 
-        The values of a single line without names get the names of the columns if there are as many columns as values.
+        The names of several lines are sorted, because the given lines may begin in the middle of a cycle. If a single
+        line has no names, its values get the names of the columns, provided that there are as many names as values.
         """
         first_line = lines[0]
+        notation = first_line.notation
         if len(lines) > 1:
-            names = sorted({name for line in lines for name in line.names}, key=_sort_key)
-            return Layout(first_line.notation, tuple(names), len(names), len(lines))
-        width = len(first_line.values)
-        names_of_row = first_line.names
-        if not names_of_row and len(self._columns) == width:
-            names_of_row = self._columns
-        return Layout(first_line.notation, names_of_row, width)
+            different_names = {name for line in lines for name in line.names}
+            sorted_names = tuple(sorted(different_names, key=_counter_and_clock_first))
+            return Layout(notation, sorted_names, len(sorted_names), len(lines))
+
+        value_count = len(first_line.values)
+        names = first_line.names
+        if not names and len(self._columns) == value_count:
+            names = self._columns
+        return Layout(notation, names, value_count)
 
     def _read(self, layout: Layout, line: Line, size: int) -> list[Frame]:
-        """Return the frame that a line completes, in a list; empty if the line completes no frame or is rejected.
+        """Return a list with the frame that a line completes.
+
+        The list is empty if the line completes no frame, or if the line is rejected because it has another layout.
 
         Args:
-            layout: The layout of the lines.
-            line: The line.
+            layout: The recognised layout.
+            line: The next line.
             size: Number of bytes of the line.
         """
         if line.notation is not layout.notation:
             return self._reject(size)
-        if layout.lines > 1:
+        has_cycles = layout.line_count > 1
+        if has_cycles:
             return self._read_cycle_line(layout, line, size)
         has_other_names = bool(line.names) and line.names != layout.names
-        if len(line.values) != layout.width or has_other_names:
+        if len(line.values) != layout.value_count or has_other_names:
             return self._reject(size)
         return self._frame(layout, line.values, size)
 
     def _read_cycle_line(self, layout: Layout, line: Line, size: int) -> list[Frame]:
-        """Store the values of a line of a cycle, and return the frame if the cycle is complete.
+        """Store the values of one line of a cycle. A cycle is a sequence of lines that together contain one frame.
 
-        Each line of a cycle may contain the clock in addition to its value. A cycle begins with the first name of the
-        layout, or with a name that the present cycle already has.
+        A line is identified by the first of its names that is not the name of a clock, because every line of a cycle
+        may contain the clock. A new cycle begins with the line whose name comes first in the layout. A new cycle also
+        begins if the present cycle already contains a value with the name of the line, because lines must be missing.
 
         Args:
-            layout: The layout of the lines.
-            line: The line.
+            layout: The recognised layout.
+            line: The next line.
             size: Number of bytes of the line.
+
+        Returns:
+            A list with the frame if the line completes the cycle, otherwise an empty list.
         """
-        names = [name for name in line.names if name not in TIMES_US]
-        if not names or not set(line.names) <= set(layout.names):
+        names_without_clock = [name for name in line.names if name not in TIMES_US]
+        has_unknown_names = not set(line.names) <= set(layout.names)
+        if not names_without_clock or has_unknown_names:
             return self._reject(size)
-        first_name = next(name for name in layout.names if name not in TIMES_US)
-        begins_cycle = names[0] == first_name or names[0] in self._cycle_values
+
+        line_name = names_without_clock[0]
+        first_line_name = next(name for name in layout.names if name not in TIMES_US)
+        begins_cycle = line_name == first_line_name or line_name in self._cycle_values
         if begins_cycle:
-            self._drop_cycle()
-        self._cycle_values |= dict(zip(line.names, line.values, strict=True))
+            self._drop_cycle()  # an earlier cycle, if it is unfinished
+        line_values = dict(zip(line.names, line.values, strict=True))
+        self._cycle_values.update(line_values)
         self._cycle_bytes += size
-        is_incomplete = len(self._cycle_values) < layout.width
-        if is_incomplete:
+        is_complete = len(self._cycle_values) == layout.value_count
+        if not is_complete:
             return []
 
         values = [self._cycle_values[name] for name in layout.names]
@@ -287,25 +324,29 @@ class TextParser(DelimitedParser):
         return self._frame(layout, values, cycle_bytes)
 
     def _drop_cycle(self) -> None:
-        """Count the lines of an unfinished cycle as dropped."""
+        """Drop the lines of an unfinished cycle, and count them as rejected."""
         if self._cycle_values:
             self.counts.count_rejected(self._cycle_bytes)
         self._clear_cycle()
 
     def _clear_cycle(self) -> None:
-        """Begin a new cycle of lines."""
+        """Delete the values of the present cycle, so that a new cycle can begin."""
         self._cycle_values = {}
         self._cycle_bytes = 0
 
     def _frame(self, layout: Layout, values: Sequence[float], size: int) -> list[Frame]:
-        """Return a list with the frame that the values form, and update the moduli of the counter and the clock.
+        """Convert values to a frame, and update the moduli of the counter and the clock.
 
         Args:
-            layout: The layout of the lines.
+            layout: The recognised layout.
             values: Value of each column.
-            size: Number of bytes that are dropped if the values are no frame.
+            size: Number of bytes that are counted as dropped if the values are not a valid frame.
+
+        Returns:
+            A list with the frame; an empty list if the values are not a valid frame, for example because the counter is
+            infinite.
         """
-        frames = self._attempt(layout.columns.frame, values, size)
+        frames = self._try_decode(layout.columns.frame, values, dropped_size=size)
         for frame in frames:
             self.seq_modulus = self._seq_wrap.update(frame.seq)
             self.t_us_modulus = self._clock_wrap.update(frame.t_us)
@@ -313,46 +354,48 @@ class TextParser(DelimitedParser):
 
 
 def clock_wrap(unit_us: float) -> CounterWrap:
-    """Return the object that learns where a clock wraps.
+    """Create the estimator of the time at which a clock wraps to 0.
 
-    The clock may have 16, 24 or 32 bits, or may be computed from a 32-bit clock in us or ms.
+    The estimator assumes that the clock has 16, 24 or 32 bits, or is computed from a 32-bit clock in us or ms.
 
     Args:
         unit_us: Unit of the clock, us.
     """
     unit = round(unit_us)
-    usual_moduli = {T_US_MODULUS, 1000 * T_US_MODULUS}
+    usual_moduli = {T_US_MODULUS, 1000 * T_US_MODULUS}  # of a 32-bit clock in us or ms; all moduli are in us
     for bits in (16, 24, 32):
         usual_moduli.add((1 << bits) * unit)
-    return CounterWrap(sorted(usual_moduli), T_US_MODULUS * unit, MAX_TIME_STEPS)
+    initial_modulus = T_US_MODULUS * unit
+    return CounterWrap(sorted(usual_moduli), initial_modulus, MAX_CLOCK_STEP_RATIO)
 
 
-def _sort_key(name: str) -> tuple[bool, str]:
-    """Return a key that sorts frame counter and clock before the channels."""
+def _counter_and_clock_first(name: str) -> tuple[bool, str]:
+    """Return the key by which a name is sorted: the frame counter and the clock come before the channels."""
     is_channel = name != SEQ and name not in TIMES_US
     return is_channel, name
 
 
-def _period(lines: list[Line]) -> int:
+def _repeated_cycle_length(lines: list[Line]) -> int:
     """Return the number of lines in the cycle that has just occurred `RECOGNITION_REPEATS` times in succession.
 
-    Two lines are equal if they have the same notation, the same names and the same number of values. The result is 0 if
-    there is no cycle. Only lines with names form cycles of several lines.
+    The result is 0 if there is no such cycle. Two lines are equal in this comparison if they have the same notation,
+    the same names and the same number of values. A cycle of several lines is possible only for pairs of name and value
+    and for Teleplot. In these two notations, each line may contain a part of the frame.
 
     Args:
-        lines: The latest lines, at least one.
+        lines: The lines received last, at least one, in the order in which they arrived.
     """
     signatures = [(line.notation, line.names, len(line.values)) for line in lines]
     *earlier_signatures, last_signature = signatures
     if last_signature not in earlier_signatures:
         return 0
 
-    # The cycle begins again with the previous line that equals the last line.
-    lines_back_to_front = earlier_signatures[::-1]
-    period = lines_back_to_front.index(last_signature) + 1
-    has_names = lines[-1].notation in (Notation.pairs, Notation.teleplot)
-    if period > 1 and not has_names:
+    # The length of the cycle is the distance from the last line to the latest earlier line that is equal.
+    latest_signatures_first = earlier_signatures[::-1]
+    cycle_length = latest_signatures_first.index(last_signature) + 1
+    can_have_several_lines = lines[-1].notation in (Notation.pairs, Notation.teleplot)
+    if cycle_length > 1 and not can_have_several_lines:
         return 0
-    recent_signatures = signatures[-RECOGNITION_REPEATS * period :]
-    is_repeated = recent_signatures == recent_signatures[:period] * RECOGNITION_REPEATS
-    return period if is_repeated else 0
+    recent_signatures = signatures[-RECOGNITION_REPEATS * cycle_length :]
+    is_repeated = recent_signatures == recent_signatures[:cycle_length] * RECOGNITION_REPEATS
+    return cycle_length if is_repeated else 0

@@ -1,4 +1,4 @@
-"""Parsers for the lines of text that boards send, and functions that write frames as such lines.
+"""Functions that parse the lines of text that boards send, and functions that write frames as lines of text.
 
 A board may use one of the following notations.
 
@@ -25,10 +25,10 @@ from isocharge.common.number_text import parse_number
 from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame
 
 TELEPLOT_TIME = "t_ms"
-"""Name of the time of a Teleplot line, which has no name in Teleplot."""
+"""Name under which the time of a Teleplot line is stored, because it has no name in Teleplot."""
 
 MAX_JSON_LEVEL = 3
-"""Largest depth in a JSON object at which numbers are read."""
+"""Largest number of nested objects and lists in JSON from which numbers are read."""
 
 _SEPARATOR = re.compile(r"\s*[,;\t]\s*|\s+")
 
@@ -50,7 +50,7 @@ class Notation(StrEnum):
 
 
 class Line(NamedTuple):
-    """Content of a line.
+    """Content of a line of text.
 
     Attributes:
         notation: Notation of the line.
@@ -68,16 +68,16 @@ NO_READING = Line(Notation.nothing)
 
 
 def parse_line(data: bytes) -> Line:
-    """Parse a line of text in any of the notations. The first characters determine the notation.
+    """Parse a line of text in one of the supported notations, which is recognised from the characters of the line.
 
     Args:
-        data: The line without the characters that end it.
+        data: Bytes of the line, without the line feed at its end.
 
     Raises:
-        ValueError: If the line has no known notation.
+        ValueError: If the line has no supported notation, or is not valid in its notation.
     """
     text = data.decode("utf-8").strip()
-    if not text or text[0] == "#":
+    if not text or text[0] == "#":  # a blank line or a comment
         return NO_READING
     # The first character is tested before the separators, because JSON and Teleplot lines also contain colons.
     if text[0] in "{[":
@@ -92,16 +92,19 @@ def parse_line(data: bytes) -> Line:
 
 
 def _csv(text: str) -> Line:
-    """Parse a line of numbers between separators, or a header with the names of the columns.
+    """Parse a line of CSV, which contains either numbers or the names of the columns.
+
+    The cells of the line may be separated by commas, semicolons, tabs or blanks. Separators at the end of the line are
+    ignored.
 
     Raises:
-        ValueError: If the line consists neither of numbers nor of different names.
+        ValueError: If the line contains neither only numbers nor only names that all differ.
     """
     cells = _SEPARATOR.split(text.rstrip(",; \t"))
     try:
         return Line(Notation.csv, values=tuple(map(parse_number, cells)))
     except ValueError:  # a cell is not a number, so that the line may be a header
-        are_names = all(map(_NAME.fullmatch, cells))
+        are_names = all(_NAME.fullmatch(cell) for cell in cells)
         are_different = len(set(cells)) == len(cells)
         if are_names and are_different:
             return Line(Notation.header, names=tuple(cells))
@@ -109,14 +112,20 @@ def _csv(text: str) -> Line:
 
 
 def _sentence(text: str) -> Line:
-    """Parse the numbers of a sentence such as `$FILM,1.5,2.5*3A`, whose first word is a name.
+    """Parse a sentence such as `$FILM,1.5,2.5*3A`, which consists of a name and numbers.
 
-    The sentence may end in `*` and a checksum, which is the exclusive or of all bytes between `$` and `*`.
+    The sentence may end with `*` and a checksum. The checksum is the exclusive or of all bytes between `$` and `*`,
+    written as two hexadecimal digits.
+
+    Raises:
+        ValueError: If the checksum is wrong, or the sentence does not consist of a name and numbers.
     """
-    content, star, checksum = text[1:].partition("*")
-    if star:
-        expected_checksum = reduce(xor, content.encode(), 0)
-        if len(checksum) != 2 or int(checksum, 16) != expected_checksum:
+    text_after_dollar = text[1:]
+    content, star, sent_checksum = text_after_dollar.partition("*")
+    has_checksum = star != ""
+    if has_checksum:
+        computed_checksum = reduce(xor, content.encode(), 0)
+        if len(sent_checksum) != 2 or int(sent_checksum, 16) != computed_checksum:
             raise ValueError(f"expected the checksum of the sentence, got {text[-100:]!r}")
     _name, *cells = _SEPARATOR.split(content.rstrip(",; \t"))
     if not cells:
@@ -142,12 +151,15 @@ def _pairs(text: str) -> Line:
 
 
 def _teleplot(text: str) -> Line:
-    """Parse the latest value of a Teleplot line, `>name:time:value;time:value§unit|flags`.
+    """Parse a Teleplot line of the form `>name:time:value;time:value§unit|flags`, and return its latest value.
 
-    The time, the unit and the flags may be missing. Lines with texts (flag `t`) or with points of x-y plots (flag `xy`)
-    have no values.
+    The time, the unit and the flags may be missing. The result contains no value if the line is a text (flag `t`) or
+    contains points of an x-y plot (flag `xy`).
+
+    Raises:
+        ValueError: If the line has another form.
     """
-    content, _, flags = text[1:].partition("|")
+    content, _, flags = text[1:].partition("|")  # without the first character ">"
     name, _, values = content.partition(":")
     if not name.strip() or not values:
         raise ValueError(f"expected >name:value, got {text!r}")
@@ -156,7 +168,7 @@ def _teleplot(text: str) -> Line:
 
     _, _, latest_value = values.rstrip("; ").rpartition(";")
     reading, _, _unit = latest_value.partition("§")
-    *times, value = reading.split(":")
+    *times, value = reading.split(":")  # one time, or none
     if len(times) > 1:
         raise ValueError(f"expected >name:time:value, got {text!r}")
     pairs = {}
@@ -167,31 +179,37 @@ def _teleplot(text: str) -> Line:
 
 
 def _json(text: str) -> Line:
-    """Parse a JSON object with numbers at any level, or a JSON list of numbers."""
+    """Parse a JSON object that contains numbers, or a JSON list of numbers.
+
+    The result for a list of numbers has the notation CSV, because the numbers have no names.
+
+    Raises:
+        ValueError: If the text is not valid JSON, or contains no numbers.
+    """
     try:
-        # As floats, integers with hundreds of digits become infinite, as they do in the other notations.
+        # Integers are parsed as floats, so that integers of hundreds of digits become infinite, as in other notations.
         content = json.loads(text, parse_int=float)
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
-    if isinstance(content, list) and content and all(isinstance(number, float) for number in content):
+    if isinstance(content, list) and content and all(isinstance(item, float) for item in content):
         return Line(Notation.csv, values=tuple(content))
-    numbers = dict(_json_numbers("", content))
-    if not numbers:
+    numbers_by_path = dict(_json_numbers("", content))
+    if not numbers_by_path:
         raise ValueError(f"expected numbers, got {text!r}")
-    return Line(Notation.json, names=tuple(numbers), values=tuple(numbers.values()))
+    return Line(Notation.json, names=tuple(numbers_by_path), values=tuple(numbers_by_path.values()))
 
 
 def _json_numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, float]]:
-    """Return every number of a JSON value with the path to it, such as `charge.A` or `charge.0.re`.
+    """Return all numbers in a JSON value, each with its path, such as `charge.A` or `charge.0.re`.
 
-    The function ignores numbers that are more than `MAX_JSON_LEVEL` levels deep.
+    Numbers that are nested in more than `MAX_JSON_LEVEL` objects and lists are ignored.
 
     Args:
-        path: Path to the value; empty for the whole text.
-        content: The value: a number, a list, an object, or a value that contains no number.
-        level: Number of objects and lists that contain the value.
+        path: Path of the value; empty for the whole text.
+        content: The value, which is a number, a list, an object or a value that contains no number.
+        level: Number of objects and lists in which the value is nested.
     """
-    if isinstance(content, float):  # Integers were read as floats.
+    if isinstance(content, float):  # integers were read as floats
         return [(path, content)]
     if level >= MAX_JSON_LEVEL:
         return []
@@ -203,7 +221,7 @@ def _json_numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, fl
         return []
 
     numbers = []
-    prefix = f"{path}." if level > 0 else ""
+    prefix = f"{path}." if level > 0 else ""  # the whole text has no path
     for key, value in items:
         numbers += _json_numbers(prefix + key, value, level + 1)
     return numbers
@@ -212,33 +230,39 @@ def _json_numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, fl
 def _named_values(frame: Frame) -> list[tuple[str, str]]:
     """Return the names and the values of the frame counter, the clock and the channels, as text.
 
-    Channels without names are called A, B, C, and so on.
+    Channels without names are called A, B, C, and so on. The values of channels have seven significant digits.
     """
-    fields = []
+    named_values = []
     if frame.seq is not None:
-        fields.append((SEQ, str(frame.seq)))
+        named_values.append((SEQ, str(frame.seq)))
     if frame.t_us is not None:
-        fields.append(("t_us", str(frame.t_us)))
-    names = frame.names or tuple(chr(ord("A") + channel) for channel in range(len(frame.values)))
-    for name, value in zip(names, frame.values, strict=True):
-        fields.append((name, f"{value:.7g}"))
-    return fields
+        named_values.append(("t_us", str(frame.t_us)))
+    channel_names = frame.names
+    if not channel_names:
+        channel_names = tuple(chr(ord("A") + channel) for channel in range(len(frame.values)))
+    for name, value in zip(channel_names, frame.values, strict=True):
+        named_values.append((name, f"{value:.7g}"))
+    return named_values
 
 
 def _write_csv(frame: Frame) -> str:
+    """Return the values of the channels, separated by commas."""
     return ",".join(f"{value:.7g}" for value in frame.values)
 
 
 def _write_pairs(frame: Frame) -> str:
+    """Return pairs `name:value` of the counter, the clock and the channels, separated by commas."""
     return ",".join(f"{name}:{value}" for name, value in _named_values(frame))
 
 
 def _write_teleplot(frame: Frame) -> str:
+    """Return a line `>name:time:value` for the counter and for each channel, in which the time is the clock in ms."""
     time = "" if frame.t_us is None else f"{frame.t_us / 1e3:.3f}:"
     return "\n".join(f">{name}:{time}{value}" for name, value in _named_values(frame) if name not in TIMES_US)
 
 
 def _write_json(frame: Frame) -> str:
+    """Return a JSON object with the counter, the clock and the channels."""
     fields = ", ".join(f"{json.dumps(name)}: {value}" for name, value in _named_values(frame))
     return "{" + fields + "}"
 
@@ -249,14 +273,16 @@ TEXT_FORMATS: dict[str, Callable[[Frame], str]] = {
     "teleplot": _write_teleplot,
     "json": _write_json,
 }
-"""Function that writes a frame, by the name of the notation. CSV has only the channels and no header."""
+"""Functions that write a frame, by the name of the notation. The CSV contains only the channels and has no header."""
 
 
 def encode_text(frame: Frame, notation: str) -> bytes:
-    """Return a frame as a line of text, or as several lines for Teleplot. Numbers have seven digits.
+    """Write a frame as a line of text, or as several lines for Teleplot.
+
+    The values of the channels are written with seven significant digits.
 
     Args:
-        frame: The frame.
+        frame: Frame to write.
         notation: A key of `TEXT_FORMATS`.
     """
     return (TEXT_FORMATS[notation](frame) + "\n").encode()

@@ -1,4 +1,8 @@
-"""Encoder of the frames that the board of a device file sends. It is the inverse of the path from frames to charges."""
+"""Encoder that converts charges to the frames that a board sends.
+
+The encoder is the inverse of the computation of charges from frames. Both computations use the settings in the device
+file of the board.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,25 +22,25 @@ from isocharge.serve.live.reading_stream import ChannelPicker, channel_number
 from isocharge.serve.signal_chain.stages import Gain
 
 BINARY = "binary"
-"""Notation of the binary frame of isocharge."""
+"""Name of the notation that is the binary frame of isocharge."""
 
 CSV = "csv"
-"""Notation of text in which channels have no names."""
+"""Name of the notation of text frames in which the channels have no names."""
 
 PAIRS = "pairs"
-"""Notation of text in which channels have names."""
+"""Name of the notation of text frames in which each channel has a name."""
 
 FRAMES_TO_RECOGNISE = 8
-"""Number of frames after which a parser has recognised the layout of the frames."""
+"""Number of frames from which every parser can recognise the layout of the frames."""
 
 
 class BoardFrames(NamedTuple):
-    """Frames that a board sends.
+    """Description of the frames that a board sends, with the function that encodes them.
 
     Attributes:
         names: Names of the channels; empty if the frames contain no names.
-        channels: Field of each channel, which determines the range of its values.
-        encode: Function from a frame, with one value for each channel, to its bytes.
+        channels: Field of each channel in a frame. The type of the field determines the range of the values.
+        encode: Function that returns the bytes of a frame. The frame must have one value for each channel.
         seq_modulus: Value at which the frame counter wraps to 0.
         t_us_modulus: Time at which the clock wraps to 0, us.
     """
@@ -51,33 +55,31 @@ class BoardFrames(NamedTuple):
 class BoardEncoder:
     """Encodes charges as the frames of the board that a device file describes.
 
-    The charge of an electrode is divided by its gain, and the offset of the board is added. The result is the value of
-    the channel that the device file assigns to the electrode. The other channels of the frame are 0. A value outside
-    the range of its field is set to the limit of the field, as in a converter, and the frame gets the flag `saturated`
-    if the frame has flags.
+    The value of a channel is the charge of its electrode divided by the gain, plus the offset of the board. The device
+    file assigns the channels to the electrodes. Channels without an electrode have the value 0. If a value is outside
+    the range of its field, it is set to the nearest limit of the range. The frame then gets the flag `saturated`,
+    provided that frames of this board have flags.
 
     Attributes:
         seq_modulus: Value at which the frame counter of the board wraps to 0.
         t_us_modulus: Time at which the clock of the board wraps to 0, us.
-        request: Request that the board answers with a frame; None for a board that sends frames by itself.
-        clipped: Number of frames with a value that was set to the limit of its field.
+        request: Request that the board answers with a frame, or None if the board sends frames without requests.
+        clipped: Number of frames in which a value was set to a limit of its range.
     """
 
     def __init__(self, device: Device, electrodes: tuple[str, ...], notation: str | None = None) -> None:
-        """Assign the electrodes to the channels, and check that a frame without charge can be encoded and read.
-
-        The two checks at the end encode frames. They therefore follow after all attributes are set.
+        """Assign the electrodes to the channels, and check that frames without charge can be encoded and read again.
 
         Args:
             device: Settings of the board.
             electrodes: Names of the electrodes, in the order of the charges.
-            notation: Notation of frames that the device file does not describe: "binary", or a notation of
-                `encode_text`. By default it is chosen so that it fits the device file.
+            notation: Notation of the frames if the device file does not describe them. It is "binary" or a notation of
+                `encode_text`. By default, a notation is chosen that fits the device file.
 
         Raises:
-            DeviceError: If the device file describes datagrams, is for other electrodes, states an offset that its
-                field cannot contain, or does not fit the notation.
-            ChargeError: If there is no channel for an electrode.
+            DeviceError: If the device file describes datagrams, contains settings for other electrodes, states an
+                offset that its field cannot contain, or does not fit the notation.
+            ChargeError: If an electrode has no channel.
         """
         self._frames = _frames_of(device, electrodes, notation)
         chain = device.chain(electrodes)
@@ -93,15 +95,20 @@ class BoardEncoder:
         self.t_us_modulus = self._frames.t_us_modulus
         self.request = device.request
         self.clipped = 0
+
+        # The second check calls `encode`, which needs all attributes.
         self._check_offsets(device.where, electrodes)
         self._check_reading(device, electrodes)
 
     def _check_offsets(self, where: str, electrodes: tuple[str, ...]) -> None:
-        """Raise DeviceError if a channel cannot contain the value that the board sends without charge.
+        """Check that each channel can contain the value that the board sends without charge.
 
         Args:
             where: Name of the device file, for messages.
-            electrodes: Names of the electrodes.
+            electrodes: Names of the electrodes, in the order of the charges.
+
+        Raises:
+            DeviceError: If a channel cannot contain its value.
         """
         no_charge_pC = np.zeros(len(electrodes))
         offsets = self._gain.revert(no_charge_pC).tolist()
@@ -114,11 +121,14 @@ class BoardEncoder:
                 )
 
     def _check_reading(self, device: Device, electrodes: tuple[str, ...]) -> None:
-        """Raise DeviceError if the parser of the device file does not read frames without charge.
+        """Check that the parser of the device file can read frames without charge.
 
         Args:
-            device: Settings of the board.
-            electrodes: Names of the electrodes.
+            device: Settings of the board, which contain the parser.
+            electrodes: Names of the electrodes, in the order of the charges.
+
+        Raises:
+            DeviceError: If the parser reads none of the frames.
         """
         parser = device.parser()
         no_charge = (0.0,) * len(electrodes)
@@ -134,13 +144,13 @@ class BoardEncoder:
             )
 
     def encode(self, frame: Frame) -> bytes:
-        """Return the bytes that the board sends for a frame whose values are charges, pC.
+        """Return the bytes that the board sends for the charges of a frame.
 
-        A value outside the range of its channel is set to the limit of the range. The frame then gets the flag
-        `saturated` and is counted in `clipped`. Channels without an electrode are 0.
+        If a value is outside the range of its channel, it is set to the nearest limit of the range. The frame then gets
+        the flag `saturated`, and `clipped` is increased by one. Channels without an electrode have the value 0.
 
         Args:
-            frame: A frame with one charge for each electrode, in the order of the electrodes.
+            frame: Frame whose values are the charges of the electrodes, pC, in the order of the electrodes.
         """
         board_values = self._gain.revert(np.array(frame.values)).tolist()
         channels = self._frames.channels
@@ -159,51 +169,50 @@ class BoardEncoder:
 
 
 def _frames_of(device: Device, electrodes: tuple[str, ...], notation: str | None) -> BoardFrames:
-    """Return the names, the fields and the encoder of the frames that the board of a device file sends.
+    """Return the description of the frames that the board of a device file sends.
 
     Args:
         device: Settings of the board.
         electrodes: Names of the electrodes.
         notation: Notation of frames whose channels the device file does not describe: "binary", or a notation of
-            `encode_text`; None for the default notation of the device file.
+            `encode_text`. If None, a notation is chosen that fits the device file.
 
     Raises:
-        DeviceError: If the device file describes datagrams, has a channel with too large a number, or does not fit the
-            notation.
+        DeviceError: If the device file describes datagrams, contains a channel number that is too large, or does not
+            fit the notation.
     """
-    # The device file describes the channels as a layout of binary fields, or as the columns of a CSV.
     frames = device.frames
-    if isinstance(frames, FrameLayout):
+    if isinstance(frames, FrameLayout):  # the device file describes the channels as binary fields
         no_notations = ()
         _check_notation(device.where, notation, no_notations)
         return _layout_frames(frames, device.where)
-    if isinstance(frames, TextFrames) and frames.columns:
+    if isinstance(frames, TextFrames) and frames.columns:  # the device file describes the channels as columns of a CSV
         _check_notation(device.where, notation, (CSV,))
         return _column_frames(frames.columns)
 
-    # The device file does not describe the channels, so that they follow from the electrodes and the notation.
-    channel_names, n_channel = _channel_names(device, electrodes)
+    # The device file does not describe the channels. They follow from the electrodes and the notation.
+    channel_names, n_channel = _used_channels(device, electrodes)
     default_notation, fitting_notations = _fitting_notations(device, has_channel_names=bool(channel_names))
     _check_notation(device.where, notation, fitting_notations)
     chosen_notation = notation or default_notation
     if chosen_notation == BINARY:
-        binary_channels = (Field("f32", BINARY),) * n_channel
-        return BoardFrames((), binary_channels, encode_frame)
+        binary_channels = (Field("f32", BINARY),) * n_channel  # the name of a field is only used in messages
+        return BoardFrames(names=(), channels=binary_channels, encode=encode_frame)
     frame_names = () if chosen_notation == CSV else channel_names
     text_channels = (Field("f64", chosen_notation),) * n_channel
     encode = partial(encode_text, notation=chosen_notation)
-    return BoardFrames(frame_names, text_channels, encode)
+    return BoardFrames(names=frame_names, channels=text_channels, encode=encode)
 
 
 def _layout_frames(layout: FrameLayout, where: str) -> BoardFrames:
-    """Return the frames of a layout of binary fields that a device file describes.
+    """Return the description of frames that have the layout of binary fields in a device file.
 
     Args:
-        layout: The layout.
+        layout: Layout of the binary fields, as the device file describes it.
         where: Name of the device file, for messages.
 
     Raises:
-        DeviceError: If the frames are datagrams.
+        DeviceError: If the frames are sent as datagrams.
     """
     if layout.framing == DATAGRAM:
         raise DeviceError(
@@ -215,26 +224,30 @@ def _layout_frames(layout: FrameLayout, where: str) -> BoardFrames:
 
 
 def _column_frames(columns: tuple[str, ...]) -> BoardFrames:
-    """Return the frames of a CSV. Its columns contain the frame number, clocks, and the values of the channels."""
+    """Return the description of frames that are lines of a CSV.
+
+    Args:
+        columns: Names of the columns. A column contains the frame number, a clock, or the values of a channel.
+    """
     names = tuple(name for name in columns if name not in (SEQ, *TIMES_US))
     channels = tuple(Field("f64", name) for name in names)
     return BoardFrames(names, channels, partial(_encode_row, columns))
 
 
 def _fitting_notations(device: Device, *, has_channel_names: bool) -> tuple[str, tuple[str, ...]]:
-    """Return the notations that fit a device file which does not describe the channels of the frames.
+    """Return the notations that fit a device file in which the channels of the frames are not described.
 
     Args:
         device: Settings of the board.
-        has_channel_names: Whether the channels of the electrodes have names, and not only numbers.
+        has_channel_names: Whether the channels have names. False if they only have numbers.
 
     Returns:
-        The default notation, and all notations that fit.
+        The default notation, and a tuple of all notations that fit the device file.
     """
     if isinstance(device.frames, BinaryFrames):
         return BINARY, (BINARY,)
     if isinstance(device.frames, AutoFrames):
-        # Binary frames contain no names, so that they do not fit a section [channels] that refers to names.
+        # Binary frames contain no names. They therefore do not fit a section [channels] that contains names.
         default = PAIRS if device.channels and has_channel_names else BINARY
         return default, (BINARY, *TEXT_FORMATS)
     default = PAIRS if has_channel_names else CSV
@@ -242,12 +255,16 @@ def _fitting_notations(device: Device, *, has_channel_names: bool) -> tuple[str,
 
 
 def _check_notation(where: str, notation: str | None, fitting_notations: tuple[str, ...]) -> None:
-    """Raise DeviceError if a notation is given that does not fit the device file.
+    """Check that the given notation, if there is one, fits the device file.
 
     Args:
         where: Name of the device file, for messages.
-        notation: The notation; None if none is given.
-        fitting_notations: Notations that fit the device file; empty if the device file describes the frames.
+        notation: The given notation, or None if no notation is given.
+        fitting_notations: Notations that fit the device file. The tuple is empty if the device file describes the
+            frames, so that a notation must not be given.
+
+    Raises:
+        DeviceError: If the given notation does not fit the device file.
     """
     if notation is None or notation in fitting_notations:
         return
@@ -259,26 +276,26 @@ def _check_notation(where: str, notation: str | None, fitting_notations: tuple[s
     raise DeviceError(f"{where}: frames: expected {expected}, got {notation}")
 
 
-def _channel_names(device: Device, electrodes: tuple[str, ...]) -> tuple[tuple[str, ...], int]:
-    """Return the names and the number of the channels that the electrodes of a device file use.
+def _used_channels(device: Device, electrodes: tuple[str, ...]) -> tuple[tuple[str, ...], int]:
+    """Return the names of the channels to which electrodes are assigned, and the number of channels in a frame.
 
-    The names are empty if the device file states only the numbers of the channels. An electrode that the device file
-    does not assign to a channel uses the channel with the name of the electrode.
+    If the device file assigns no channel to an electrode, the electrode uses the channel with its own name. If the
+    device file contains only numbers of channels, the tuple of names is empty.
 
     Args:
         device: Settings of the board.
         electrodes: Names of the electrodes.
 
     Raises:
-        DeviceError: If the number of a channel is larger than the number of values in a frame can be.
+        DeviceError: If the number of a channel is larger than the largest possible number of values in a frame.
     """
-    name_of_electrode = [device.channels.get(electrode, electrode) for electrode in electrodes]
-    names = tuple(dict.fromkeys(name_of_electrode))  # each channel once
+    assigned_names = [device.channels.get(electrode, electrode) for electrode in electrodes]
+    names = tuple(dict.fromkeys(assigned_names))  # each name once, because two electrodes may use the same channel
     numbers = [channel_number(name) for name in names]  # None for a name that is not a number
     if None in numbers:
         return names, len(names)
 
-    # Channels with numbers have no gaps: a frame contains all channels up to the largest number.
+    # All channels have numbers. A frame contains all channels up to the largest number, and one for each electrode.
     used_numbers = [number for number in numbers if number is not None]
     n_channel = max(len(electrodes), *used_numbers)
     if n_channel > MAX_CHARGES:
@@ -287,11 +304,12 @@ def _channel_names(device: Device, electrodes: tuple[str, ...]) -> tuple[tuple[s
 
 
 def _encode_row(columns: tuple[str, ...], frame: Frame) -> bytes:
-    """Return a frame as a line of a CSV.
+    """Return the line of a CSV that contains a frame.
 
     Args:
-        columns: Names of the columns, in their order: `seq`, clocks (`t_us`, `t_ms` or `t_s`) and channels.
-        frame: The frame, with a value for each channel. A frame without a time has the time 0.
+        columns: Names of the columns in their order. A column contains the frame number (`seq`), a clock (`t_us`,
+            `t_ms` or `t_s`), or the values of a channel.
+        frame: Frame with one value for each channel. If the frame has no time, the line contains the time 0.
     """
     value_of_channel = dict(zip(frame.names, frame.values, strict=True))
     cells = []
@@ -300,7 +318,7 @@ def _encode_row(columns: tuple[str, ...], frame: Frame) -> bytes:
             cells.append(str(frame.seq))
         elif name in TIMES_US:
             clock_unit_us = TIMES_US[name]
-            cells.append(repr((frame.t_us or 0) / clock_unit_us))
+            cells.append(repr((frame.t_us or 0) / clock_unit_us))  # `repr` writes all digits
         else:
             cells.append(f"{value_of_channel[name]:.7g}")  # seven digits, as a float32 number has
     return (",".join(cells) + "\n").encode()

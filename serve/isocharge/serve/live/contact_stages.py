@@ -1,12 +1,15 @@
-"""Stages that compute the contact of a record from a reading of the charges.
+"""Stages that compute the contact of a record from the touch charges of a frame.
 
 The stages process each frame in the following order.
 
-- `PredictionStage` predicts the contact with the model, and adds the flags of the model.
-- `FilmStage` follows the pretension of the film from touch to touch (section `[follow]` of the device file).
-- `TrackingStage` follows the contact from frame to frame (section `[track]`).
-- `ChargeScaleStage` increases the standard deviations if the scale of all charges is uncertain (section `[memory]`).
-- `TouchOffsetStage` increases the standard deviations if touches may have a common offset (section `[touch_offset]`).
+- `PredictionStage` predicts the contact with the model, and adds flags if the contact is not valid.
+- `FilmStage` estimates how the pretension of the film changes from touch to touch (section `[follow]` of the device
+  file).
+- `TrackingStage` tracks the contact from frame to frame (section `[track]` of the device file).
+- `ChargeScaleStage` increases the standard deviations of the contact if the common scale of all charges is uncertain
+  (section `[memory]` of the device file).
+- `TouchOffsetStage` increases the standard deviations of the contact if all charges of a touch may have a common offset
+  (section `[touch_offset]` of the device file).
 """
 
 from abc import ABC, abstractmethod
@@ -26,24 +29,25 @@ from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule
 from isocharge.serve.tracking.tracker import Tracker
 
 CHARGE_SCALE_STEP = 0.01
-"""Relative change of all touch charges for the finite difference with respect to their common scale."""
+"""Relative change of all touch charges for the numerical derivative of the contact with respect to their scale."""
 
 TOUCH_OFFSET_STEP_pC = 1.0
-"""Step of the finite difference with respect to a common offset of the charges, pC."""
+"""Offset of the charges for the numerical derivative of the contact with respect to a common offset, pC."""
 
 LARGEST_FORCE_EXPONENT = 1.5
-"""Largest exponent p with which the force is proportional to the p-th power of a common scale of all charges.
+"""Largest exponent p of the law that the force is proportional to the p-th power of the common scale of all charges.
 
-A film without pretension has this exponent.
+The exponent has this value for a film without pretension, and is smaller for a film with pretension.
 """
 
 
 @dataclass(slots=True)
 class CurrentModel:
-    """The current model, which all stages share.
+    """Reference to the current model, which all stages share.
 
     Attributes:
-        predictor: The loaded model. If the film is followed, the model of the film at its estimated pretension.
+        predictor: The loaded model. If the film is followed, this is the model of the film at its estimated pretension
+            instead.
     """
 
     predictor: Predictor
@@ -51,18 +55,18 @@ class CurrentModel:
 
 @dataclass(slots=True)
 class ContactFrame:
-    """A frame of the stages. The stages change it in place.
+    """Frame that the stages process. Each stage changes the attributes of this object.
 
     Attributes:
         reading: Charges of the frame after the signal chain.
-        clock_s: Time of the frame on a clock that does not jump, s.
-        flags: Flags of `isocharge.serve.flags`.
-        contact: The contact; None if nothing touches, or the frame is invalid.
+        clock_s: Time of the frame on a monotonic clock, s.
+        flags: Flags of the frame, as in `isocharge.serve.flags`.
+        contact: The estimated contact. None if nothing touches the film, or if the frame is invalid.
         film: State of the followed film; None if the film is not followed.
         tracking: The tracked contact; None if contacts are not tracked.
         is_mixture_contact: Whether the contact comes from a `ContactMixture` and not from the model.
-        model_charge_pC: Charges for which the current model gives the contact, shape (n_electrode,), pC; None out of
-            contact. On a followed film, these charges differ from the charges of the reading.
+        model_charge_pC: Charges from which the current model predicts the contact, shape (n_electrode,), pC. None if
+            there is no contact. If the film is followed, these charges differ from the charges of the reading.
     """
 
     reading: Reading
@@ -76,32 +80,33 @@ class ContactFrame:
 
 
 class ContactStage(ABC):
-    """A stage with its settings and its state."""
+    """Base class of the stages. A stage contains its settings and its state."""
 
     @abstractmethod
     def step(self, frame: ContactFrame) -> None:
-        """Process the next frame in place."""
+        """Process the next frame by changing the attributes of `frame`."""
 
     def reset(self) -> None:  # noqa: B027  # some stages have no state
-        """Discard the present contact, as after an outage or a new tare."""
+        """Discard the state of the present contact, for example after an outage or when a new tare is measured."""
 
 
 class PredictionStage(ContactStage):
-    """Predicts the contact with the current model."""
+    """Stage that predicts the contact of each frame with the current model."""
 
     def __init__(self, model: CurrentModel) -> None:
-        """Set the model.
+        """Store the model, and the limits within which its contacts are valid.
 
         Args:
-            model: The current model. Its predictor may change later, but the limits of the flags do not.
+            model: The current model. Its predictor may be replaced later. The limits of valid contacts then stay the
+                same.
         """
         self._model = model
         self._validity = model.predictor.validity
 
     def step(self, frame: ContactFrame) -> None:
-        """Predict the contact of a frame in which something touches, and add its flags.
+        """Predict the contact of a frame, and add the flags of this contact to the frame.
 
-        A frame out of contact, or with the flag `invalid`, remains without a contact.
+        If nothing touches the film, or if the frame has the flag `invalid`, the frame gets no contact.
         """
         reading = frame.reading
         if INVALID in reading.flags or not reading.contact or reading.charge_pC is None:
@@ -112,68 +117,71 @@ class PredictionStage(ContactStage):
 
 
 class FilmStage(ContactStage):
-    """Follows the pretension of the film, and changes the current model accordingly.
+    """Stage that estimates the pretension of the film, and replaces the current model by the model for this pretension.
 
     Attributes:
-        follower: The follower of the film.
+        follower: Object that estimates the pretension.
     """
 
     def __init__(self, model: CurrentModel, rule: FollowRule, warming_ratio: Array | float) -> None:
-        """Begin with the film as it was calibrated.
+        """Begin with the pretension that the calibration of the film has found.
 
         Args:
-            model: The current model.
-            rule: Settings.
-            warming_ratio: Charge that warming adds to each electrode, relative to the mean over all electrodes, shape
-                (n_electrode,).
+            model: The current model, whose predictor this stage replaces.
+            rule: Settings of the estimation, which are the section `[follow]` of the device file.
+            warming_ratio: Charge that warming adds to each electrode, relative to the mean magnitude over all
+                electrodes, shape (n_electrode,), or one number for all electrodes.
 
         Raises:
-            ModelError: If the film of the model cannot be followed.
+            ModelError: If the pretension of this film cannot be estimated with the model.
         """
         self._model = model
         self.follower = FilmFollower(model.predictor, rule, warming_ratio)
 
     def step(self, frame: ContactFrame) -> None:
-        """Correct the contact for the estimated film, and then update the estimate of the film with the frame.
+        """Correct the contact for the estimated pretension, and then update this estimate with the frame.
 
-        If the film is lost, which means that it cannot be followed, the contact gets the flag `film`. The updated model
-        is used from the next frame on.
+        The model for the new estimate is used from the next frame on. If the pretension can no longer be estimated, a
+        frame with a contact gets the flag `film`.
         """
         charge_pC = frame.reading.charge_pC
         if frame.contact is not None and charge_pC is not None:
             frame.contact, frame.model_charge_pC = self.follower.follow_contact(frame.contact, charge_pC)
         frame.film = self.follower.film  # the estimate with which this contact was corrected
 
-        # Only after that, the estimate may change.
+        # The following call may change the estimate. It must therefore come after the two statements above.
         self.follower.observe_frame(charge_pC, frame.contact, frame.flags, frame.clock_s)
         self._model.predictor = self.follower.predictor
         if frame.contact is not None and self.follower.is_lost:
             frame.flags = (*frame.flags, FILM)
 
     def reset(self) -> None:
-        """Discard the present touch. The estimated pretension is kept."""
+        """Discard the state of the present touch. The estimated pretension is not changed."""
         self.follower.discard_touch()
 
     def reset_film(self) -> None:
-        """Return to the film as it was calibrated."""
+        """Reset the estimate of the pretension to the pretension that the calibration of the film has found."""
         self.follower.reset()
         self._model.predictor = self.follower.predictor
 
 
 class TrackingStage(ContactStage):
-    """Tracks the contact from frame to frame."""
+    """Stage that tracks the contact from frame to frame."""
 
     def __init__(self, tracker: Tracker, predictor: Predictor, *, is_film_followed: bool) -> None:
-        """Set the model of a tracker. The tracker keeps its present contact.
+        """Select how the tracker tracks contacts with this model.
 
-        On some films, several contacts cause the same charges. A mixture of Gaussian components tracks these contacts.
-        It needs the file `charges.npz` beside the model, which describes the charges of every contact.
+        The contact that is tracked at present is not discarded.
+
+        On some films, several different contacts cause the same charges. The tracker then uses a mixture of Gaussian
+        components, which represents all possible contacts. The mixture needs the file `charges.npz` in the folder of
+        the model, which describes the charges of every contact.
 
         Args:
-            tracker: The tracker with its state.
+            tracker: Tracker, whose state is used further.
             predictor: The loaded model.
-            is_film_followed: Whether the film is followed. If so, no mixture is used, because the file of charges
-                describes the calibrated film and not the current film.
+            is_film_followed: Whether the pretension of the film is estimated. If it is, no mixture is used, because the
+                file of charges describes the calibrated film instead of the current film.
 
         Raises:
             ModelError: If the file of charges of the model is damaged.
@@ -183,7 +191,7 @@ class TrackingStage(ContactStage):
             mixture = contact_mixture(predictor)  # None if the model has no such file
         self._mixture_validity = predictor.validity
         if mixture is not None:
-            # The contacts of the mixture are valid in the area for which the file describes charges.
+            # A contact of the mixture is valid in the whole area for which the file describes the charges.
             self._mixture_validity = replace(predictor.validity, corners_mm=mixture.charges.corners_mm)
         self._tracker = tracker
         self._tracker.mixture = mixture
@@ -191,8 +199,8 @@ class TrackingStage(ContactStage):
     def step(self, frame: ContactFrame) -> None:
         """Update the tracker with the contact of the frame, and add the tracked contact and its event to the frame.
 
-        If a mixture of several possible contacts tracks the touch, its most probable contact replaces the contact of
-        the model, and the flags are determined for the new contact.
+        If the tracker uses a mixture of several possible contacts, the most probable contact replaces the contact of
+        the model. The flags are then determined for the most probable contact.
         """
         tracker = self._tracker
         reading = frame.reading
@@ -213,12 +221,12 @@ class TrackingStage(ContactStage):
 
 
 def _add_error(frame: ContactFrame, contact: Contact, shift: tuple[float, float, float]) -> None:
-    """Include an error in the standard deviations of two contacts: the contact of a frame, and the tracked contact.
+    """Include an error in the standard deviations of the contact of a frame and of the tracked contact.
 
     Args:
         frame: The frame, which is changed.
         contact: The contact of the frame.
-        shift: Changes of x and y, mm, and of the force, N, that one standard deviation of the error causes.
+        shift: Changes of x, mm, of y, mm, and of the force, N, that an error of one standard deviation causes.
     """
     frame.contact = contact.widened(shift)
     if frame.tracking is not None and frame.tracking.tracked is not None:
@@ -226,13 +234,13 @@ def _add_error(frame: ContactFrame, contact: Contact, shift: tuple[float, float,
 
 
 class ChargeScaleStage(ContactStage):
-    """Increases the standard deviations of a contact if the common scale of all charges is uncertain.
+    """Stage that increases the standard deviations of a contact if the common scale of all charges is uncertain.
 
     The scale is uncertain if the memory of the film is not known exactly.
     """
 
     def __init__(self, model: CurrentModel) -> None:
-        """Begin without a sensitivity.
+        """Create the stage. The sensitivity of the contact is computed when the first contact is processed.
 
         Args:
             model: The current model, with which the sensitivity of the contact is computed.
@@ -241,7 +249,7 @@ class ChargeScaleStage(ContactStage):
         self.reset()
 
     def step(self, frame: ContactFrame) -> None:
-        """Add the error of the common scale to the standard deviations of the contact and of the tracked contact."""
+        """Include the error of the common scale in the standard deviations of the contact and the tracked contact."""
         if frame.contact is None:
             return
         shift = self._shift(frame, frame.contact)
@@ -255,18 +263,19 @@ class ChargeScaleStage(ContactStage):
         self._sensitivity_predictor = self._model.predictor
 
     def _shift(self, frame: ContactFrame, contact: Contact) -> tuple[float, float, float] | None:
-        """Return the changes of x and y (mm) and of the force (N) that one standard deviation of the scale causes.
+        """Return the change of the contact if the common scale of all charges is wrong by one standard deviation.
 
-        The changes are computed from a second prediction with slightly larger charges. This is not possible for a
-        contact of the mixture, which the model does not predict. For such a contact, only the force is assumed to
-        depend on the scale: F is proportional to scale^p with the largest exponent p, so that dF = p F d(scale).
+        The change is computed from a second prediction with slightly larger charges. A contact of the mixture is not
+        predicted by the model, so that there is no second prediction. For such a contact, only the force F is assumed
+        to depend on the scale. F is assumed to be proportional to scale^p with p = `LARGEST_FORCE_EXPONENT`. The change
+        of the force is then dF = p F d(scale).
 
         Args:
             frame: The frame.
             contact: The contact of the frame.
 
         Returns:
-            The changes; None if the scale is known exactly.
+            Changes of x, mm, of y, mm, and of the force, N. None if the scale is known exactly.
         """
         charge_scale_std = frame.reading.charge_scale_std  # relative standard deviation of the scale
         if frame.is_mixture_contact:
@@ -278,35 +287,38 @@ class ChargeScaleStage(ContactStage):
         if predictor is not self._sensitivity_predictor:  # the sensitivity was computed with another model
             self.reset()
         scaled_pC = charge_pC * (1.0 + CHARGE_SCALE_STEP)
-        # The second prediction is only made if the contact has moved since the previous one.
+        # The function that is passed makes the second prediction. It is only called if the contact has moved since the
+        # previous second prediction.
         return self._sensitivity.shift(contact, charge_scale_std, lambda: predictor.predict(scaled_pC))
 
 
 class TouchOffsetRule(Rule, frozen=True, kw_only=True):
-    """Description of an offset that all charges of a touch may have in common.
+    """Settings that describe an offset that all charges of a touch may have in common.
 
-    Examples are a triboelectric and a pyroelectric charge.
+    Such an offset can be a triboelectric charge or a pyroelectric charge.
 
     Attributes:
-        std_pC: Standard deviation of the offset, pC. The offset is constant within a touch, and its mean is 0.
+        std_pC: Standard deviation of the offset, pC. The offset is constant during a touch, and its mean over many
+            touches is 0.
     """
 
     std_pC: Setting = 5.0
 
 
 class TouchOffsetStage(ContactStage):
-    """Increases the standard deviations of a contact, because the charges of its touch may have a common offset.
+    """Stage that increases the standard deviations of a contact if all charges of its touch may have a common offset.
 
-    An offset shifts light presses more than strong presses. The standard deviations of a contact of the mixture are not
-    changed. The sensitivity is computed with the model, and the model does not predict this contact.
+    A common offset changes the contact of a light press more than the contact of a strong press. If the contact comes
+    from the mixture of the tracker, its standard deviations are not changed. The effect of an offset on such a contact
+    is not known, because the model does not predict this contact.
     """
 
     def __init__(self, model: CurrentModel, rule: TouchOffsetRule, warming_ratio: Array | float) -> None:
-        """Begin without a sensitivity.
+        """Create the stage. The sensitivity of the contact is computed when the first contact is processed.
 
         Args:
             model: The current model, with which the sensitivity of the contact is computed.
-            rule: Settings.
+            rule: Settings that describe the offset.
             warming_ratio: Charge that the offset adds to each electrode, relative to the common offset, shape
                 (n_electrode,), or one number for all electrodes.
         """
@@ -316,10 +328,10 @@ class TouchOffsetStage(ContactStage):
         self.reset()
 
     def step(self, frame: ContactFrame) -> None:
-        """Add the error of the common offset to the standard deviations of the contact and of the tracked contact.
+        """Include the error of a common offset in the standard deviations of the contact and the tracked contact.
 
-        The error is computed from a second prediction with charges that are shifted by an offset. A contact of the
-        mixture is not changed, because the model does not predict it.
+        The error is computed from a second prediction, in which an offset is added to the charges. A contact of the
+        mixture is not changed, because the model does not predict such a contact.
         """
         charge_pC = frame.model_charge_pC
         contact = frame.contact
@@ -329,7 +341,8 @@ class TouchOffsetStage(ContactStage):
         if predictor is not self._sensitivity_predictor:  # the sensitivity was computed with another model
             self.reset()
         shifted_pC = charge_pC + TOUCH_OFFSET_STEP_pC * self._warming_ratio
-        # The second prediction is only made if the contact has moved since the previous one.
+        # The function that is passed makes the second prediction. It is only called if the contact has moved since the
+        # previous second prediction.
         shift = self._sensitivity.shift(contact, self._rule.std_pC, lambda: predictor.predict(shifted_pC))
         _add_error(frame, contact, shift)
 

@@ -1,4 +1,4 @@
-"""The device file: the settings of a board and its amplifiers, in TOML.
+"""Device file, which contains the settings of a board and its amplifiers in TOML.
 
     name = "bench board 3"         # optional
 
@@ -22,10 +22,12 @@
     [leak]
     tau_s = {A = 10.0, B = 10.2, C = 9.9}
 
-The sections `[hum]`, `[tare]`, `[leak]`, `[memory]`, `[touch]` and `[common_mode]` contain the settings of the rules in
-`isocharge.serve.signal_chain`, and `[track]` and `[follow]` those of the rules in `isocharge.serve.tracking`. The
-section `[touch_offset]` contains the settings of `TouchOffsetRule`. The key `on = false` switches the stage of a
-section off. Tare and touch are switched on without a section. An unknown key is an error.
+The sections `[hum]`, `[tare]`, `[leak]`, `[memory]`, `[touch]` and `[common_mode]` contain the settings of the signal
+chain. The classes of these settings are in `isocharge.serve.signal_chain`. The sections `[track]` and `[follow]`
+contain the settings of the tracking. The classes of these settings are in `isocharge.serve.tracking`. The section
+`[touch_offset]` contains the settings of `TouchOffsetRule`. The key `on = false` in a section switches off the stage of
+this section. If the file has no section `[tare]` or `[touch]`, the stage is switched on and has its default settings.
+An unknown key causes an error.
 """
 
 from collections.abc import Mapping
@@ -54,17 +56,22 @@ from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.tracker import TrackRule
 
 MIN_ELECTRODES_FOR_WARMING = 4
-"""Smallest number of electrodes with which warming can be distinguished from force. A contact has three unknowns."""
+"""Smallest number of electrodes with which warming can be distinguished from force.
+
+A contact has three unknowns, and warming is a fourth unknown.
+"""
 
 
 class Gain(Rule, frozen=True, kw_only=True):
-    """Conversion of the unit of a board to charge. Each setting is one number, or one number for each electrode.
+    """Settings that convert the unit of a board to charge.
+
+    Each setting is either one number for all electrodes, or one number for each electrode.
 
     Attributes:
         pC_per_unit: Charge of one unit, pC.
-        V_per_unit: Voltage of one unit, V; an alternative to `pC_per_unit` that requires `feedback_pF`.
-        feedback_pF: Feedback capacitance of the amplifiers, pF. It is the charge in pC that causes 1 V.
-        offset: Value of the board without charge, in its unit.
+        V_per_unit: Voltage of one unit, V. It can be given together with `feedback_pF` instead of `pC_per_unit`.
+        feedback_pF: Feedback capacitance of the amplifiers, pF. Its value is the charge, in pC, for an output of 1 V.
+        offset: Value that the board sends without charge, in the unit of the board.
     """
 
     pC_per_unit: Finite | dict[str, Finite] | None = None
@@ -73,10 +80,12 @@ class Gain(Rule, frozen=True, kw_only=True):
     offset: Finite | dict[str, Finite] | None = None
 
     def __post_init__(self) -> None:
-        """Check that the section has either `pC_per_unit`, or `V_per_unit` and `feedback_pF`, and that no gain is 0.
+        """Check that the gain is given in exactly one form, and that it is not 0.
+
+        The section must contain either `pC_per_unit`, or both `V_per_unit` and `feedback_pF`.
 
         Raises:
-            WrongKey: For the first key that is missing or wrong.
+            WrongKey: If a key is missing or wrong. The error names the first such key.
         """
         has_voltage = self.V_per_unit is not None
         has_capacitance = self.feedback_pF is not None
@@ -89,9 +98,8 @@ class Gain(Rule, frozen=True, kw_only=True):
         if has_voltage and not has_capacitance:
             raise WrongKey("feedback_pF")
 
-        # `per_unit` is the setting that is given: V_per_unit or pC_per_unit.
         if self.per_unit is None:
-            raise WrongKey("pC_per_unit")
+            raise WrongKey("pC_per_unit")  # the section contains neither form
         numbers = self.per_unit.values() if isinstance(self.per_unit, dict) else [self.per_unit]
         if 0.0 in numbers:
             key = "V_per_unit" if has_voltage else "pC_per_unit"
@@ -99,18 +107,20 @@ class Gain(Rule, frozen=True, kw_only=True):
 
     @property
     def per_unit(self) -> float | dict[str, float] | None:
-        """Charge of one unit, pC, or its voltage, V, if there is a feedback capacitance."""
+        """Voltage of one unit, V, if the section contains `V_per_unit`, and otherwise the charge of one unit, pC."""
         return self.pC_per_unit if self.V_per_unit is None else self.V_per_unit
 
     def charge_pC(self, electrode: str, values: Array) -> Array:
-        """Convert values of one electrode to charges. A setting that is missing has no effect.
+        """Convert values of one electrode to charges.
+
+        A missing offset counts as 0, and a missing factor counts as 1.
 
         Args:
             electrode: Name of the electrode.
             values: Values in the unit of the board, of any shape.
 
         Returns:
-            The charges, in the same shape, pC.
+            The charges, pC, with the same shape as `values`.
         """
         per_unit = _setting_of(self.per_unit, electrode, default=1.0)
         feedback_pF = _setting_of(self.feedback_pF, electrode, default=1.0)
@@ -119,12 +129,13 @@ class Gain(Rule, frozen=True, kw_only=True):
 
 
 def _setting_of(setting: float | Mapping[str, float] | None, electrode: str, default: float) -> float:
-    """Return the value of a setting for an electrode.
+    """Return the value of a setting for one electrode.
 
     Args:
-        setting: A number for all electrodes, numbers by electrode, or None if there is no such setting.
+        setting: One number for all electrodes, a dictionary of numbers by electrode name, or None if the setting is not
+            given.
         electrode: Name of the electrode.
-        default: Value that is returned if there is no setting for this electrode.
+        default: Value that is returned if the setting is not given for this electrode.
     """
     if setting is None:
         return default
@@ -134,34 +145,38 @@ def _setting_of(setting: float | Mapping[str, float] | None, electrode: str, def
 
 
 class Saturation(Rule, frozen=True, kw_only=True):
-    """Largest charge that the converter can represent, pC."""
+    """Section `[saturation]` of a device file.
+
+    Attributes:
+        limit_pC: Largest charge that the converter can represent, pC.
+    """
 
     limit_pC: Setting
 
 
 class LeakSection(LeakRule, frozen=True, kw_only=True):
-    """Leak of the charge amplifiers.
+    """Section `[leak]` of a device file, which describes the leak of the charge amplifiers.
 
     Attributes:
-        tau_s: Time constant of the amplifiers, s: one number, or one number for each electrode.
+        tau_s: Time constant of the amplifiers, s, as one number for all electrodes or one number for each electrode.
     """
 
     tau_s: Positive | dict[str, Positive]
 
 
 class CommonMode(ThermalRule, frozen=True, kw_only=True):
-    """Estimation of the warming of the film.
+    """Section `[common_mode]` of a device file, which contains the settings for estimating the warming of the film.
 
     Attributes:
-        pC_per_K: Charge of each electrode when the film warms, pC/K. Only the ratios and the signs matter. None if all
-            electrodes are alike.
+        pC_per_K: Charge of each electrode if the film warms by 1 K, pC/K. Only the ratios and the signs are used. None
+            if all electrodes collect the same charge.
     """
 
     pC_per_K: dict[str, Finite] | None = None
 
 
 class DeviceSections(Settings, frozen=True):
-    """The content of a device file."""
+    """Content of a device file. Each attribute other than the name is a section or a table of the file."""
 
     name: str = "unnamed board"
     frames: Frames = AutoFrames()
@@ -180,10 +195,12 @@ class DeviceSections(Settings, frozen=True):
 
 
 class Device(DeviceSections, frozen=True):
-    """The settings of a board. The other attributes are the sections of its file; None if a section is switched off.
+    """Settings of a board, which come from its device file.
+
+    The inherited attributes are the sections of the file. A section that is switched off is None.
 
     Attributes:
-        table: Unchanged content of the device file, which is stored in recordings.
+        table: Content of the device file without any conversion, which is stored in recordings.
         where: Name of the file, for messages.
     """
 
@@ -192,26 +209,27 @@ class Device(DeviceSections, frozen=True):
 
     @property
     def request(self) -> Request | None:
-        """Request after which the board sends a frame; None if the board sends frames by itself."""
+        """Request that the board answers with a frame, or None if the board sends frames without requests."""
         if self.frames.request is None:
             return None
         return Request(bytes.fromhex(self.frames.request), self.frames.request_Hz, self.frames.echo)
 
     def parser(self) -> Parser:
-        """Return a new parser for the frames of the board."""
+        """Return a new parser that reads the frames of the board."""
         return self.frames.parser()
 
     def chain(self, electrodes: tuple[str, ...]) -> Chain:
-        """Return the settings of the signal chain, with one value for each electrode where the electrodes may differ.
+        """Return the settings of the signal chain for a sensor with these electrodes.
 
-        A section that the device file does not have leaves its settings at None, except for [leak], which then has its
-        defaults.
+        If the device file does not contain a section, the settings of this section are None. The attribute `leak` is an
+        exception, because it then contains the default settings.
 
         Args:
             electrodes: Names of the electrodes of the model, in the order of the charges.
 
         Raises:
-            DeviceError: If a setting is for other electrodes, or there are too few electrodes to estimate warming.
+            DeviceError: If a setting contains other electrodes, or if warming must be estimated with too few
+                electrodes.
         """
         if self.common_mode is not None and len(electrodes) < MIN_ELECTRODES_FOR_WARMING:
             raise DeviceError(
@@ -219,10 +237,10 @@ class Device(DeviceSections, frozen=True):
                 "every set of charges fits some contact, and warming cannot be separated from force: remove the section"
             )
         gain_pC = None
-        zero = None
+        offset = None
         if self.gain is not None:
             gain_pC = self._gain_pC(self.gain, electrodes)
-            zero = self._for_each_electrode("gain.offset", self.gain.offset, electrodes)
+            offset = self._for_each_electrode("gain.offset", self.gain.offset, electrodes)
         limit_pC = None
         if self.saturation is not None:
             limit_pC = self.saturation.limit_pC
@@ -231,7 +249,7 @@ class Device(DeviceSections, frozen=True):
             tau_s = self._for_each_electrode("leak.tau_s", self.leak.tau_s, electrodes)
         return Chain(
             gain_pC=gain_pC,
-            zero=zero,
+            zero=offset,
             limit_pC=limit_pC,
             hum=self.hum,
             tare=self.tare,
@@ -240,21 +258,21 @@ class Device(DeviceSections, frozen=True):
             memory=self.memory,
             touch=self.touch,
             thermal=self.common_mode,
-            pyro=self._warming_ratio(electrodes),
+            warming_ratios=self._warming_ratio(electrodes),
         )
 
     def _warming_ratio(self, electrodes: tuple[str, ...]) -> Array | float:
-        """Return the response of each electrode to a warming of the film, relative to the mean of all electrodes.
+        """Return the charge of each electrode if the film warms, relative to the mean magnitude over all electrodes.
 
         Args:
-            electrodes: Names of the electrodes.
+            electrodes: Names of the electrodes, in the order of the charges.
 
         Returns:
-            Ratio of the charge of each electrode to the mean magnitude, shape (n_electrode,), dimensionless; 1 if the
-            device file does not state the charges.
+            Ratio of the charge of each electrode to the mean magnitude, shape (n_electrode,), dimensionless. The number
+            1.0 if the device file does not contain the key `pC_per_K`.
 
         Raises:
-            DeviceError: If all charges are 0, or the setting is for other electrodes.
+            DeviceError: If the charges of all electrodes are 0, or if the setting contains other electrodes.
         """
         # The section [common_mode] states the charge that each electrode collects if the film warms by 1 K.
         setting = None if self.common_mode is None else self.common_mode.pC_per_K
@@ -267,40 +285,46 @@ class Device(DeviceSections, frozen=True):
         return charge_pC_per_K / mean_magnitude
 
     def check_gain(self, electrodes: tuple[str, ...]) -> None:
-        """Raise DeviceError if the gain is for other electrodes."""
+        """Check that the section `[gain]`, if there is one, contains numbers for exactly these electrodes.
+
+        Raises:
+            DeviceError: If the section contains numbers for other electrodes.
+        """
         if self.gain is not None:
             self._gain_pC(self.gain, electrodes)
 
     def _gain_pC(self, gain: Gain, electrodes: tuple[str, ...]) -> Array | None:
-        """Return the charge of one unit of the board with its sign, shape (n_electrode,), pC.
+        """Return the charge of one unit of the board for each electrode.
 
         Args:
             gain: Section `[gain]` of the device file.
             electrodes: Names of the electrodes.
 
         Returns:
-            The charges; None if the section states no charge, so that one unit is 1 pC.
+            Charge of one unit with its sign, shape (n_electrode,), pC. None if the section does not state the charge of
+            one unit.
         """
         if gain.V_per_unit is None:
             return self._for_each_electrode("gain.pC_per_unit", gain.pC_per_unit, electrodes)
         V_per_unit = self._for_each_electrode("gain.V_per_unit", gain.V_per_unit, electrodes)
         feedback_pF = self._for_each_electrode("gain.feedback_pF", gain.feedback_pF, electrodes)
-        if V_per_unit is None or feedback_pF is None:
+        if V_per_unit is None or feedback_pF is None:  # never, because `Gain` checks that both are given
             return None
         return V_per_unit * feedback_pF  # V times pF is pC
 
     def _for_each_electrode(
         self, key: str, setting: float | Mapping[str, float] | None, electrodes: tuple[str, ...]
     ) -> Array | None:
-        """Return the value of a setting for each electrode, shape (n_electrode,); None if there is no setting.
+        """Return the value of a setting for each electrode, shape (n_electrode,), or None if the setting is not given.
 
         Args:
             key: Section and key of the setting, for messages.
-            setting: A number for all electrodes, or a number for each electrode.
+            setting: One number for all electrodes, a dictionary of numbers by electrode name, or None if the setting is
+                not given.
             electrodes: Names of the electrodes.
 
         Raises:
-            DeviceError: If the setting is for other electrodes.
+            DeviceError: If the dictionary contains other electrodes.
         """
         if setting is None:
             return None
@@ -313,11 +337,11 @@ class Device(DeviceSections, frozen=True):
 
 
 ANY_BOARD = Device(name="any board")
-"""A board without a device file."""
+"""Settings of a board that has no device file."""
 
 
 def load_device(path: str | Path | None) -> Device:
-    """Read a device file; return `ANY_BOARD` if the path is None.
+    """Read a device file and return its settings, or return `ANY_BOARD` if the path is None.
 
     Raises:
         DeviceError: If the file cannot be read, or a key is unknown, missing or wrong.
@@ -328,12 +352,13 @@ def load_device(path: str | Path | None) -> Device:
 
 
 def device_from_table(table: Mapping[str, Any], where: str) -> Device:
-    """Convert the content of a device file to settings.
+    """Convert the content of a device file to the settings of a board.
 
-    The format of the frames is `auto` by default. A section that is switched off counts as absent.
+    If the section `[frames]` has no key `format`, the format of the frames is `auto`. A section that is switched off is
+    treated as if it were missing.
 
     Args:
-        table: Sections and keys as in the description of this module.
+        table: Sections and keys of the file, as the docstring of this module describes them.
         where: Name of the file, for messages.
 
     Raises:
@@ -353,17 +378,17 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
 
 
 def with_settings(device: Device, section: str, **settings: Any) -> Device:
-    """Return the settings of a board with changes in one section.
+    """Return a copy of the settings of a board in which one section is changed.
 
-    The table that recordings store contains the same changes.
+    The attribute `table` of the copy, which is stored in recordings, contains the same changes.
 
     Args:
-        device: The settings of the board.
-        section: Name of the section.
-        settings: New values of keys of the section.
+        device: The settings of the board, which are not changed.
+        section: Name of the section that is changed.
+        settings: New values by the names of their keys. The other keys of the section keep their values.
 
     Raises:
-        DeviceError: If a setting is out of its range.
+        DeviceError: If a key is unknown, or a value is out of its range.
     """
     changed = {**device.table.get(section, {}), **settings}
     return device_from_table({**device.table, section: changed}, device.where)

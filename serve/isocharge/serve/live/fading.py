@@ -1,14 +1,18 @@
-"""Cause of a decrease of the charges of a held press: a leak of the amplifier, or creep of the film.
+"""Determination of the reason why the charges of a held press decrease.
 
-A leak removes the same share of the charge in every second. Creep removes the same share in every decade of time. Let t
-be the time since the touch. With a leak, ln Q = a - t / tau is a straight line over t. With creep, ln Q = a + b ln t is
-a straight line over ln t. Both lines are fitted to the charges of a press. A law is only reported if the squared
-residuals of the other law are at least `MIN_RESIDUAL_RATIO` times as large. A third law is creep with a thermoelastic
-step (see `isocharge.serve.signal_chain.memory`). This law is reported if the squared residuals of both lines are at
-least `MIN_RESIDUAL_RATIO` times as large.
+The cause is either a leak of the amplifiers or creep of the film. A leak removes the same share of the charge in every
+second. With a leak, the logarithm of the charge Q is a linear function of the time t since the touch, namely ln Q = a -
+t / tau. Creep removes the same share of the charge in every decade of time. With creep, the logarithm of the charge is
+a linear function of ln t, namely ln Q = a + b ln t. Both straight lines are fitted to the charges of a press. One of
+the two causes is only reported if the sum of the squared residuals of the other line is at least `MIN_RESIDUAL_RATIO`
+times as large.
 
-The section [leak] of a device file corrects a leak, and the section [memory] corrects creep. If [leak] is used for
-creep, the error grows with time.
+A third possible cause is creep together with a thermoelastic step (see `isocharge.serve.signal_chain.memory`). This
+third cause is reported if the sum of the squared residuals of each straight line is at least `MIN_RESIDUAL_RATIO` times
+as large as that of the third law.
+
+The section [leak] of a device file corrects a leak, and the section [memory] corrects creep. If the section [leak] is
+used to correct creep, the error of the charges increases with time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,30 +24,32 @@ from isocharge.common.arrays import Array
 from isocharge.serve.signal_chain.memory import MAX_CREEP, MemoryRule
 
 MIN_RESIDUAL_RATIO = 9.0
-"""Smallest ratio of the squared residuals of two laws with which the better law is reported.
+"""Smallest ratio of the sums of the squared residuals of two laws for which the better law is reported.
 
-With a smaller ratio, the variations of the force of a hand could determine the result.
+With a smaller ratio, variations in the force of a hand could decide which law is reported.
 """
 
 MIN_WINDOWS = 5
-"""Smallest number of charges of a press that are compared."""
+"""Smallest number of windows of a press to which the laws are fitted."""
 
 UNDECIDED = (
     "or the amplifier leaks or the film creeps, which cannot be told apart yet: hold a press for several seconds, and "
     "set no [leak] before"
 )
-"""Advice if neither law fits clearly better; the end of a sentence."""
+"""Advice to the user if no law fits clearly better than the others. The text is the end of a sentence."""
 
 
 class Fading(NamedTuple):
-    """The law by which the charges of a press decrease.
+    """Law that describes how the charges of a held press decrease.
 
-    All values have their defaults if no law fits clearly better than the others.
+    If no law fits clearly better than the others, all attributes have their default values.
 
     Attributes:
-        tau_s: Time constant of a leak, s.
-        creep: Share of the charge that creep removes in each decade of time, dimensionless.
-        thermoelastic: Share by which the charge is larger at the beginning of the touch, dimensionless.
+        tau_s: Time constant of the leak, s; None if the cause is not a leak.
+        creep: Share of the charge that creep removes in each decade of time, dimensionless; None if the cause is not
+            creep.
+        thermoelastic: Share by which the thermoelastic step increases the charge at the beginning of the touch,
+            dimensionless.
     """
 
     tau_s: float | None = None
@@ -52,16 +58,16 @@ class Fading(NamedTuple):
 
     @property
     def sections(self) -> dict[str, dict[str, float]]:
-        """Sections of a device file that correct the decrease, with values of two digits.
+        """Sections of a device file that correct the decrease, with values rounded to two digits.
 
-        The section [leak] corrects a leak with the time constant `tau_s`. The section [memory] corrects creep. The
-        result is empty if no section corrects the decrease.
+        The section [leak] corrects a leak, and the section [memory] corrects creep. If no section can correct the
+        decrease, the dictionary is empty.
         """
         if self.tau_s is not None:
             return {"leak": {"tau_s": _two_digits(self.tau_s)}}
         if self.creep is None:
             return {}
-        if self.creep >= MAX_CREEP:  # the section [memory] refuses so large a creep
+        if self.creep >= MAX_CREEP:  # the section [memory] does not accept such a large creep
             return {}
         settings = {"creep": _two_digits(self.creep)}
         if self.thermoelastic:
@@ -70,19 +76,22 @@ class Fading(NamedTuple):
 
     @property
     def settings(self) -> str:
-        """The sections as the user writes them, such as `[leak] tau_s = 10`; empty if there are none."""
+        """Text of `sections` as the user writes it into a device file, such as `[leak] tau_s = 10`.
+
+        The text is empty if there are no sections.
+        """
         return " ".join(section_text(name, section) for name, section in self.sections.items())
 
     @property
     def creep_remedy(self) -> str:
-        """Advice to the user on how to deal with creep, as a part of a sentence."""
+        """Advice to the user on how to reduce the error that creep causes, as a part of a sentence."""
         if not self.settings:
             return "wait longer before each reading"
         return f"wait longer before each reading, or put {self.settings} into a device file"
 
 
 def section_text(name: str, section: Mapping[str, float]) -> str:
-    """Return a section of a device file in one line, such as `[leak] tau_s = 10`."""
+    """Return the text of a section of a device file in one line, such as `[leak] tau_s = 10`."""
     assignments = ", ".join(f"{key} = {value:g}" for key, value in section.items())
     return f"[{name}] {assignments}"
 
@@ -93,7 +102,7 @@ def _two_digits(value: float) -> float:
 
 
 class LineFit(NamedTuple):
-    """A straight line that was fitted to points.
+    """Straight line that was fitted to points by least squares.
 
     Attributes:
         slope: Slope of the line.
@@ -104,36 +113,37 @@ class LineFit(NamedTuple):
     squared_residual: float
 
 
-def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
+def law_of_fading(mean_magnitudes: Sequence[tuple[float, float]]) -> Fading:
     """Determine the law by which the charges of a press with a constant force decrease.
 
-    Three laws are fitted to the mean magnitude Q of the charges, and compared by their squared residuals. With a leak,
-    ln Q falls linearly with time. With creep, ln Q falls linearly with the logarithm of time. The third law is creep
-    with a thermoelastic step, which decays exponentially.
+    Three laws are fitted to the mean magnitude Q of the charges, and their sums of squared residuals are compared. With
+    a leak, ln Q decreases linearly with time. With creep, ln Q decreases linearly with the logarithm of time. The third
+    law combines creep with a thermoelastic step that decays exponentially.
 
     Args:
-        sizes: Pairs (t, Q) of a time since the touch, s, and the mean magnitude of the charges at this time, positive,
-            pC.
+        mean_magnitudes: Pairs (t, Q). The first value is a time since the touch, s. The second value is the mean
+            magnitude of the charges at this time, pC, which must be positive.
 
     Returns:
-        The law with its parameters. The parameters have their defaults if there are too few times, if the charges do
-        not decrease, or if no law fits clearly better than the others.
+        The law with its parameters. The parameters have their default values if there are fewer than `MIN_WINDOWS`
+        pairs, if the charges do not decrease, or if no law fits clearly better than the others.
     """
-    if len(sizes) < MIN_WINDOWS:
+    if len(mean_magnitudes) < MIN_WINDOWS:
         return Fading()
-    held_s, size_pC = np.array(sizes).T
-    log_size = np.log(size_pC)
-    leak_fit = _fit_line(held_s, log_size)
-    creep_fit = _fit_line(np.log(held_s), log_size)
+    held_s, magnitude_pC = np.array(mean_magnitudes).T
+    log_magnitude = np.log(magnitude_pC)
+    leak_fit = _fit_line(held_s, log_magnitude)
+    creep_fit = _fit_line(np.log(held_s), log_magnitude)
     if max(leak_fit.slope, creep_fit.slope) >= 0.0:  # the charges do not decrease
         return Fading()
     is_leak_clearly_better = creep_fit.squared_residual > MIN_RESIDUAL_RATIO * leak_fit.squared_residual
     if is_leak_clearly_better:
         return Fading(tau_s=-1.0 / leak_fit.slope)
 
-    # Creep with a step is tested before creep alone, and is only reported if it fits clearly better than both lines.
+    # Creep with a step is tested before creep alone, because creep alone may also fit clearly better than a leak. Creep
+    # with a step has more parameters, and is only reported if it fits clearly better than both straight lines.
     max_squared_residual = min(leak_fit.squared_residual, creep_fit.squared_residual) / MIN_RESIDUAL_RATIO
-    creep_and_step = _fit_creep_and_step(held_s, size_pC, max_squared_residual)
+    creep_and_step = _fit_creep_and_step(held_s, magnitude_pC, max_squared_residual)
     if creep_and_step is not None:
         return creep_and_step
     is_creep_clearly_better = leak_fit.squared_residual > MIN_RESIDUAL_RATIO * creep_fit.squared_residual
@@ -143,44 +153,48 @@ def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
     return Fading()
 
 
-def _fit_creep_and_step(held_s: Array, size_pC: Array, max_squared_residual: float) -> Fading | None:
+def _fit_creep_and_step(held_s: Array, magnitude_pC: Array, max_squared_residual: float) -> Fading | None:
     """Fit creep with a thermoelastic step: Q = level - creep * log10(t) + step * exp(-t / warmth_s).
 
-    The time constant warmth_s, with which the film takes the temperature of the air, has its default. The three other
-    parameters are then coefficients of a linear least-squares problem. They are physical if the shares creep / level
-    and step / level lie between 0 and 1.
+    The time constant warmth_s describes how fast the film returns to the temperature of the air. It is set to its
+    default value. The parameters level, creep and step then follow from a linear least-squares fit. The fit is
+    physically possible if the ratios creep / level and step / level are between 0 and 1.
 
     Args:
         held_s: Times since the touch, shape (n,), s.
-        size_pC: Mean magnitudes of the charges, shape (n,), pC.
-        max_squared_residual: Sum of the squared residuals of ln Q above which the fit is rejected.
+        magnitude_pC: Mean magnitudes of the charges at these times, shape (n,), pC.
+        max_squared_residual: The fit is rejected unless the sum of the squared residuals of ln Q is smaller than this
+            value.
 
     Returns:
-        The law; None if the fit is rejected, or its parameters are not physical.
+        The fitted law, or None if the fit is rejected or physically impossible.
     """
     level_column = np.ones_like(held_s)
     creep_column = -np.log10(held_s)
     step_column = np.exp(-held_s / MemoryRule().warmth_s)
     design_matrix = np.column_stack([level_column, creep_column, step_column])
-    coefficients = np.linalg.lstsq(design_matrix, size_pC, rcond=None)[0]
+    coefficients = np.linalg.lstsq(design_matrix, magnitude_pC, rcond=None)[0]
     level_pC, creep_pC, step_pC = coefficients.tolist()
     fitted_pC = design_matrix @ coefficients
-    has_physical_shares = 0.0 < creep_pC < level_pC and 0.0 < step_pC < level_pC
-    if not has_physical_shares or fitted_pC.min() <= 0.0:
+    is_possible = 0.0 < creep_pC < level_pC and 0.0 < step_pC < level_pC
+    if not is_possible or fitted_pC.min() <= 0.0:  # the logarithm below needs positive values
         return None
-    squared_residual = float(np.square(np.log(size_pC / fitted_pC)).sum())
+    squared_residual = float(np.square(np.log(magnitude_pC / fitted_pC)).sum())
     if squared_residual >= max_squared_residual:
         return None
     return Fading(creep=creep_pC / level_pC, thermoelastic=step_pC / level_pC)
 
 
-def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
-    """Return the end of a sentence that states the possible cause of a decrease and gives advice to the user.
+def cause_of_fading(mean_magnitudes: Sequence[tuple[float, float]]) -> str:
+    """Return a text that states the possible cause of a decrease of the charges and gives advice to the user.
+
+    The text is the end of a sentence, which begins in the message of the caller.
 
     Args:
-        sizes: Pairs of a time since the touch, s, and the mean magnitude of the charges at this time, positive, pC.
+        mean_magnitudes: Pairs of a time since the touch, s, and the mean magnitude of the charges at this time, pC. The
+            magnitudes must be positive.
     """
-    law = law_of_fading(sizes)
+    law = law_of_fading(mean_magnitudes)
     if law.tau_s is not None:  # a leak
         return f"or the amplifier leaks: then put {law.settings} into a device file"
     if law.creep is not None:
@@ -194,7 +208,8 @@ def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
 def _fit_line(x: Array, y: Array) -> LineFit:
     """Fit a straight line to points by least squares.
 
-    The slope is sum((x - mean(x)) * (y - mean(y))) / sum((x - mean(x))^2). The line passes through the mean point.
+    The slope is sum((x - mean(x)) * (y - mean(y))) / sum((x - mean(x))^2). The line passes through the point (mean(x),
+    mean(y)).
 
     Args:
         x: First coordinates of the points, shape (n,).

@@ -1,6 +1,9 @@
-"""Path from chunks of bytes to touch charges: parser, clock, assignment of the channels, and signal chain.
+"""Computation of touch charges from chunks of bytes.
 
-The readings do not depend on a model of the film, unless the signal chain estimates warming.
+A parser finds the frames in the bytes, and a clock computes the time of each frame. The channels of the frame are then
+assigned to the electrodes, and the signal chain computes the touch charges.
+
+The touch charges do not depend on a model of the film, unless the signal chain estimates warming.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,71 +25,74 @@ from isocharge.serve.signal_chain.chain import Chain, Reading, SignalChain
 from isocharge.serve.signal_chain.thermal import Misfit
 
 MAX_CHANNEL_DIGITS = 4
-"""Largest number of digits in the number of a channel."""
+"""Largest number of digits in a text that is recognised as the number of a channel."""
 
 BYTES_TO_RECOGNISE = 8192
-"""Number of bytes without an intact frame after which an error is raised."""
+"""If a stream contains no intact frame in more than this number of bytes, an error is raised."""
 
 
 class ChannelPicker:
-    """Selects the value of each electrode from frames.
+    """Selects the values of the electrodes from the channels of a frame.
 
-    The section `[channels]` of the device file assigns a channel to each electrode, by its name or its number. Without
-    this section, channels are assigned by the names of the electrodes (`A`, `A_pC` or `charge.A`). If the channels have
-    no such names, the channels are assigned by their order. This requires as many channels as electrodes.
+    The section `[channels]` of the device file states the name or the number of the channel of each electrode. If the
+    device file has no such section, a channel with the name of an electrode belongs to this electrode. The name of the
+    channel can also contain an addition, as in `A_pC` or `charge.A`. If the channels have no such names, the channels
+    belong to the electrodes in their order. There must then be as many channels as electrodes.
     """
 
     def __init__(
         self, electrodes: tuple[str, ...], channels: Mapping[str, str], reader: str, where: str = "device file"
     ) -> None:
-        """Set the assignment.
+        """Store the assignment of the channels to the electrodes.
 
         Args:
             electrodes: Names of the electrodes, in the order of the charges.
-            channels: Name or number of the channel of each electrode; empty if the device file has no such section.
-            reader: Reader that expects these electrodes, for messages, such as "model three/1".
+            channels: Name or number of the channel by electrode name. It is empty if the device file has no section
+                `[channels]`.
+            reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
             where: Name of the device file, for messages.
         """
         self._electrodes = electrodes
         self._channels = channels
         self._reader = reader
         self._where = where
-        # Names, number of values and positions of the channels of the previous frame, which `pick` uses again.
+        # Names, number of values and positions of the channels of the previous frame. `pick` uses the positions again.
         self._names: tuple[str, ...] | None = None
         self._n_values = -1
         self._positions: tuple[int, ...] = ()
 
     def pick(self, frame: Frame) -> Array:
-        """Return the values in the order of the electrodes, shape (n_electrode,), in the unit of the device.
+        """Return the values of a frame in the order of the electrodes, shape (n_electrode,), in the unit of the device.
 
-        The positions of the channels are only looked up again if the names or the number of values have changed since
-        the previous frame.
+        If the previous frame had the same names and the same number of values, the positions of its channels are used
+        again.
 
         Raises:
-            ChargeError: If a frame has no value for an electrode.
+            ChargeError: If the frame has no value for an electrode.
         """
         if frame.names != self._names or len(frame.values) != self._n_values:
             self._positions = self.positions(frame)
             self._names = frame.names
             self._n_values = len(frame.values)
-        values = itemgetter(*self._positions)(frame.values)  # a tuple, or a single number for one electrode
+        # With several positions, `itemgetter` returns a tuple. With a single position, it returns a number.
+        values = itemgetter(*self._positions)(frame.values)
         return np.array(values, dtype=float).reshape(-1)
 
     def positions(self, frame: Frame) -> tuple[int, ...]:
-        """Return the position of each electrode's channel among the values of a frame.
+        """Return the index of each electrode's value among the values of a frame.
 
-        If the device file assigns channels to the electrodes, these channels are used. Otherwise the channels with the
-        names of the electrodes are used. If the channels have other names, they are used in their order.
+        The docstring of the class describes how the channels are assigned to the electrodes.
 
         Raises:
-            ChargeError: If the device file assigns no channels, the names differ, and the number of values is wrong.
+            ChargeError: If the frame lacks a channel that the device file names, or if the channels cannot be assigned
+                by their names or by their order.
         """
         if self._channels:
             return tuple(self._position(electrode, frame) for electrode in self._electrodes)
         position_of_electrode = {electrode_of(name): position for position, name in enumerate(frame.names)}
-        if position_of_electrode.keys() >= set(self._electrodes):
+        if position_of_electrode.keys() >= set(self._electrodes):  # every electrode has a channel with its name
             return tuple(position_of_electrode[electrode] for electrode in self._electrodes)
-        if len(frame.values) == len(self._electrodes):
+        if len(frame.values) == len(self._electrodes):  # the channels are in the order of the electrodes
             return tuple(range(len(frame.values)))
         example_keys = ", ".join(f'{electrode} = "..."' for electrode in self._electrodes)
         raise ChargeError(
@@ -96,7 +102,7 @@ class ChannelPicker:
         )
 
     def _position(self, electrode: str, frame: Frame) -> int:
-        """Return the index of the channel that the device file assigns to an electrode.
+        """Return the index of the value of one electrode among the values of a frame, as the device file assigns it.
 
         Args:
             electrode: Name of the electrode.
@@ -116,19 +122,19 @@ class ChannelPicker:
 
 
 def check_channels(device: Device, electrodes: tuple[str, ...], reader: str) -> None:
-    """Check without a frame that the device file assigns a channel to each electrode.
+    """Check that each electrode has a channel. No frame is needed for this check.
 
-    If the device file describes the layout of the frames, their channels are known, and are assigned as in a received
-    frame. Otherwise the channels are not known before the first frame. Each electrode then needs a key in the section
-    `[channels]` if there is such a section.
+    If the device file describes the layout of the frames, their channels are known. The channels are then assigned to
+    the electrodes in the same way as in a received frame. Otherwise the channels are not known before the first frame
+    arrives. If the device file has a section `[channels]`, this section must then contain a key for each electrode.
 
     Args:
         device: Settings of the board.
         electrodes: Names of the electrodes, in the order of the charges.
-        reader: Reader that expects these electrodes, for messages, such as "model three/1".
+        reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
 
     Raises:
-        ChargeError: If there is no channel for an electrode.
+        ChargeError: If an electrode has no channel.
     """
     if isinstance(device.frames, FrameLayout):
         picker = ChannelPicker(electrodes, device.channels, reader, device.where)
@@ -143,14 +149,14 @@ def check_channels(device: Device, electrodes: tuple[str, ...], reader: str) -> 
 
 
 def channel_names(frame: Frame) -> tuple[str, ...]:
-    """Return the names of the channels as in the section `[channels]`; numbers from 1 if the frames have no names."""
+    """Return the names of the channels of a frame, or their numbers from 1 as texts if the frame contains no names."""
     if frame.names:
         return frame.names
     return tuple(str(number) for number in range(1, len(frame.values) + 1))
 
 
 def position_of(name: str, frame: Frame) -> int | None:
-    """Return the position of a channel among the values of a frame; None if there is no such channel.
+    """Return the index of a channel among the values of a frame, or None if the frame has no such channel.
 
     Args:
         name: Name of the channel, or its number from 1, such as `2` or `ch2`.
@@ -165,7 +171,10 @@ def position_of(name: str, frame: Frame) -> int | None:
 
 
 def channel_number(name: str) -> int | None:
-    """Return the number of a channel, counted from 1, for a name such as `2` or `ch2`; None for any other name."""
+    """Return the number of a channel, which a name such as `2` or `ch2` contains.
+
+    The channels are counted from 1. The function returns None for every other name.
+    """
     digits = name.removeprefix("ch")
     is_number = digits.isascii() and digits.isdigit() and len(digits) <= MAX_CHANNEL_DIGITS
     if not is_number or int(digits) == 0:
@@ -174,25 +183,28 @@ def channel_number(name: str) -> int | None:
 
 
 def electrode_of(name: str) -> str:
-    """Return the name of the electrode in the name of a channel.
+    """Return the name of the electrode that is part of the name of a channel.
 
-    For example, the result is `A` for `A`, `A_pC`, `charge.A` and `charge_raw_pC.A`.
+    For example, the function returns `A` if the channel is called `A`, `A_pC`, `charge.A` or `charge_raw_pC.A`.
     """
-    return name.rpartition(".")[2].removesuffix("_pC")
+    _, _, last_part = name.rpartition(".")
+    return last_part.removesuffix("_pC")
 
 
 class TimedReading(NamedTuple):
-    """A frame after the signal chain, and its time."""
+    """Touch charges of a frame, which the signal chain has computed, and the time of the frame."""
 
     reading: Reading
     time: ReadingTime
 
 
 class ReadingStream:
-    """The path from chunks to readings. The object stores the state of the path. An object belongs to one thread.
+    """Computes touch charges from the chunks of a stream, and stores the state of this computation.
+
+    An object may only be used by one thread.
 
     Attributes:
-        parser: Parser of the frames, with its counters.
+        parser: Parser that finds the frames in the bytes and counts them.
         gaps: Counter of missing frame numbers.
         clock: Clock of the device.
     """
@@ -208,20 +220,20 @@ class ReadingStream:
         misfit: Misfit | None = None,
         reader: str = "the sensor",
     ) -> None:
-        """Connect the parts of the path.
+        """Create the parser, the counters, the clock and the signal chain.
 
         Args:
             electrodes: Names of the electrodes, in the order of the charges.
             device: Settings of the board.
-            chain: Settings of the signal chain; by default those of the device.
-            parser: Parser of the frames; by default that of the device.
-            gaps: Counter of missing frame numbers.
-            misfit: Function that returns how badly a model explains charges, in standard deviations of the noise. Only
-                a signal chain that estimates warming needs it.
-            reader: Reader that expects these electrodes, for messages, such as "model three/1".
+            chain: Settings of the signal chain. By default, the settings in the device file are used.
+            parser: Parser of the frames. By default, the parser that the device file describes is used.
+            gaps: Counter of missing frame numbers. By default, a new counter is created.
+            misfit: Function that returns how badly a model explains charges, in standard deviations of the noise. This
+                function is only needed if the signal chain estimates warming.
+            reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
 
         Raises:
-            DeviceError: If the device file has other electrodes.
+            DeviceError: If the device file contains settings for other electrodes.
         """
         self.parser = parser or device.parser()
         self.gaps = gaps or SequenceGaps()
@@ -236,19 +248,22 @@ class ReadingStream:
 
     @property
     def warming_ratio(self) -> Array | float:
-        """Charge that warming adds to each electrode, relative to the mean magnitude, shape (n_electrode,)."""
-        return self._settings.pyro
+        """Charge that warming of the film adds to each electrode, relative to the mean magnitude of these charges.
+
+        The array has the shape (n_electrode,). A single number applies to all electrodes.
+        """
+        return self._settings.warming_ratios
 
     def _new_chain(self) -> SignalChain:
-        """Return a signal chain without any state."""
+        """Return a new signal chain, which has not processed any frames."""
         return SignalChain(self._settings, len(self._electrodes), self._misfit)
 
     def tare(self) -> None:
-        """Measure the tare again from the next quiet frames."""
+        """Discard the tare, and measure it again from the next quiet frames."""
         self._chain.reset_tare()
 
     def restart(self) -> None:
-        """Return to the initial state: discard the format, the frame numbers, the clock, the tare and all counters."""
+        """Return to the initial state. The recognised format, the clock, the tare and all counters are discarded."""
         self.parser = self._device.parser()
         self.gaps = SequenceGaps()
         self.clock = DeviceClock()
@@ -256,12 +271,12 @@ class ReadingStream:
         self._pending_flags = ()
 
     def feed(self, chunk: Chunk) -> Iterator[TimedReading]:
-        """Yield the readings of the frames that end in this chunk.
+        """Process a chunk, and yield the touch charges of each frame whose last byte is in the chunk.
 
         Raises:
-            ChargeError: If a frame has another number of charges.
+            ChargeError: If a frame has no value for an electrode.
             TareError: If the film is touched during the whole search for a tare.
-            NoFramesError: If the bytes contain no frames.
+            NoFramesError: If the stream has contained no intact frame in many bytes.
         """
         frames = self.frames(chunk)
         for frame in frames:
@@ -269,7 +284,10 @@ class ReadingStream:
         self.end_chunk(frames, chunk)
 
     def frames(self, chunk: Chunk) -> list[Frame]:
-        """Return the frames that end in a chunk. If the chunk follows an outage, discard the earlier state first."""
+        """Return the frames whose last byte is in a chunk.
+
+        If the chunk follows an outage, discard the earlier state first.
+        """
         if chunk.outage_s > 0.0:
             self._reconnect()
         return self.parser.feed(chunk.data)
@@ -277,12 +295,14 @@ class ReadingStream:
     def advance(self, frame: Frame, chunk: Chunk) -> TimedReading:
         """Compute the time and the touch charges of the next frame of a chunk.
 
-        The clock of the device gives the time of the frame. The gap counter compares the number of the frame with that
-        of the previous frame. The signal chain converts the values of the electrodes to touch charges.
+        The time of the frame is computed with the clock of the device. Missing frames are counted by comparing the
+        number of the frame with the number of the previous frame. The signal chain converts the values of the
+        electrodes to touch charges.
 
         Args:
             frame: The frame.
-            chunk: The chunk. Its time of arrival is the time of frames without a device time.
+            chunk: The chunk that contains the end of the frame. A frame without a device time has the time at which
+                this chunk arrived.
 
         Returns:
             The touch charges with the flags of the frame, and the time of the frame.
@@ -304,7 +324,7 @@ class ReadingStream:
                 flags=flags,
             )
         except TareError as error:
-            # If the film rests after all, the present values are the offsets of the board.
+            # If nothing touches the film, the present values are the offsets of the board. The message states them.
             value_of_electrode = dict(zip(self._electrodes, values.tolist(), strict=True))
             offsets = ", ".join(f"{name} = {value:.10g}" for name, value in value_of_electrode.items())
             setting = "[gain] offset = {" + offsets + "}"
@@ -314,16 +334,17 @@ class ReadingStream:
         return TimedReading(reading, time_of_reading)
 
     def end_chunk(self, frames: list[Frame], chunk: Chunk) -> None:
-        """Adjust the clock to the arrival of a chunk whose frames have been processed.
+        """Finish a chunk whose frames have been processed.
 
-        If the chunk completed no frame, check that the stream has frames of a known format.
+        If the chunk contained the end of a frame, the clock of the device is adjusted to the time of arrival of the
+        chunk. Otherwise the method checks that the stream has contained intact frames.
 
         Args:
-            frames: The frames that ended in the chunk.
+            frames: The frames that `frames` returned for the chunk.
             chunk: The chunk.
 
         Raises:
-            NoFramesError: If there has been no intact frame among many bytes.
+            NoFramesError: If the stream has contained no intact frame in more than `BYTES_TO_RECOGNISE` bytes.
         """
         if frames:
             self.clock.arrived(chunk.timestamp)
@@ -331,18 +352,18 @@ class ReadingStream:
             _check_recognised(self.parser)
 
     def finish(self) -> None:
-        """End the stream, as at the end of a file.
+        """Finish the stream, for example at the end of a file.
 
         Raises:
-            NoFramesError: If there has been no intact frame.
+            NoFramesError: If the whole stream has contained no intact frame.
         """
-        _check_recognised(self.parser, max_bytes=-1)
+        _check_recognised(self.parser, max_bytes=-1)  # raises an error without a frame, even if no bytes have arrived
 
     def _reconnect(self) -> None:
         """Discard the state of the parser, the gap counter, the clock and the tare after an outage.
 
-        After an outage, frames are missing, and the film may have been touched. The next frame gets the flag
-        `reconnected`.
+        The state is not valid any more, because frames are missing and the film may have been touched during the
+        outage. The next frame gets the flag `reconnected`.
         """
         self.parser.reset()
         self.gaps.reset()
@@ -352,7 +373,11 @@ class ReadingStream:
 
 
 def _check_recognised(parser: Parser, max_bytes: int = BYTES_TO_RECOGNISE) -> None:
-    """Raise NoFramesError if more than `max_bytes` bytes have arrived without an intact frame."""
+    """Check that the stream has contained an intact frame, or at most `max_bytes` bytes.
+
+    Raises:
+        NoFramesError: If more than `max_bytes` bytes have arrived without an intact frame.
+    """
     counts = parser.counts
     if counts.frames == 0 and counts.bytes_dropped > max_bytes:
         raise NoFramesError(

@@ -1,7 +1,7 @@
-"""A touch stream whose chunks and records are written to a recording, and the replay of such a recording.
+"""Recording of the chunks and records of a touch stream, and replay of such a recording.
 
-`replay` feeds the chunks of a recording to a stream with the same settings. With the same models, the records of a
-replay are the same, bit for bit.
+The function `replay` passes the chunks of a recording to a stream that has the same settings as the recorded stream. If
+the replay also uses the same models, its records are identical to the recorded records.
 """
 
 import logging
@@ -19,132 +19,136 @@ from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import PredictionRecord
 
 Load = Callable[[], Predictor]
-"""A function that loads a model."""
+"""Function that loads a model and returns its predictor."""
 
 log = logging.getLogger(__name__)
 
 
 class RecordedStream:
-    """A touch stream that writes its chunks and records to a recording.
+    """Touch stream that writes its chunks and records to a recording.
 
-    An object belongs to one thread. Only the methods `request_...` may be called from any thread. The requests are
-    executed before the next chunk.
+    An object may only be used by one thread, except for the methods whose names begin with `request_`. Any thread may
+    call these methods. A request is executed before the next chunk is processed.
 
     Attributes:
-        recorder: The recording that is being written; None if there is none.
+        recorder: Recorder that writes the present recording, or None if nothing is recorded.
     """
 
     def __init__(self, stream: TouchStream, recorder: Recorder | None = None) -> None:
-        """Set the stream and its recording.
+        """Store the stream and the recorder of its first recording.
 
         Args:
-            stream: The stream from chunks to records.
-            recorder: A recording that is open while `follow` runs; None for no recording.
+            stream: Stream that computes records from chunks.
+            recorder: Recorder that the caller has opened, and closes after `follow` has ended. None if nothing is
+                recorded at first.
         """
         self._stream = stream
         self.recorder = recorder
-        self._caller_recorder = recorder  # The caller opened this recording and closes it.
-        self._current_chunk: tuple[Chunk, list[str]] | None = None  # a chunk and its records, which are not written yet
+        self._caller_recorder = recorder  # the caller closes this recorder, and all others are closed here
+        self._current_chunk: tuple[Chunk, list[str]] | None = None  # a chunk and its records that are not recorded yet
         self._requests: deque[Callable[[], None]] = deque()
-        # The latest requested recording, or None as a request to end the recording; empty without a request.
+        # Recorder of the requested recording, or None if it was requested to record nothing. The deque is empty if
+        # there is no request. A new request replaces an older one. Other threads can safely append to a deque.
         self._next_recorder: deque[Recorder | None] = deque(maxlen=1)
         self._next_load: Load | None = None
         self._loading_model: Future[Predictor] | None = None
 
     @property
     def predictor(self) -> Predictor:
-        """The model that computes the next record."""
+        """Model with which the next record is computed."""
         return self._stream.predictor
 
     def request_tare(self) -> None:
-        """Request a new tare. The method may also be called from a signal handler."""
+        """Request that the tare is measured again. A signal handler may also call this method."""
         self._requests.append(self._tare)
 
     def request_film_reset(self) -> None:
-        """Request a reset of the followed film to its calibration.
+        """Request to reset the estimate of the followed film to its calibration.
 
-        The method may also be called from a signal handler.
+        A signal handler may also call this method.
         """
         self._requests.append(self._reset_film)
 
     def request_recording(self, recorder: Recorder | None) -> None:
-        """Request to end the present recording and to begin another recording.
+        """Request to end the present recording, and to begin another recording.
 
-        The request replaces an earlier request that has not been executed yet. When a recording begins, the stream is
-        restarted and the tare is measured again, because a replay only has the bytes of the recording.
+        If an earlier request was not executed yet, it is replaced by this request. When a recording begins, the stream
+        is restarted and the tare is measured again. A replay can then compute the same records, although it only has
+        the bytes of the recording.
 
         Args:
-            recorder: The next recording, which the stream opens and closes; None for no recording.
+            recorder: Recorder of the next recording, which this object opens and closes. None to record nothing.
         """
         self._next_recorder.append(recorder)
         self._requests.append(self._begin_requested_recording)
 
     def request_marker(self, marker: Marker) -> None:
-        """Request to write a marker to the recording, if there is one."""
+        """Request to write a marker to the recording. Without a recording, the marker is ignored."""
         self._requests.append(partial(self._mark, marker))
 
     def request_model(self, load: Load) -> None:
-        """Request another model, which is loaded in the background.
+        """Request to replace the model by another model.
 
-        When the model has been loaded, it is used for the next chunk and all later chunks. If the model cannot be
-        loaded, or has other electrodes, an error is logged and the present model is kept. The method may also be called
-        from a signal handler.
+        The new model is loaded in a separate thread. As soon as it has been loaded, it is used for all later chunks. If
+        the new model cannot be loaded, or has other electrodes, an error is logged and the present model remains in
+        use. A signal handler may also call this method.
 
         Args:
-            load: Function that loads the model.
+            load: Function that loads and returns the new model.
         """
         self._next_load = load
 
     def follow(self, chunks: Iterable[Chunk]) -> Generator[PredictionRecord]:
-        """Yield the records until the chunks end.
+        """Process the chunks, record them, and yield their prediction records.
 
-        Requests are executed before each chunk. A chunk is recorded after its last record has been yielded. Close the
-        generator before the recorder, so that the present chunk is also recorded, even if the program is interrupted.
+        Requests are executed before each chunk. A chunk is recorded after its last record has been yielded. The caller
+        must close this generator before it closes its recorder. The present chunk is then recorded even if the program
+        is interrupted.
 
         Args:
-            chunks: Chunks of a port or of a file.
+            chunks: Chunks of bytes from a port or from a file.
 
         Raises:
-            ChargeError: If a frame has another number of charges than the model.
+            ChargeError: If a frame has no value for an electrode of the model.
             TareError: If the film is touched during the whole search for a tare.
             PortError: If the bytes contain no frames.
             PortLost: If the port disappears.
         """
         try:
             for chunk in chunks:
-                # Execute the requests before the chunk.
                 if self._next_load or self._loading_model:
                     self._continue_loading()
                 while self._requests:
                     execute_request = self._requests.popleft()
                     execute_request()
 
-                # The chunk is stored before its records, so that it is also recorded if the caller closes the generator
-                # at a `yield`. The lines of the records are added one by one.
-                lines: list[str] = []
-                self._current_chunk = (chunk, lines)
+                # If the caller closes the generator at a `yield`, the chunk must be recorded with the records that were
+                # yielded until then. Chunk and records are therefore stored for `_record_chunk`.
+                record_lines: list[str] = []
+                self._current_chunk = (chunk, record_lines)
                 for record in self._stream.feed(chunk):
-                    lines.append(record.to_json())
+                    record_lines.append(record.to_json())
                     yield record
                 self._record_chunk()
             self._stream.finish()
         finally:
-            self._record_chunk()  # writes the present chunk after an interruption, and nothing otherwise
+            self._record_chunk()  # after an interruption, this records the present chunk; otherwise it does nothing
             self._end_recording()
 
     def _record_chunk(self) -> None:
-        """Write the present chunk and its records to the recording."""
+        """If a chunk was not recorded yet, write the chunk and its records to the recording."""
         if self.recorder is not None and self._current_chunk is not None:
-            self.recorder.chunk(*self._current_chunk)
+            chunk, record_lines = self._current_chunk
+            self.recorder.chunk(chunk, record_lines)
         self._current_chunk = None
 
     def _begin_requested_recording(self) -> None:
-        """Begin the recording that was requested, or end the recording if no recording was requested.
+        """End the present recording, and begin the requested recording if there is one.
 
-        The stream is restarted, so that the records of the recording depend only on the bytes in the recording. If the
-        file cannot be created, an error is logged.
+        Before the new recording begins, the stream is restarted. The records of the recording therefore depend only on
+        the bytes in the recording. If the file cannot be created, an error is logged.
         """
-        if not self._next_recorder:  # an earlier call has already executed the latest request
+        if not self._next_recorder:  # an earlier call of this method has already executed the latest request
             return
         self._end_recording()
         recorder = self._next_recorder.pop()
@@ -161,24 +165,24 @@ class RecordedStream:
             recorder.model(present_label)
 
     def _end_recording(self) -> None:
-        """End the present recording. If this object has opened the recording, close it."""
+        """End the present recording, and close its recorder unless the caller has opened it."""
         recorder = self.recorder
         self.recorder = None
         if recorder is not None and recorder is not self._caller_recorder:
             recorder.close()
 
     def _mark(self, marker: Marker) -> None:
-        """Write a marker to the recording."""
+        """Write a marker to the recording, if there is a recording."""
         if self.recorder is not None:
             self.recorder.mark(marker)
 
     def _continue_loading(self) -> None:
-        """Use the requested model if it has been loaded, and begin to load the next requested model.
+        """Begin to use the requested model if it has been loaded, and begin to load the next requested model.
 
-        A separate thread loads a model, so that the stream does not wait. At most one model is loaded at a time.
+        A model is loaded in a separate thread, so that the stream does not wait. Only one model is loaded at a time.
         """
         if self._loading_model is not None and self._loading_model.done():
-            self._use(self._loading_model)
+            self._use_loaded_model(self._loading_model)
             self._loading_model = None
         if self._next_load and self._loading_model is None:
             load = self._next_load
@@ -187,19 +191,19 @@ class RecordedStream:
             self._loading_model = loader.submit(load)
             loader.shutdown(wait=False)  # the thread ends after this model
 
-    def _use(self, loaded: "Future[Predictor]") -> None:
-        """Use a loaded model for all later chunks.
+    def _use_loaded_model(self, loaded: "Future[Predictor]") -> None:
+        """Use a newly loaded model for all later chunks.
 
-        If the loaded model cannot be used, log an error and continue with the present model.
+        If the new model could not be loaded or cannot be used, log an error and continue with the present model.
 
         Args:
-            loaded: Result of the thread that has loaded the model.
+            loaded: Completed future, which contains the new model or the error that occurred while it was loaded.
         """
         present_label = self._stream.predictor.metadata.label
         try:
             new_predictor = loaded.result()
             self._stream.use(new_predictor)
-        except Exception as error:  # after any error of the new model, the present model stays
+        except Exception as error:  # after every error of the new model, the present model remains in use
             log.error(
                 "%s serves on, because the new model is refused: %s: %s", present_label, type(error).__name__, error
             )
@@ -210,13 +214,13 @@ class RecordedStream:
         log.warning("%s serves from now on, after %s", new_label, present_label)
 
     def _tare(self) -> None:
-        """Measure the tare again, and record the request."""
+        """Measure the tare again, and write the request to the recording."""
         self._stream.tare()
         if self.recorder is not None:
             self.recorder.tare()
 
     def _reset_film(self) -> None:
-        """Reset the estimate of the film to its calibration, and record the request."""
+        """Reset the estimate of the film to its calibration, and write the request to the recording."""
         self._stream.reset_film()
         if self.recorder is not None:
             self.recorder.back()
@@ -231,24 +235,26 @@ def replay(
     load: Callable[[str], Predictor] | None = None,
     on_marker: Callable[[Marker], object] = lambda _: None,
 ) -> Iterator[PredictionRecord]:
-    """Compute the records of a recording again, and yield them.
+    """Compute the records of a recording again from its chunks, and yield these records.
 
-    A chunk of bytes yields as many records as it yielded when the recording was made.
+    For each chunk, the replay yields as many records as were yielded when the recording was made.
 
     Args:
-        recording: The recording.
-        stream: A new stream with the same model, device and policy, whose `now_ns` is `clock`.
-        clock: The clock of the replay.
-        real_time: Whether to wait between two chunks for the time that had passed in the recording.
-        load: Function that loads a model by its label, for recordings in which the model changes. If None, the first
-            model computes all records.
-        on_marker: Function that is called with each marker, between the records before and after it.
+        recording: Recording whose chunks are processed.
+        stream: New stream with the model, the device and the policy of the recorded stream. Its argument `now_ns` must
+            be `clock`.
+        clock: Clock that the replay sets to the times of the recording.
+        real_time: Whether to wait before each chunk, so that the replay takes as long as the recording.
+        load: Function that loads the model with a given label. It is called when the recorded stream has changed its
+            model. If `load` is None, all records are computed with the first model.
+        on_marker: Function that is called with each marker. The call takes place between the records that come before
+            and after the marker.
 
     Raises:
         RecordingError: If a line other than the last one is damaged.
         ModelError: If a model of the recording cannot be loaded.
     """
-    delay_s: float | None = None  # time by which the replay is later than the recording; None before the first chunk
+    delay_s: float | None = None  # time from the recording to the replay; None before the first chunk
     for event in recording.events():
         match event:
             case Marker():
@@ -268,9 +274,10 @@ def replay(
                 if real_time:
                     due_s = chunk.timestamp + delay_s
                     time.sleep(max(0.0, due_s - time.time()))
-                # The consumer of the records may have stopped before the last record of a chunk. The recording has one
-                # latency for each record that was used.
-                used_count = len(latencies_us)
+                # When the recording was made, the program may have ended before the last record of a chunk was yielded.
+                # The recording contains one latency for each record that was yielded. The stream still processes the
+                # whole chunk.
+                yielded_count = len(latencies_us)
                 for index, record in enumerate(stream.feed(chunk)):
-                    if index < used_count:
+                    if index < yielded_count:
                         yield record

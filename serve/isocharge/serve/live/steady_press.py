@@ -1,9 +1,10 @@
 """Detection of presses that are held still, and measurement of their charges.
 
-A press is steady if, within a window of time, the scatter and the drift of each charge are small. The charge of the
-press is the mean over the window minus the mean at rest just before the touch. A slow drift of the amplifiers, or of
-the temperature of the film, therefore does not affect the charge. A press is refused, with a reason, if it saturates an
-amplifier, moves, creeps or ends too early.
+The charges of a press are examined in a time window. The press is steady if the scatter and the drift of each charge in
+the window are small. The charge of a press is the mean charge in the window minus the mean charge at rest just before
+the touch. The measured charge is therefore not affected by a slow drift of the amplifiers or of the temperature of the
+film. A press is refused if it saturates an amplifier, moves, creeps or ends too early. The reason for the refusal is
+returned.
 """
 
 from collections import deque
@@ -20,31 +21,37 @@ from isocharge.serve.live.reading_stream import TimedReading
 from isocharge.serve.signal_chain.chain import Reading
 
 CHECKS_PER_WINDOW = 10
-"""Number of checks in the length of a window. A board may send thousands of frames per second."""
+"""Number of times that a window is examined within its length.
+
+A board may send thousands of frames per second, so that it would take too long to examine the window at every frame.
+"""
 
 PORT_LOST = "the port was lost: do not touch the film until it is tared"
-"""Reason why a press is refused if the port was lost."""
+"""Reason for which a press is refused if the port was lost."""
 
 NO_REST_BEFORE_PRESS = (
     "pressed too soon after the last touch: do not touch the film for half a second before a press; if that does not "
     "help, the amplifier leaks: state its time constant in the section [leak] of a device file"
 )
-"""Reason why a press is refused if the film was not at rest before the press."""
+"""Reason for which a press is refused if the film was not at rest before the press."""
 
 MIN_REST_FRAMES = 3
-"""Smallest number of frames at rest before a touch."""
+"""Smallest number of frames at rest that must precede a press."""
 
 MAX_SCATTER_RATIO = 2.0
-"""Largest scatter of a window, relative to the calmest window of the press. A larger scatter shows a jerk."""
+"""Largest scatter in a calm window, relative to the smallest scatter in a window of the same press.
+
+A larger scatter means that the probe has moved suddenly.
+"""
 
 MAX_SLOPE_DIFFERENCE = 0.3
-"""Largest deviation of the relative slope of a charge from the mean slope, relative to the mean slope.
+"""Largest difference between the relative slope of a charge and the mean relative slope, divided by the latter.
 
-If no deviation is larger, all charges change in proportion.
+If no difference is larger, all charges change in proportion, and the press does not move.
 """
 
 MIN_CHARGE_pC = 1e-9
-"""Smallest charge by which a drift is divided, pC."""
+"""Smallest charge by which a drift is divided, pC. It avoids a division by zero."""
 
 
 class SteadyRule(NamedTuple):
@@ -53,17 +60,18 @@ class SteadyRule(NamedTuple):
     Attributes:
         window_s: Length of the window, s.
         min_frames: Smallest number of frames in a window.
-        max_scatter_sigmas: Largest scatter about a straight line, in standard deviations of the noise.
-        relative_noise: Standard deviation of a charge under load, relative to the charge, in addition to the noise at
-            rest. The force of a hand varies by about 1 %.
-        max_relative_drift: Largest drift of a charge over the window, relative to the larger of the charge and of the
-            mean magnitude of all charges. A drift of this size changes the position by about 0.05 mm.
-        drift_sigmas: Number of standard errors of the drift that are added to the largest drift.
-        max_held_s: Time after the touch at which a press that is not yet steady is refused, s. The longer a press is
-            held, the larger is the error of the leak correction.
-        min_held_s: Time below which a touch is not a press, s.
-        rest_s: Length of the rest before the touch that is subtracted, s.
-        edge_s: Time before and after a press that is not counted as rest, because the probe lands or leaves, s.
+        max_scatter_sigmas: Largest scatter of a charge about a straight line, in standard deviations of its noise.
+        relative_noise: Standard deviation of the additional noise of a press, relative to its charge. It is larger than
+            0 because the force of a hand varies.
+        max_relative_drift: Largest drift of a charge over the window, relative to its magnitude or to the mean
+            magnitude of all charges, whichever is larger. A drift of this size changes the position by about 0.05 mm.
+        drift_sigmas: Number of standard errors of the drift by which the drift may also exceed this limit.
+        max_held_s: Time since the touch after which a press is refused if it is not steady yet, s. A longer press would
+            have a larger error of the leak correction.
+        min_held_s: Shortest duration of a press, s. Shorter touches are ignored.
+        rest_s: Duration of the rest before a touch over which the charges at rest are averaged, s.
+        edge_s: Time just before and just after a press that does not count as rest, s. The probe may already or still
+            touch the film during this time.
     """
 
     window_s: float = 0.5
@@ -79,7 +87,16 @@ class SteadyRule(NamedTuple):
 
 
 class Phase(StrEnum):
-    """State of a press watch: the event that the watch waits for, or the result of the latest reading."""
+    """State of a `PressWatch`, or result of its latest reading.
+
+    Attributes:
+        taring: The watch waits until the charge of the untouched film has been measured.
+        lift: The watch waits until the finger leaves the film.
+        waiting: The watch waits for a touch.
+        settling: The watch waits until the present press is steady.
+        taken: The present press was accepted with the latest reading.
+        refused: The present press was refused with the latest reading.
+    """
 
     taring = "taring"
     lift = "lift"
@@ -90,16 +107,17 @@ class Phase(StrEnum):
 
 
 class SteadyPress(NamedTuple):
-    """A press that was held still.
+    """Charges of a press that was held still, measured in a window of time.
 
     Attributes:
         charge_pC: Mean touch charges over the window, shape (n_electrode,), pC.
-        scatter_pC: Standard deviations about a straight line in the window, shape (n_electrode,), pC.
-        drift_pC: Changes of this straight line over the window, shape (n_electrode,), pC.
+        scatter_pC: Standard deviation of each charge about a straight line that is fitted to it, shape (n_electrode,),
+            pC.
+        drift_pC: Change of each straight line over the window, shape (n_electrode,), pC.
         held_s: Time from the touch to the end of the window, s.
         window_s: Length of the window, s.
         frames: Number of frames in the window.
-        flags: Words of `isocharge.serve.flags` that frames of the window had.
+        flags: Flags of `isocharge.serve.flags` that at least one frame in the window has.
     """
 
     charge_pC: Array
@@ -112,14 +130,16 @@ class SteadyPress(NamedTuple):
 
 
 class WatchResult(NamedTuple):
-    """Result of a press watch for one reading.
+    """Result that a `PressWatch` returns for one reading.
 
     Attributes:
-        phase: What the watch waits for; `taken` or `refused` only for the reading with which a press is decided.
-        charge_pC: Touch charges of this reading minus the rest before, shape (n_electrode,), pC; None without a tare.
-        held_s: Time since the touch, s; 0 if nothing touches.
-        reason: Why a press is refused, or is not yet steady; a part of a sentence.
-        press: The press, if it was accepted with this reading; otherwise None.
+        phase: What the watch waits for. It is `taken` or `refused` only for the reading with which a press was accepted
+            or refused.
+        charge_pC: Touch charges of this reading minus the charges at rest before the press, shape (n_electrode,), pC.
+            None if the reading has no charges.
+        held_s: Time since the touch began, s; 0 if nothing touches the film.
+        reason: Reason why the press is refused or is not steady yet, as a part of a sentence.
+        press: The accepted press if the phase is `taken`, and otherwise None.
     """
 
     phase: Phase
@@ -130,11 +150,11 @@ class WatchResult(NamedTuple):
 
 
 class WindowFrame(NamedTuple):
-    """A frame in the window of a press.
+    """Charges of one frame in the window of a press.
 
     Attributes:
-        t_s: Time, s.
-        charge_pC: Touch charges minus the rest before, shape (n_electrode,), pC.
+        t_s: Time of the frame, s.
+        charge_pC: Touch charges minus the charges at rest before the press, shape (n_electrode,), pC.
         flags: Flags of the frame.
     """
 
@@ -144,13 +164,13 @@ class WindowFrame(NamedTuple):
 
 
 class PressWatch:
-    """Finds one steady press in each touch. An object belongs to one thread."""
+    """Finds one steady press in each touch. An object may only be used by one thread."""
 
     def __init__(self, electrodes: tuple[str, ...], rule: SteadyRule | None = None) -> None:
-        """Begin to wait for a tare, which is the charge of the untouched film.
+        """Create a watch that waits for the tare, which is the charge of the untouched film.
 
         Args:
-            electrodes: Names of the electrodes, which appear in the reasons.
+            electrodes: Names of the electrodes, for the reasons of refusals.
             rule: Conditions for a steady press.
         """
         self._electrodes = electrodes
@@ -167,28 +187,31 @@ class PressWatch:
         self._check_s = -np.inf  # time at which the window was last examined
         self._reason = ""  # why the press is not steady yet
         self._min_scatter_pC = np.inf  # smallest scatter of all windows of the press
-        self._sizes: list[tuple[float, float]] = []  # time since the touch and mean charge of each calm window
+        # Time since the touch, s, and mean magnitude of the charges, pC, of each calm window
+        self._mean_magnitudes: list[tuple[float, float]] = []
 
     def arm(self) -> None:
-        """Ignore the press that is in progress, and wait for the next press."""
+        """Ignore the present press if there is one, and wait for the next press."""
         if self._phase is Phase.settling:
             self._phase = Phase.lift
 
     def feed(self, timed: TimedReading) -> WatchResult:
-        """Process the next reading, and return the state of the press.
+        """Process the next reading, and return the phase of the press.
 
-        The phases follow each other: `taring` until the charge of the untouched film has been measured, `waiting` for
-        a touch, `settling` until the press is steady or refused, and `lift` until the finger leaves the film.
+        The phase is `taring` until the charge of the untouched film has been measured. The next phase is `waiting`
+        until a touch begins. It is followed by `settling` until the press is accepted or refused, and by `lift` until
+        the finger leaves the film.
 
         Args:
-            timed: The reading with its time.
+            timed: The touch charges of a frame, with their time.
 
         Returns:
-            The phase with the charges of the reading. A press is returned once, with the reading that completes it.
+            The phase and the charges of the reading. The result contains an accepted press only for the reading with
+            which the press was accepted.
         """
         reading = timed.reading
         t_s = timed.time.clock_s
-        if RECONNECTED in reading.flags or RESTART in reading.flags:
+        if RECONNECTED in reading.flags or RESTART in reading.flags:  # earlier charges cannot be compared with this one
             self._rest.clear()
             return self._refuse(PORT_LOST, Phase.taring)
         if reading.charge_pC is None:  # there is no tare yet, or the frame is invalid
@@ -203,16 +226,16 @@ class PressWatch:
             self._begin_press(t_s)
         charge_pC = reading.charge_pC - self._rest_pC
         held_s = t_s - self._begin_s
-        if self._phase is Phase.lift:  # the press has been taken or refused, and the finger is still on the film
+        if self._phase is Phase.lift:  # the press was accepted or refused before, and the finger is still on the film
             return WatchResult(Phase.lift, charge_pC, held_s)
         result = self._process_press(reading, charge_pC, t_s)
         return result._replace(charge_pC=charge_pC, held_s=held_s)
 
     def _process_rest(self, charge_pC: Array, t_s: float) -> WatchResult:
-        """Store a frame in which nothing touches. If a press has ended before it was steady, refuse this press.
+        """Store a frame in which nothing touches the film, and refuse a press that has ended before it was steady.
 
         Args:
-            charge_pC: Charges of the frame, shape (n_electrode,), pC.
+            charge_pC: Touch charges of the frame, shape (n_electrode,), pC.
             t_s: Time of the frame, s.
         """
         rule = self._rule
@@ -236,9 +259,12 @@ class PressWatch:
         return WatchResult(Phase.waiting, charge_pC)
 
     def _begin_press(self, t_s: float) -> None:
-        """Begin a press at the time `t_s`, s, and measure the charges at rest just before the press.
+        """Begin a press, and measure the charges at rest just before the press.
 
-        The latest frames before the press are left out, because the finger may have touched the film already.
+        The latest frames before the press are left out, because the finger may already have touched the film.
+
+        Args:
+            t_s: Time of the first frame of the press, s.
         """
         rest_end_s = t_s - self._rule.edge_s
         rest_charges_pC = [charge_pC for frame_s, charge_pC in self._rest if frame_s <= rest_end_s]
@@ -248,7 +274,7 @@ class PressWatch:
             self._rest_pC = np.mean(rest_charges_pC, axis=0)
         self._rest.clear()
         self._window.clear()
-        self._sizes.clear()
+        self._mean_magnitudes.clear()
         self._phase = Phase.settling
         self._begin_s = t_s
         self._check_s = t_s
@@ -256,16 +282,16 @@ class PressWatch:
         self._min_scatter_pC = np.inf
 
     def _process_press(self, reading: Reading, charge_pC: Array, t_s: float) -> WatchResult:
-        """Add a frame to the window of a press, and accept the press if it is steady.
+        """Add a frame to the window of the present press, and accept the press if it is steady.
 
         Args:
-            reading: The frame.
-            charge_pC: Charges of the frame minus the rest, shape (n_electrode,), pC.
+            reading: Touch charges and flags of the frame.
+            charge_pC: Touch charges minus the charges at rest before the press, shape (n_electrode,), pC.
             t_s: Time of the frame, s.
 
         Returns:
-            The phase `taken` with the press if it is steady, `refused` with the reason if it cannot become steady, and
-            otherwise `settling`.
+            The phase `taken` and the press if the press is steady, `refused` and the reason if the press is refused,
+            and otherwise `settling`. The charges and the time since the touch are not filled in.
         """
         rule = self._rule
         self._end_s = t_s
@@ -294,14 +320,15 @@ class PressWatch:
         return WatchResult(Phase.settling, reason=self._reason)
 
     def _steady_press(self, reading: Reading) -> SteadyPress | None:
-        """Return the press in the window if it is steady; otherwise store the reason and return None.
+        """Return the press in the window if the press is steady, and otherwise store the reason and return None.
 
-        A window is calm if it contains no sudden movement. Its scatter is then not much larger than that of the calmest
-        window so far. The mean charge of a calm window is stored, from which the law of a slow decrease is determined
-        later. If a window is not calm, its mean charge and its reason are not stored.
+        A window is calm if its scatter is not much larger than the smallest scatter in a window of the present press. A
+        window with a sudden movement is therefore not calm. The mean magnitude of the charges in each calm window is
+        stored. The law of a slow decrease is later determined from these values. If a window is not calm, neither its
+        mean magnitude nor its reason is stored.
 
         Args:
-            reading: The latest frame, which has the noise of the charges at rest.
+            reading: The latest frame. Its tare contains the noise of the charges at rest.
         """
         press = self._measure_window()
         scatter_pC = float(press.scatter_pC.max())
@@ -311,13 +338,13 @@ class PressWatch:
         is_after_first_window = press.held_s >= 2.0 * press.window_s
         if is_calm and is_after_first_window:
             middle_s = press.held_s - 0.5 * press.window_s  # time from the touch to the middle of the window
-            mean_size_pC = float(np.abs(press.charge_pC).mean())
-            self._sizes.append((middle_s, mean_size_pC))
+            mean_magnitude_pC = float(np.abs(press.charge_pC).mean())
+            self._mean_magnitudes.append((middle_s, mean_magnitude_pC))
 
         noise_pC = np.zeros_like(press.charge_pC)
         if reading.tare is not None:
             noise_pC = reading.tare.noise_pC
-        reason = unsteadiness(self._rule, press, noise_pC, self._electrodes, self._sizes)
+        reason = unsteadiness(self._rule, press, noise_pC, self._electrodes, self._mean_magnitudes)
         if not reason:
             return press
         if is_calm:
@@ -325,10 +352,10 @@ class PressWatch:
         return None
 
     def _measure_window(self) -> SteadyPress:
-        """Fit a straight line to each charge in the window, and return the mean, the scatter and the change.
+        """Fit a straight line to each charge in the window, and return the results.
 
-        The scatter is the standard deviation of the residuals. The change is the difference between the two ends of the
-        line.
+        The scatter of a charge is the standard deviation of the residuals of its line. The drift of a charge is the
+        difference between the values of its line at the end and at the beginning of the window.
         """
         begin_s = self._window[0].t_s
         end_s = self._end_s
@@ -336,9 +363,9 @@ class PressWatch:
         times_s = np.array([frame.t_s for frame in self._window]) - begin_s
         charge_pC = np.array([frame.charge_pC for frame in self._window])  # shape (frames, n_electrode)
 
-        # Least squares with centred times, so that the slope is independent of the mean.
+        # The line is fitted by least squares with centred times. Its value at time 0 is then the mean charge.
         centred_s = times_s - times_s.mean()
-        square_sum_s2 = max(float(centred_s @ centred_s), 1e-30)  # not 0, even if all times are equal
+        square_sum_s2 = max(float(centred_s @ centred_s), 1e-30)  # avoids a division by 0 if all times are equal
         slope_pC_per_s = centred_s @ charge_pC / square_sum_s2
         mean_pC = charge_pC.mean(axis=0)
         residual_pC = charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)
@@ -356,7 +383,12 @@ class PressWatch:
         )
 
     def _refuse(self, reason: str, phase: Phase) -> WatchResult:
-        """Refuse a press for a reason, and continue with a phase."""
+        """Set the phase, and return a result that refuses the present press.
+
+        Args:
+            reason: Reason for the refusal.
+            phase: Phase in which the watch continues.
+        """
         self._phase = phase
         return WatchResult(Phase.refused, reason=reason)
 
@@ -366,50 +398,55 @@ def unsteadiness(
     press: SteadyPress,
     noise_pC: Array,
     electrodes: tuple[str, ...],
-    sizes: Sequence[tuple[float, float]],
+    mean_magnitudes: Sequence[tuple[float, float]],
 ) -> str:
-    """Return the reason why a press is not steady, as a part of a sentence; an empty string if it is steady.
+    """Return the reason why a press is not steady, or an empty text if the press is steady.
 
-    A straight line is fitted to each charge in the window. The press is steady if each charge scatters little about its
-    line, and each line changes little over the window. Noise alone explains a part of the scatter and of the change.
+    A straight line is fitted to each charge in the window. The press is steady if the scatter of each charge about its
+    line is small, and if the change of each line over the window is small. The limits include the scatter and the
+    change that noise alone causes.
 
     Args:
         rule: Conditions for a steady press.
         press: A window of the press.
         noise_pC: Standard deviation of each charge at rest, shape (n_electrode,), pC.
-        electrodes: Names of the electrodes, which appear in the reason.
-        sizes: Time since the touch, s, and mean magnitude of the charges, pC, of each window so far. They are used to
-            state the cause of a decrease.
+        electrodes: Names of the electrodes, for the reason.
+        mean_magnitudes: Time since the touch, s, and mean magnitude of the charges, pC, of each calm window so far. The
+            cause of a slow decrease is determined from these values.
+
+    Returns:
+        The reason as a part of a sentence.
     """
     # The charges scatter because of the noise at rest, and because a hand varies its force.
-    mean_size_pC = float(np.abs(press.charge_pC).mean())
-    expected_scatter_pC = np.hypot(noise_pC, rule.relative_noise * mean_size_pC)
+    mean_magnitude_pC = float(np.abs(press.charge_pC).mean())
+    expected_scatter_pC = np.hypot(noise_pC, rule.relative_noise * mean_magnitude_pC)
     relative_scatter = press.scatter_pC / expected_scatter_pC
     if relative_scatter.max() > rule.max_scatter_sigmas:
         worst = int(relative_scatter.argmax())
         return f"the charge of {electrodes[worst]} shakes by {press.scatter_pC[worst]:.2g} pC"
 
-    # Standard deviation of the change over a window of n frames of a line that is fitted to noise: sqrt(12 / n).
+    # If a line is fitted to n values of noise, the standard deviation of its change is sqrt(12 / n) times the noise.
     drift_std_pC = press.scatter_pC * np.sqrt(12.0 / press.frames)
-    size_pC = np.maximum(np.abs(press.charge_pC), mean_size_pC)  # small charges may change as much as the mean charge
-    max_drift_pC = rule.max_relative_drift * size_pC + rule.drift_sigmas * drift_std_pC
+    # A charge that is smaller than the mean magnitude may change as much as a charge of the mean magnitude.
+    compared_pC = np.maximum(np.abs(press.charge_pC), mean_magnitude_pC)
+    max_drift_pC = rule.max_relative_drift * compared_pC + rule.drift_sigmas * drift_std_pC
     if (np.abs(press.drift_pC) <= max_drift_pC).all():
         return ""
-    return _drift_reason(press, sizes)
+    return _drift_reason(press, mean_magnitudes)
 
 
-def _drift_reason(press: SteadyPress, sizes: Sequence[tuple[float, float]]) -> str:
-    """Return the reason for a drift of the charges, as a part of a sentence.
+def _drift_reason(press: SteadyPress, mean_magnitudes: Sequence[tuple[float, float]]) -> str:
+    """Return the probable reason for a drift of the charges, as a part of a sentence.
 
-    The force changes if all charges change in proportion, so that their relative slopes are equal. Otherwise the
-    position changes.
+    If all charges change in proportion, their relative slopes are equal. In this case, the force changes and the
+    position does not. If the relative slopes differ, the position changes.
 
     Args:
         press: A window of the press. `drift_pC` is the change of each charge over the window.
-        sizes: Time since the touch, s, and mean magnitude of the charges, pC, of each window so far.
+        mean_magnitudes: Time since the touch, s, and mean magnitude of the charges, pC, of each calm window so far.
     """
-    charge_size_pC = np.maximum(np.abs(press.charge_pC), MIN_CHARGE_pC)
-    relative_slope = press.drift_pC / charge_size_pC / press.window_s  # shape (n_electrode,), 1/s
+    magnitude_pC = np.maximum(np.abs(press.charge_pC), MIN_CHARGE_pC)
+    relative_slope = press.drift_pC / magnitude_pC / press.window_s  # shape (n_electrode,), 1/s
     mean_slope = float(relative_slope.mean())
     largest_difference = np.abs(relative_slope - mean_slope).max()
     if largest_difference > MAX_SLOPE_DIFFERENCE * abs(mean_slope):
@@ -418,5 +455,5 @@ def _drift_reason(press: SteadyPress, sizes: Sequence[tuple[float, float]]) -> s
         return f"the charges rise by {100.0 * mean_slope:.2g} % per second: hold the force"
     return (
         f"the charges fall by {-100.0 * mean_slope:.2g} % per second on all electrodes alike: hold the force; "
-        f"{cause_of_fading(sizes)}"
+        f"{cause_of_fading(mean_magnitudes)}"
     )

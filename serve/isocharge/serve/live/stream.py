@@ -1,6 +1,6 @@
-"""The stream that computes prediction records from chunks of bytes.
+"""Stream that computes prediction records from chunks of bytes.
 
-Each record has the charges of a frame and the contact that was computed from them.
+Each record contains the charges of one frame, and the contact that was computed from these charges.
 """
 
 import math
@@ -33,11 +33,14 @@ from isocharge.serve.signal_chain.chain import Chain, Reading
 from isocharge.serve.tracking.tracker import Tracker
 
 LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
-"""Flags that the next record receives if a frame has no record. The flags describe events before that record."""
+"""Flags of a frame without a record that are added to the next record. They describe events before the next record."""
 
 
 class Policy(StrEnum):
-    """Which frames have a record. With both policies, the signal chain processes all frames."""
+    """Rule that decides which frames have a record: all frames, or only the latest frame of each chunk.
+
+    With both policies, the signal chain processes all frames.
+    """
 
     every = "every"
     latest = "latest"
@@ -45,12 +48,12 @@ class Policy(StrEnum):
 
 @dataclass(slots=True)
 class StreamCounts:
-    """Counts of a stream, in addition to the counts of its parser and of its frame numbers.
+    """Further counts of a stream, in addition to those of its parser and of its counter of missing frame numbers.
 
     Attributes:
-        records: Number of records.
-        skipped: Number of frames without a record, because a newer frame had arrived with them (`Policy.latest`).
-        outages: Number of times that the port was connected again after an outage.
+        records: Number of records that the stream has yielded.
+        skipped: Number of frames that have no record, because the same chunk contained a newer frame (`Policy.latest`).
+        outages: Number of outages of the port after which the stream has continued.
     """
 
     records: int = 0
@@ -59,9 +62,9 @@ class StreamCounts:
 
 
 class StreamTotals(NamedTuple):
-    """All counts of a stream since it began, including the counts before a restart.
+    """Counts of a stream since it began, including the counts before its latest restart.
 
-    The counts have the same meanings as in `FrameCounts` and `SequenceGaps`.
+    The classes `FrameCounts` and `SequenceGaps` describe the meaning of each count.
     """
 
     frames: int = 0
@@ -83,21 +86,22 @@ def stream(
     parser: Parser | None = None,
     gaps: SequenceGaps | None = None,
 ) -> Iterator[PredictionRecord]:
-    """Yield a record for every intact frame.
+    """Compute the prediction record of every intact frame in the chunks, and yield the records.
 
     Args:
-        chunks: Bytes with the time of their arrival: an open `Port`, or another iterable of chunks.
-        predictor: The model of this sensor.
-        device: Settings of the board, from `load_device`.
-        chain: Settings of the signal chain; by default those of the device.
-        parser: Parser of the frames, for example to read its counters; by default that of the device.
-        gaps: Counter of missing frame numbers, for example to read it; by default a new one.
+        chunks: Chunks of bytes with the times of their arrival, for example an open `Port`.
+        predictor: Model with which the contacts are predicted.
+        device: Settings of the board, as `load_device` returns them.
+        chain: Settings of the signal chain. By default, the settings in the device file are used.
+        parser: Parser of the frames, whose counters the caller can read. By default, the parser that the device file
+            describes is used.
+        gaps: Counter of missing frame numbers, which the caller can read. By default, a new counter is created.
 
     Raises:
-        ChargeError: If a frame has another number of charges than the model.
-        DeviceError: If the device file has other electrodes than the model.
+        ChargeError: If a frame has no value for an electrode of the model.
+        DeviceError: If the device file contains settings for other electrodes than those of the model.
         TareError: If the film is touched during the whole search for a tare.
-        PortError: If the bytes contain no frames.
+        PortError: If the stream has contained no intact frame in many bytes.
         PortLost: If the port disappears.
     """
     touch = TouchStream(predictor, device, chain=chain, parser=parser, gaps=gaps)
@@ -107,16 +111,18 @@ def stream(
 
 
 class TouchStream:
-    """The path from chunks to records. The object stores the state of the path. An object belongs to one thread.
+    """Computes prediction records from the chunks of a stream, and stores the state of this computation.
+
+    An object may only be used by one thread.
 
     Attributes:
-        parser: Parser of the frames, with its counters.
+        parser: Parser that finds the frames in the bytes and counts them.
         gaps: Counter of missing frame numbers.
         clock: Clock of the device.
-        counts: Records, skipped frames and outages.
-        predictor: The loaded model. If the film is followed, `answering_predictor` is the model of the film at its
-            estimated pretension.
-        frame_id: Name of the film in the records.
+        counts: Numbers of records, of skipped frames and of outages.
+        predictor: The loaded model. If the film is followed, the contacts are predicted with `answering_predictor`
+            instead.
+        frame_id: Name of the film, which each record contains.
     """
 
     def __init__(
@@ -131,21 +137,24 @@ class TouchStream:
         now_ns: Callable[[], int] = time.perf_counter_ns,
         frame_id: str | None = None,
     ) -> None:
-        """Connect the parts of the path.
+        """Create the signal chain and the stages that compute the contact.
 
         Args:
-            predictor: The model of this sensor.
+            predictor: Model with which the contacts are predicted.
             device: Settings of the board.
-            chain: Settings of the signal chain; by default those of the device.
-            parser: Parser of the frames; by default that of the device.
-            gaps: Counter of missing frame numbers; by default a new one.
-            policy: Which frames have a record.
-            now_ns: Function that returns the time of the clock of `Chunk.clock_ns`, ns, for latencies.
-            frame_id: Name of this film in its records; by default that of the model's sensor.
+            chain: Settings of the signal chain. By default, the settings in the device file are used.
+            parser: Parser of the frames. By default, the parser that the device file describes is used.
+            gaps: Counter of missing frame numbers. By default, a new counter is created.
+            policy: Rule that decides for which frames the stream yields a record.
+            now_ns: Function that returns the present time, ns, on the clock of `Chunk.clock_ns`. It is used to measure
+                the latency of each record.
+            frame_id: Name of the film, which each record contains. By default, the name in the metadata of the model is
+                used.
 
         Raises:
-            DeviceError: If the device file has other electrodes than the model.
-            ModelError: If the film is to be followed, but the model does not allow it.
+            DeviceError: If the device file contains settings for other electrodes than those of the model.
+            ModelError: If the device file requires that the film is followed, but the film of this model cannot be
+                followed.
         """
         self._readings = ReadingStream(
             predictor.metadata.electrodes,
@@ -153,7 +162,7 @@ class TouchStream:
             chain=chain,
             parser=parser,
             gaps=gaps,
-            misfit=self._misfit,
+            misfit=self._misfit,  # is only called for frames, after `_set_model` below
             reader=f"model {predictor.metadata.label}",
         )
         self.parser = self._readings.parser
@@ -172,17 +181,19 @@ class TouchStream:
         self._set_model(predictor)
 
     def _set_model(self, predictor: Predictor) -> None:
-        """Build the stages that the device file requests, and use them from the next frame on.
+        """Create the stages that the device file requires, and use them from the next frame on.
 
-        All stages are built before the first attribute is changed, so that an error changes nothing.
+        All stages are created before the first attribute is changed. If a stage cannot be created, the stream is
+        therefore unchanged.
 
         Args:
-            predictor: The model, with which the stages begin.
+            predictor: Model with which the stages begin. If the film is followed, the stages change their model later.
 
         Raises:
-            ModelError: If a stage cannot use the model. The stream then keeps its stages.
+            ModelError: If a stage cannot use the model.
         """
-        model = CurrentModel(predictor)
+        model = CurrentModel(predictor)  # shared by all stages
+        # The stages process each frame in this order.
         stages: list[ContactStage] = [PredictionStage(model)]
         film_stage = None
         if self._follow_rule is not None:
@@ -203,11 +214,13 @@ class TouchStream:
         self.frame_id = self._given_name or predictor.metadata.frame_id
 
     def use(self, predictor: Predictor) -> None:
-        """Continue with another model of the same electrodes. The tare and the signal chain keep their state.
+        """Use another model with the same electrodes from the next frame on.
+
+        The tare and the state of the signal chain are not changed.
 
         Raises:
-            ModelError: If the model has other electrodes, or the electrodes in another order, or a stage cannot use
-                the model. The stream then keeps its present model.
+            ModelError: If the model has other electrodes or another order of the electrodes, or if a stage cannot use
+                the model. The present model then remains in use.
         """
         present = self.predictor.metadata
         new = predictor.metadata
@@ -220,17 +233,21 @@ class TouchStream:
 
     @property
     def has_tracking(self) -> bool:
-        """Whether contacts are tracked, so that records have the fields of a `Tracking`."""
+        """Whether contacts are tracked. The records then contain the fields of a `Tracking`."""
         return self._tracker is not None
 
     @property
     def has_film(self) -> bool:
-        """Whether the film is followed, so that records have the field `film`."""
+        """Whether the film is followed. The records then contain the field `film`."""
         return self._follow_rule is not None
 
     @property
     def answering_predictor(self) -> Predictor:
-        """The current model. If the film is followed, this is the model of the film at its estimated pretension."""
+        """Model with which the contacts are predicted at present.
+
+        If the film is followed, this is the model of the film at its estimated pretension. Otherwise it is the loaded
+        model.
+        """
         return self._model.predictor
 
     def tare(self) -> None:
@@ -239,32 +256,33 @@ class TouchStream:
         self._discard_contact()
 
     def reset_film(self) -> None:
-        """Reset the followed film to its calibration. If the film is not followed, nothing changes."""
+        """Reset the estimate of the film to its calibration. If the film is not followed, nothing changes."""
         if self._film_stage is not None:
             self._film_stage.reset_film()
 
     def _discard_contact(self) -> None:
-        """Discard the present contact."""
+        """Discard the state of the present contact in all stages, for example after an outage."""
         for stage in self._stages:
             stage.reset()
 
     def restart(self) -> None:
-        """Return to the state of a new stream, so that later records depend only on later bytes.
+        """Return to the state of a new stream.
 
-        The counts of `totals` continue.
+        All later records therefore depend only on later bytes. Only the counts that `totals` returns include the time
+        before the restart.
         """
-        self._before_restart = self.totals()  # `totals` adds them to the counts of the new parser
+        self._before_restart = self.totals()  # `totals` adds these counts to the counts of the new parser
         self._readings.restart()
         self._discard_contact()
         self.reset_film()
 
-        # The path from chunks to readings has created new objects.
+        # `self._readings.restart` has created new objects.
         self.parser = self._readings.parser
         self.gaps = self._readings.gaps
         self.clock = self._readings.clock
 
     def totals(self) -> StreamTotals:
-        """Return the counts since the stream began."""
+        """Return the counts of the stream since it began, including the counts before its latest restart."""
         counts = self.parser.counts
         since_restart = StreamTotals(
             frames=counts.frames,
@@ -276,23 +294,23 @@ class TouchStream:
             bytes_dropped=counts.bytes_dropped,
             resyncs=counts.resyncs,
         )
-        pairs = zip(self._before_restart, since_restart, strict=True)
-        return StreamTotals(*(before + since for before, since in pairs))
+        count_pairs = zip(self._before_restart, since_restart, strict=True)
+        return StreamTotals(*(count_before + count_since for count_before, count_since in count_pairs))
 
     def feed(self, chunk: Chunk) -> Iterator[PredictionRecord]:
-        """Yield the records of the frames that end in this chunk.
+        """Process a chunk, and yield the records of the frames whose last byte is in the chunk.
 
         Raises:
-            ChargeError: If a frame has another number of charges than the model.
+            ChargeError: If a frame has no value for an electrode of the model.
             TareError: If the film is touched during the whole search for a tare.
-            PortError: If the bytes contain no frames.
+            PortError: If the stream has contained no intact frame in many bytes.
         """
         if chunk.outage_s > 0.0:
             self.counts.outages += 1
             self._discard_contact()
         frames = self._readings.frames(chunk)
-        # The policy `latest` gives a record only to the last frame of a chunk. The signal chain needs all frames. The
-        # flags of skipped frames are collected, because some of them also matter for the frame with the record.
+        # With the policy `latest`, only the last frame of a chunk has a record. The signal chain still processes all
+        # frames. Some flags of the skipped frames are added to the record of the last frame.
         skipped_flags: set[str] = set()
         for number, frame in enumerate(frames, start=1):
             timed = self._readings.advance(frame, chunk)
@@ -308,20 +326,20 @@ class TouchStream:
         self._readings.end_chunk(frames, chunk)
 
     def finish(self) -> None:
-        """End the stream, as at the end of a file.
+        """Finish the stream, for example at the end of a file.
 
         Raises:
-            PortError: If there was no intact frame.
+            PortError: If the whole stream has contained no intact frame.
         """
         self._readings.finish()
 
     def _record(self, chunk: Chunk, frame: Frame, timed: TimedReading) -> PredictionRecord:
-        """Return the record of a frame. The latency is measured last, after the contact has been computed.
+        """Compute the contact of a frame, and return the prediction record of the frame.
 
         Args:
-            chunk: The chunk in which the frame ends.
+            chunk: The chunk that contains the last byte of the frame.
             frame: The frame.
-            timed: Charges of the frame, and its time.
+            timed: Touch charges and time of the frame.
         """
         reading, reading_time = timed
         contact_frame = ContactFrame(reading, reading_time.clock_s, reading.flags)
@@ -340,7 +358,7 @@ class TouchStream:
             charge_raw_pC=self._by_electrode(reading.raw_pC),
             tare_pC=self._by_electrode(tare_pC),
             flags=contact_frame.flags,
-            latency_us=(self._now_ns() - chunk.clock_ns) / 1e3,
+            latency_us=(self._now_ns() - chunk.clock_ns) / 1e3,  # includes the time that the stages have taken
             model=self._label,
             frame_id=self.frame_id,
             tracking=contact_frame.tracking,
@@ -348,7 +366,11 @@ class TouchStream:
         )
 
     def _by_electrode(self, charge_pC: Array | None) -> Charges | None:
-        """Return charges by electrode name; None for a charge that is not a number."""
+        """Return the charges as a dictionary by electrode name. A charge that is not a finite number becomes None.
+
+        Args:
+            charge_pC: Charges in the order of the electrodes, shape (n_electrode,), pC; None if there are no charges.
+        """
         if charge_pC is None:
             return None
         charges: Charges = {}
@@ -357,17 +379,21 @@ class TouchStream:
         return charges
 
     def _misfit(self, charge_pC: Array) -> Reals:
-        """Return the misfits of charges with the current model.
+        """Return how badly the current model explains charges.
 
-        The charges (pC) have the shape (n, electrodes), and the misfits have the shape (n,).
+        Args:
+            charge_pC: Charges of n frames, shape (n, n_electrode), pC.
+
+        Returns:
+            Misfits, shape (n,), in standard deviations of the noise.
         """
         return self.answering_predictor.predict_batch(charge_pC).misfit
 
 
 def _contact_fields(frame: ContactFrame) -> Mapping[str, Any]:
-    """Return the fields of a record that describe its contact.
+    """Return the names and values of the fields of a record that describe the contact.
 
-    The fields are null if the frame is invalid. If nothing touches, the force is 0 and the position is null.
+    If the frame is invalid, all values are None. If nothing touches the film, the force is 0, and the position is None.
     """
     if frame.contact is not None:
         return frame.contact.fields()
@@ -377,12 +403,13 @@ def _contact_fields(frame: ContactFrame) -> Mapping[str, Any]:
 
 
 def _with_lasting_flags(reading: Reading, skipped_flags: set[str]) -> Reading:
-    """Add flags of skipped frames to a reading.
+    """Return a reading to which flags of skipped frames have been added.
 
-    Only flags that describe earlier events, such as lost frames, are added.
+    Only the flags in `LASTING_FLAGS` are added. Such a flag describes an event before the reading, for example lost
+    frames.
 
     Args:
-        reading: The reading.
+        reading: Reading of the next frame that has a record.
         skipped_flags: All flags of the skipped frames.
     """
     added_flags = tuple(flag for flag in LASTING_FLAGS if flag in skipped_flags and flag not in reading.flags)

@@ -1,4 +1,4 @@
-"""Model folders: metadata, ONNX session, golden vectors, companion files, Triton configuration, and search by name.
+"""Folders of models: their metadata, ONNX sessions, golden vectors and companion files, and the search for a model.
 
 May import: nothing else of isocharge.serve.
 """

@@ -1,16 +1,18 @@
-"""Charges of a film as a Chebyshev series in position and force. The file `charges.npz` stores the series.
+"""Charges of a film, described by a Chebyshev series in the position and the force of the contact.
 
-A network maps charges to a contact. If several contacts give the same charges (a fold of the forward map), a network
-cannot distinguish them. The tracker then compares the measured charges with this series:
+A network maps charges to a contact. Near a fold of the forward map, several contacts give the same charges, and a
+network cannot distinguish these contacts. The tracker then compares the measured charges with the charges of this
+series:
 
     ln Q_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree,
 
 where T_i are Chebyshev polynomials, r is the largest distance of a contact from the centre, and l is the logarithm of
-the force, scaled to [-1, 1]. The file is in the same folder as `model.onnx` and contains three arrays.
+the force, scaled to [-1, 1]. The series is stored in the file `charges.npz`, which is in the same folder as
+`model.onnx`. The file contains three arrays.
 
-- `series`: the coefficients c, shape (degree + 1, degree + 1, force_degree + 1, n_electrode).
-- `radius_mm`: the largest distance r.
-- `force_N`: the smallest and the largest force.
+- `series`: the coefficients c of the Chebyshev series, shape (degree + 1, degree + 1, force_degree + 1, n_electrode).
+- `radius_mm`: the largest distance r of a contact from the centre, mm.
+- `force_N`: the smallest and the largest force of a contact, N.
 """
 
 import io
@@ -53,7 +55,7 @@ N_CHECKED_FORCES = 5
 
 @dataclass(frozen=True)
 class ChargeSeries:
-    """Charges of all contacts up to a given distance from the centre of the film.
+    """Charges of a film as a function of the contact, for contacts up to a given distance from the centre of the film.
 
     Attributes:
         series: Series of ln Q, where Q is the charge in pC.
@@ -75,8 +77,9 @@ class ChargeSeries:
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute the charges of contacts and their derivatives.
 
-        The series gives ln Q as a function of coordinates between -1 and 1, to which the contact is converted. Outside
-        the range of forces, ln Q is extrapolated linearly in ln F, with the slope at the end of the range.
+        The series gives ln Q, the logarithm of the charge, as a function of coordinates between -1 and 1. The contacts
+        are converted to these coordinates. Outside the range of forces, ln Q is extrapolated as a linear function of
+        the logarithm of the force, with the slope at the nearest end of the range.
 
         Args:
             contact: Contacts (x, y, ln F), shape (n, 3), with x and y in mm and F in N.
@@ -91,15 +94,16 @@ class ChargeSeries:
         scale = np.array([self.radius_mm, self.radius_mm, 0.5 * (max_log_force - min_log_force)])
         unit_contact = (contact - centre) / scale
 
-        # ln Q, followed by its derivatives with respect to the three coordinates, shape (n, 4, n_electrode)
-        values = self.series.values(unit_contact)
+        # ln Q, followed by its derivatives with respect to the three coordinates, shape (n, 4, n_electrode). The series
+        # is evaluated at the end of the range of forces if the force is outside this range.
+        values = self.series.values_and_derivatives(unit_contact)
         log_charge = values[:, 0]
         log_slopes = values[:, 1:]  # shape (n, 3, n_electrode)
         log_force_slope = log_slopes[:, -1]  # with respect to the coordinate of the force
 
         unit_force = unit_contact[:, 2:]  # shape (n, 1)
         distance_from_range = unit_force - np.clip(unit_force, -1.0, 1.0)  # 0 within the range of forces
-        charge_pC = np.exp(log_charge + distance_from_range * log_force_slope)
+        charge_pC = np.exp(log_charge + distance_from_range * log_force_slope)  # shape (n, n_electrode)
 
         # dQ = Q d(ln Q). The division by the scale converts the derivatives to the units of the contact.
         electrode_slopes = log_slopes.swapaxes(1, 2)  # shape (n, n_electrode, 3)
@@ -116,10 +120,10 @@ class ChargeSeries:
 
 
 def read_charges(version_folder: Path, n_electrode: int) -> ChargeSeries | None:
-    """Read the file `charges.npz` beside a model; return None if there is none.
+    """Read the series in the file `charges.npz` of a model. Return None if the model has no such file.
 
     Args:
-        version_folder: The folder that holds `model.onnx`.
+        version_folder: Folder of the model, which contains `model.onnx`.
         n_electrode: Number of electrodes of the model.
 
     Raises:
@@ -136,10 +140,10 @@ def read_charges(version_folder: Path, n_electrode: int) -> ChargeSeries | None:
 
 
 def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> ChargeSeries:
-    """Create the series of ln Q from the arrays of a file, and check it.
+    """Create the Chebyshev series of the charges from the arrays of a file, and check the series.
 
-    The charge Q of each electrode is given by a Chebyshev series in x, y and the logarithm of the force. The series has
-    degree + 1 coefficients along each of these axes.
+    The logarithm of the charge of each electrode is a Chebyshev series in x, y and the logarithm of the force. Along
+    each of these three axes, a series of degree n has n + 1 coefficients.
 
     Args:
         arrays: Arrays of the file by name.
@@ -167,7 +171,7 @@ def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Charge
 
 
 def read_contact_range(arrays: Mapping[str, np.ndarray]) -> tuple[float, tuple[float, float]]:
-    """Return the range of contacts of a series from the arrays `radius_mm` and `force_N` of a file.
+    """Read the range of contacts for which a series is valid from the arrays `radius_mm` and `force_N` of a file.
 
     Args:
         arrays: Arrays of the file by name.
@@ -191,12 +195,13 @@ def read_contact_range(arrays: Mapping[str, np.ndarray]) -> tuple[float, tuple[f
 
 
 def _check_charges(charges: ChargeSeries) -> None:
-    """Check the charges of some contacts.
+    """Check that the charges of some contacts are finite and positive, and change with the contact.
 
-    The contacts lie on a circle with half of the radius of the series. Every contact of the circle has several forces.
+    The contacts lie on a circle with half of the radius of the series. Several forces are checked at each point of the
+    circle.
 
     Raises:
-        ValueError: If the charges overflow, or do not depend on the position or on the force.
+        ValueError: If a charge is not finite or not positive, or if no charge changes with x, with y or with the force.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, N_CHECKED_DIRECTIONS, endpoint=False)
     positions_mm = 0.5 * charges.radius_mm * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -204,12 +209,12 @@ def _check_charges(charges: ChargeSeries) -> None:
     log_forces = np.log(np.geomspace(min_force_N, max_force_N, N_CHECKED_FORCES))
     contacts = np.array([[x_mm, y_mm, log_force] for x_mm, y_mm in positions_mm for log_force in log_forces])
     with np.errstate(over="ignore", invalid="ignore"):  # charges that overflow are reported below
-        charge_pC, derivative = charges.linearised(contacts)
+        charge_pC, slopes = charges.linearised(contacts)  # shapes (n, n_electrode) and (n, n_electrode, 3)
 
-    is_finite = np.isfinite(charge_pC).all() and np.isfinite(derivative).all()
+    is_finite = np.isfinite(charge_pC).all() and np.isfinite(slopes).all()
     if not (is_finite and (charge_pC > 0.0).all()):
         raise ValueError("series: expected charges that are finite and positive for every contact")
-    # The largest derivative of any contact and electrode with respect to x, y and ln F, shape (3,)
-    largest_slopes = np.abs(derivative).max(axis=(0, 1))
+    # Largest magnitude of the derivatives with respect to x, y and ln F over all contacts and electrodes, shape (3,)
+    largest_slopes = np.abs(slopes).max(axis=(0, 1))
     if not (largest_slopes > 0.0).all():
         raise ValueError("series: expected charges that change with x, y and the force")

@@ -1,8 +1,9 @@
-"""Companion files, such as `charges.npz`, which belong to one `model.onnx` and are in the same folder.
+"""Companion files of a model, such as `charges.npz`, which belong to one `model.onnx` and are in its folder.
 
-`golden.json` contains the checksum of each companion file. A companion file of another model has the right format, but
-would give wrong contacts. A file whose checksum differs or is missing is therefore refused. Models that were written
-before companion files had checksums are still read, with a warning in the log.
+The file `golden.json` contains the checksum of each companion file. A companion file of another model would have the
+right format but give wrong contacts. A companion file is therefore refused if its checksum differs from the checksum in
+`golden.json`, or if `golden.json` does not list the file. Earlier versions of isocharge wrote no checksums of companion
+files. The companion files of models from these versions are read without a comparison, and a warning is logged.
 """
 
 import logging
@@ -18,10 +19,11 @@ log = logging.getLogger(__name__)
 def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
     """Read a companion file from the folder of a `model.onnx`, and compare it with its checksum in `golden.json`.
 
-    A folder of an earlier version has no checksums of companion files. The file is then read without a comparison.
+    Models that were written by earlier versions have no checksums of companion files. The companion files of such
+    models are read without a comparison, and a warning is logged.
 
     Args:
-        version_folder: The folder that holds `model.onnx`.
+        version_folder: Folder of the model, which contains `model.onnx`.
         name: Name of the companion file.
         advice: What the user can do if the file cannot be read, for the error message.
 
@@ -29,18 +31,19 @@ def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
         The bytes of the file.
 
     Raises:
-        ModelError: If the file cannot be read, or its checksum is not the one in `golden.json`.
+        ModelError: If the file cannot be read, if its checksum differs from the checksum in `golden.json`, or if
+            `golden.json` is damaged or does not list the file.
     """
     path = version_folder / name
     data = read_needed(path, ModelError, advice)
     golden_path = version_folder / "golden.json"
-    checksums = None
+    checksums = None  # stays None if a model of an earlier version has no checksums of companion files
     if golden_path.exists():
         checksums = read_golden(golden_path).companion_sha256
     if checksums is None:
         log.warning("%s: golden.json holds no checksum of this file; whether it fits model.onnx is not verified", path)
         return data
-    expected_sha256 = checksums.get(name, "no such file")  # the text is no checksum, so that the comparison fails
+    expected_sha256 = checksums.get(name, "no such file")  # this text differs from every checksum
     actual_sha256 = sha256_of(data)
     if actual_sha256 != expected_sha256:
         raise ModelError(

@@ -1,18 +1,20 @@
-"""The file `film_directions.npz` of a calibrated model: unknowns of the film other than its pretension.
+"""The file `film_directions.npz` of a calibrated model, which describes the unknowns of the film except its pretension.
 
-After a calibration, the parameters of the film, its imperfections, its discrepancy and its gains have a joint
-uncertainty. The misfits of touches identify only a few linear combinations of these unknowns, the directions. A change
-along a direction changes the charges of a contact by a relative amount that depends on the contact:
+After a calibration, several unknowns of the film remain uncertain: its parameters, its imperfections, its discrepancy
+and its gains. From the misfits of touches, only a few linear combinations of these unknowns can be estimated. These
+linear combinations are called directions. A change along a direction changes the charges of a contact by a relative
+amount that depends on the contact:
 
     ln Q_e = ln Q_e(calibrated film) + sum over k of z_k s_ke(x, y, F),
 
-where the z_k are independent and have the standard deviation 1 at a given pretension. The s_ke are Chebyshev series, as
-in `charge_series`. The file contains these arrays:
+where Q_e is the charge of electrode e, and z_k is the change along direction k. At a given pretension, the changes z_k
+are independent and have the standard deviation 1. Each s_ke is a Chebyshev series, as in the module `charge_series`.
+The file contains the following arrays:
 
     series             coefficients of s, shape (degree + 1, degree + 1, force_degree + 1, n_direction, n_electrode)
     radius_mm          largest distance of a contact from the centre, mm
     force_N            smallest and largest force, N
-    by_pretension      change of the mean of each z_k with the pretension, shape (n_direction,), 1/MPa
+    by_pretension      derivative of the mean of each z_k with respect to the pretension, shape (n_direction,), 1/MPa
     log_charge         optional: coefficients of ln Q of the calibrated film, shape (degree + 1, degree + 1,
                        force_degree + 1, n_electrode), where the degrees may differ from those of `series`
 """
@@ -60,14 +62,15 @@ MAX_CHANGE_WITH_PRETENSION = 1e3
 
 @dataclass(frozen=True)
 class FilmDirections:
-    """Linear combinations of the unknowns (directions) in which the film is uncertain at a given pretension.
+    """Uncertain linear combinations of the unknowns of a film, called directions, and their effects on the charges.
 
     Attributes:
         coefficients: Coefficients of the series, shape (degree + 1, degree + 1, force_degree + 1, n_direction,
             n_electrode).
         radius_mm: Largest distance of a contact from the centre, mm.
         force_N: Smallest and largest force, N.
-        by_pretension: Change of the mean of each direction with the pretension, shape (n_direction,), 1/MPa.
+        by_pretension: Derivative of the mean of each direction with respect to the pretension, shape (n_direction,),
+            1/MPa.
         log_charge_coefficients: Coefficients of the series of ln Q of the calibrated film, shape (degree + 1, degree +
             1, force_degree + 1, n_electrode). None if the file does not contain them.
     """
@@ -82,7 +85,7 @@ class FilmDirections:
     def none(cls, n_electrode: int) -> "FilmDirections":
         """Return an empty set of directions.
 
-        The empty set is used for a model that was calibrated by an earlier version.
+        A model that was calibrated by an earlier version of isocharge has no directions.
         """
         no_coefficients = np.zeros((1, 1, 1, 0, n_electrode))
         return cls(no_coefficients, radius_mm=1.0, force_N=(1.0, 2.0), by_pretension=np.zeros(0))
@@ -99,14 +102,15 @@ class FilmDirections:
 
     @cached_property
     def _log_charge_series(self) -> Series | None:
-        """Chebyshev series of ln Q of the calibrated film, or None if its coefficients are unknown."""
+        """Chebyshev series of ln Q, the logarithms of the charges of the calibrated film. None if it is unknown."""
         return None if self.log_charge_coefficients is None else Series(self.log_charge_coefficients)
 
     def log_changes(self, contact: Array) -> Array:
-        """Compute the changes of ln Q, the logarithm of each charge, that one unit of each direction causes.
+        """Compute the change of ln Q, the logarithm of each charge, by one unit of each direction.
 
-        A direction is a linear combination of the unknowns of the film, and one unit of it is one standard deviation. A
-        contact outside the valid range (radius and forces) is replaced by the nearest contact inside this range.
+        A direction is a linear combination of the unknowns of the film. One unit of a direction is one standard
+            deviation. A contact beyond the largest radius or outside the range of forces is replaced by the nearest
+            contact within these limits.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -119,16 +123,17 @@ class FilmDirections:
             return np.zeros((len(contact), 0, n_electrode))
 
         # The first entry of axis 1 is the value of the series. Its derivatives follow in this axis.
-        log_changes = self._series.values(self._unit_contact(contact))[:, 0]
+        log_changes = self._series.values_and_derivatives(self._unit_contact(contact))[:, 0]
         return np.asarray(log_changes.reshape(len(contact), n_direction, n_electrode))
 
     def misfit_slopes(self, contact: Array, charge_pC: Array, noise_std_pC: Array) -> Array | None:
         """Compute the derivatives of the misfit vectors of touches with respect to the logarithms of their charges.
 
-        The misfit vector is the part of the charges that no contact explains. Let d be a small change of ln Q, and D
-        the changes Q d / sigma of the charges in units of their noise. A change of the contact explains the projection
-        of D onto the plane that the derivatives of the charges with respect to the contact span. The misfit vector
-        changes by the rest of D.
+        The misfit vector is the part of the charges, in units of their noise, that no contact explains. Let d be a
+        small change of ln Q, the logarithms of the charges. In units of their noise, the charges then change by the
+        vector D = Q d / sigma. A change of the contact explains the projection of D onto the subspace that the
+        derivatives of the charges with respect to the contact span. The misfit vector changes by the remaining part of
+        D.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -141,22 +146,31 @@ class FilmDirections:
         """
         if self._log_charge_series is None:
             return None
-        # The first entry of axis 1 is ln Q. Its derivatives follow. They span the same plane in any coordinates.
-        log_slopes = self._log_charge_series.values(self._unit_contact(contact))[:, 1:].swapaxes(1, 2)
-        relative_charge = (charge_pC / noise_std_pC)[:, :, None]  # change of the charge by one unit of ln Q
-        contact_slopes = relative_charge * log_slopes  # shape (n, n_electrode, 3)
+        # The first entry of axis 1 is ln Q. The derivatives of ln Q with respect to the three coordinates follow. The
+        # derivatives span the same subspace for any choice of the coordinates.
+        unit_contact = self._unit_contact(contact)
+        values = self._log_charge_series.values_and_derivatives(unit_contact)  # shape (n, 4, n_electrode)
+        log_slopes = values[:, 1:].swapaxes(1, 2)  # shape (n, n_electrode, 3)
 
-        explained_part = contact_slopes @ np.linalg.pinv(contact_slopes)
-        unexplained_part = np.eye(charge_pC.shape[1]) - explained_part
-        return np.asarray(unexplained_part * relative_charge.swapaxes(1, 2))
+        # Change of each charge, in units of its noise, by one unit of ln Q and by one unit of each coordinate
+        charge_slopes = charge_pC / noise_std_pC  # Q / sigma, shape (n, n_electrode)
+        contact_slopes = charge_slopes[:, :, None] * log_slopes  # shape (n, n_electrode, 3)
+
+        # Matrices that project a change D of the charges, each of shape (n, n_electrode, n_electrode)
+        explained_projection = contact_slopes @ np.linalg.pinv(contact_slopes)
+        unexplained_projection = np.eye(charge_pC.shape[1]) - explained_projection
+        return np.asarray(unexplained_projection * charge_slopes[:, None, :])
 
     def _unit_contact(self, contact: Array) -> Array:
-        """Return the coordinates of contacts between -1 and 1, of which the series are functions.
+        """Convert contacts to the variables of the series, which are coordinates between -1 and 1.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Coordinates of x, of y and of the logarithm of the force, shape (n, 3), dimensionless.
         """
-        # The force has a logarithmic coordinate.
+        # Logarithm of the force, scaled to [-1, 1]; forces outside the range are replaced by its nearest end.
         min_force_N, max_force_N = self.force_N
         min_log_force, max_log_force = np.log(self.force_N)
         log_force = np.log(np.clip(contact[:, 2], min_force_N, max_force_N))
@@ -183,12 +197,13 @@ class FilmDirections:
 
 
 def read_film_directions(version_folder: Path, n_electrode: int) -> FilmDirections:
-    """Read the file `film_directions.npz` beside a model.
+    """Read the directions of a film from the file `film_directions.npz` of its model.
 
-    Models that were calibrated by an earlier version have no such file, and no directions.
+    If the file does not exist, return an empty set of directions. Models that were calibrated by an earlier version of
+    isocharge have no such file.
 
     Args:
-        version_folder: The folder that holds `model.onnx`.
+        version_folder: Folder of the model, which contains `model.onnx`.
         n_electrode: Number of electrodes of the model.
 
     Raises:
@@ -205,10 +220,10 @@ def read_film_directions(version_folder: Path, n_electrode: int) -> FilmDirectio
 
 
 def _film_directions(arrays: Mapping[str, np.ndarray], n_electrode: int) -> FilmDirections:
-    """Create the directions from the arrays of a file, and check them.
+    """Check the arrays of a file, and return the directions that they describe.
 
-    A direction is a linear combination of the unknowns of the film, such as its gains. A Chebyshev series in x, y and
-    the force gives the change of ln Q, the logarithm of each charge, for one unit of each direction.
+    A direction is a linear combination of the unknowns of the film, such as its gains. For each direction, a Chebyshev
+    series in x, y and the force gives the change of ln Q, the logarithm of each charge, by one unit of the direction.
 
     Args:
         arrays: Arrays of the file by name.
@@ -229,7 +244,7 @@ def _film_directions(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Film
     if largest_log_change > MAX_LOG_CHANGE:
         raise ValueError(f"series: expected changes of ln Q up to {MAX_LOG_CHANGE:g}, got up to {largest_log_change:g}")
 
-    # Change of the mean of each direction with the pretension of the film, 1/MPa
+    # Derivative of the mean of each direction with respect to the pretension of the film, shape (n_direction,), 1/MPa
     by_pretension = finite_array(arrays, "by_pretension", (n_direction,))
     largest_change = float(np.abs(by_pretension).max(initial=0.0))
     if largest_change > MAX_CHANGE_WITH_PRETENSION:
@@ -243,7 +258,9 @@ def _film_directions(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Film
 
 
 def _log_charge_coefficients(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Array | None:
-    """Return the coefficients of ln Q of the calibrated film, or None if the file does not contain them.
+    """Check and return the coefficients of the Chebyshev series for the charges of the calibrated film.
+
+    The series gives ln Q, the logarithm of each charge. The result is None if the file does not contain the series.
 
     Args:
         arrays: Arrays of the file by name.
@@ -256,18 +273,20 @@ def _log_charge_coefficients(arrays: Mapping[str, np.ndarray], n_electrode: int)
         return None
     coefficients = finite_array(arrays, LOG_CHARGE, (None, None, None, n_electrode))
     _check_degrees(LOG_CHARGE, coefficients)
-    largest = float(np.abs(coefficients).sum(axis=(0, 1, 2)).max(initial=0.0))
+    # A Chebyshev polynomial is at most 1, so a series is at most the sum of the magnitudes of its coefficients.
+    max_log_charges = np.abs(coefficients).sum(axis=(0, 1, 2))  # shape (n_electrode,)
+    largest = float(max_log_charges.max(initial=0.0))
     if largest > MAX_LOG_CHARGE:
         raise ValueError(f"{LOG_CHARGE}: expected values of ln Q up to {MAX_LOG_CHARGE:g}, got up to {largest:g}")
     return coefficients
 
 
 def _check_degrees(name: str, coefficients: Array) -> None:
-    """Check the degrees of a Chebyshev series in x, y and the force.
+    """Check that the degrees of a Chebyshev series in x, y and the force are valid.
 
     Args:
         name: Name of the array in the file.
-        coefficients: Coefficients; the first three axes are the degrees in x, y and the force.
+        coefficients: Coefficients. The indices of the first three axes are the degrees in x, y and the force.
 
     Raises:
         ValueError: If the degrees in x and y differ, or a degree is too large.

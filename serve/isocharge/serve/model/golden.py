@@ -1,8 +1,12 @@
 """Golden vectors of a model, which are input charges and the outputs that the model computed when it was exported.
 
-The checksum shows whether `model.onnx` is still the released file. The outputs show whether another machine or another
-version of onnxruntime computes the same results. A computed output a and a stored output b are the same if
-|a - b| <= 1e-5 max(|b|, floor).
+The file `golden.json` stores the golden vectors and the checksum of `model.onnx`. The checksum shows whether
+`model.onnx` is still the released file. A comparison with the stored outputs shows whether another machine or another
+version of onnxruntime computes the same outputs. A computed output a agrees with a stored output b if
+
+    |a - b| <= 1e-5 max(|b|, floor),
+
+where the floor is a constant for each column of the output.
 """
 
 import json
@@ -44,12 +48,17 @@ REFERENCE_FORCE_N = 2.0
 
 
 def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
-    """Return the floors of x and y, mm, and of the force, N, for the outputs `contact` and `contact_std` of a model.
+    """Return the floors of x (mm), y (mm) and the force (N) for the outputs `contact` and `contact_std` of a model.
 
-    When outputs are compared, their tolerance is relative to the larger of the absolute value and the floor of the
-    output. The floors of a small film are constants. For larger films, the floors of the position grow with the radius
-    of the working area, or with the position error of the model if this gives larger floors. The floor of the force
-    grows with the largest force.
+    When two outputs are compared, the tolerance is proportional to the magnitude of the output. Below the floor, the
+    tolerance is constant.
+
+    The floors have the values of `FLOORS` for a small film. The floors of x and y grow in proportion to the radius of
+    the working area above `REFERENCE_RADIUS_MM`, and are at least the rms position error of the model. The floor of the
+    force grows in proportion to the largest force above `REFERENCE_FORCE_N`.
+
+    Args:
+        metadata: Metadata of the model.
     """
     x_floor_mm, y_floor_mm, force_floor_N = FLOORS["contact"]
     radius_mm = max(math.hypot(x_mm, y_mm) for x_mm, y_mm in metadata.working_area_mm)
@@ -101,13 +110,13 @@ class Golden:
 def make_golden(
     session: ort.InferenceSession, onnx_model: bytes, charge_pC: Singles, contact_floor: tuple[float, float, float]
 ) -> Golden:
-    """Compute the golden vectors of a new model, which are input charges with the outputs that the model must give.
+    """Compute the golden vectors of a new model, which are given charges and the outputs for these charges.
 
     Args:
         session: Session of the model.
-        onnx_model: Content of `model.onnx`, of which the checksum is computed.
+        onnx_model: Content of `model.onnx`, whose checksum is stored.
         charge_pC: Input charges, shape (n, electrodes), pC.
-        contact_floor: Floors of x and y, mm, and of the force, N, as `contact_floors` returns them.
+        contact_floor: Floors of x (mm), y (mm) and the force (N) for the comparison of outputs, from `contact_floors`.
 
     Raises:
         ModelError: If an output is not finite.
@@ -116,22 +125,23 @@ def make_golden(
     for name, rows in outputs.items():
         bad_rows = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if bad_rows.size:
-            row = bad_rows[0]  # the message shows the first of them
+            bad_row = bad_rows[0]  # the message shows only the first of the bad rows
             raise ModelError(
-                f"the new model: {name}: expected finite outputs, got {rows[row]} for the charges {charge_pC[row]} pC"
+                f"the new model: {name}: expected finite outputs, got {rows[bad_row]} for the charges "
+                f"{charge_pC[bad_row]} pC"
             )
-    floors = FLOORS | {"contact": contact_floor, "contact_std": contact_floor}
+    floor_of_output = FLOORS | {"contact": contact_floor, "contact_std": contact_floor}
     return Golden(
         sha256=sha256_of(onnx_model),
         charge_pC=charge_pC,
         outputs=outputs,
         relative=RELATIVE_TOLERANCE,
-        floors={name: floors[name] for name in outputs},
+        floors={name: floor_of_output[name] for name in outputs},  # some models compute no correlations
     )
 
 
 def read_golden(path: Path) -> Golden:
-    """Read the golden vectors of a model, which are stored charges and outputs, from its file `golden.json`.
+    """Read the golden vectors of a model (input charges and stored outputs) from the file `golden.json`.
 
     Raises:
         ModelError: If the file is missing or damaged.
@@ -195,7 +205,7 @@ class _Tolerance(Struct):
 
 
 class _GoldenFile(Struct):
-    """The content of `golden.json`. The number of rows of the outputs is checked when the model is read."""
+    """The content of `golden.json`. `load_model` checks that each output has one row for each press."""
 
     sha256: Text
     inputs: _Inputs
@@ -205,21 +215,22 @@ class _GoldenFile(Struct):
 
 
 def _float32_array(rows: Sequence[Sequence[float]]) -> Singles:
-    """Return rows of numbers as a float32 array of shape (n, width).
+    """Convert rows of numbers to a float32 array of shape (n, width).
 
-    Numbers that are too large for float32 become infinite, so that they differ from every output of a model.
+    Numbers that are too large for float32 become infinite. An infinite number differs from every output of a model, so
+    the comparison with the outputs fails.
     """
     if not rows:
-        return np.zeros((0, 0), dtype=np.float32)
+        return np.zeros((0, 0), dtype=np.float32)  # the conversion below would return an array with one axis
     with np.errstate(over="ignore"):
         return np.array(rows, dtype=np.float64).astype(np.float32)
 
 
 def check_outputs(golden: Golden, outputs: dict[str, Singles], where: str) -> None:
-    """Compare the outputs that a model has computed from the golden charges with the stored outputs.
+    """Check that the outputs that a model has computed from the golden charges agree with the stored outputs.
 
     Args:
-        golden: Golden vectors.
+        golden: Golden vectors with the stored outputs and the tolerances.
         outputs: Computed outputs by name, each of shape (n, width).
         where: Name or file of the model, for error messages.
 
@@ -231,12 +242,14 @@ def check_outputs(golden: Golden, outputs: dict[str, Singles], where: str) -> No
         # Below its floor, a value has a constant tolerance, because a relative tolerance would approach 0.
         tolerance = golden.relative * np.maximum(np.abs(expected), golden.floors[name])
         with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 with a tolerance of 0 is reported as a difference
-            ratio = np.abs(actual - expected) / tolerance  # shape (n, width)
-        if (ratio <= 1.0).all():
+            # Differences as multiples of the tolerance, shape (n, width)
+            relative_differences = np.abs(actual - expected) / tolerance
+        if (relative_differences <= 1.0).all():  # false for NaN
             continue
 
-        ratio[np.isnan(ratio)] = np.inf  # a value that is not a number is the largest difference
-        row, column = np.unravel_index(np.argmax(ratio), ratio.shape)
+        # The message shows the largest difference. A value that is not a number counts as an infinite difference.
+        relative_differences[np.isnan(relative_differences)] = np.inf
+        row, column = np.unravel_index(np.argmax(relative_differences), relative_differences.shape)
         raise ModelError(
             f"{where}: {name}[{row}, {column}]: expected {expected[row, column]:.9g} +- {tolerance[row, column]:.1g} "
             f"(golden.json), got {actual[row, column]:.9g}; copy or export the model again"

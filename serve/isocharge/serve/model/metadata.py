@@ -1,8 +1,8 @@
 """Metadata of a model, stored in the `metadata_props` of its ONNX graph as one JSON value per key.
 
-The metadata describe the sensor for which the model was trained, the order of its charges, the domain in which it is
-valid, and its measured errors. The complete description of the sensor is stored, but this module reads only the name of
-the sensor. The name is also the name of the coordinate frame of x and y.
+The metadata describe the sensor for which the model was trained, the order of the charges, the domain in which the
+model is valid, and the measured errors of the model. The complete description of the sensor is stored, but this module
+reads only the name of the sensor. The name of the sensor is also the name of the coordinate frame of x and y.
 """
 
 import json
@@ -33,10 +33,10 @@ NoiseLevel = Annotated[
 class ModelNoise(Struct, frozen=True, kw_only=True):
     """Noise that was added to the charges when the model was trained.
 
-    The variance of a charge q is `white_pC`^2 + (`gain` * q)^2.
+    The variance of the noise of a charge q is `white_pC`^2 + (`gain` * q)^2.
 
     Attributes:
-        name: Name of the noise model.
+        name: Name of the noise.
         white_pC: Standard deviation of the part that does not depend on the charge, pC.
         gain: Standard deviation of the part that is proportional to the charge, relative to the charge.
     """
@@ -46,13 +46,17 @@ class ModelNoise(Struct, frozen=True, kw_only=True):
     gain: NoiseLevel
 
     def of_each(self, electrodes: int) -> tuple[Array, Array]:
-        """Return `white_pC` and `gain` of each electrode, both of shape (electrodes,)."""
+        """Return `white_pC` and `gain` with one value for each electrode, both of shape (electrodes,)."""
         return np.broadcast_to(self.white_pC, electrodes), np.broadcast_to(self.gain, electrodes)
 
     def variance(self, charge_pC: Array) -> Array:
-        """Return the variance of the noise of charges.
+        """Compute the variance of the noise of charges.
 
-        Charges (pC) and variances (pC^2) have the shape (..., n_electrode).
+        Args:
+            charge_pC: Charges, shape (..., n_electrode), pC.
+
+        Returns:
+            Variances, shape (..., n_electrode), pC^2.
         """
         white_pC = np.asarray(self.white_pC)
         gain = np.asarray(self.gain)
@@ -60,22 +64,21 @@ class ModelNoise(Struct, frozen=True, kw_only=True):
 
 
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
-"""Share of presses, 0 to 1."""
+"""Share of presses, from 0 to 1."""
 
 
 class UnnoticedPresses(Struct, frozen=True, kw_only=True):
-    """Shares of the presses outside the working area that the model does not notice.
+    """Shares of presses outside the working area for which the model reports a wrong contact without a flag.
 
-    The contact of such a press is wrong, but the model reports no flag.
-
-    The film between two circles about the origin is divided into rings of equal width, and each ring into equal
-    sectors. The first sector begins at the x axis, and the others follow anticlockwise.
+    The area between two circles about the origin is divided into rings of equal width. Each ring is divided into equal
+    sectors. The first sector of a ring begins at the x axis, and the other sectors follow anticlockwise.
 
     Attributes:
         from_mm: Radius of the inner circle, mm.
         to_mm: Radius of the outer circle, mm.
         force_N: Smallest and largest force of the presses, N.
-        share: Share of the presses that are answered wrongly without a flag, by ring and sector.
+        share: Share of the presses with a wrong contact and no flag, from 0 to 1, for each sector of each ring. The
+            rings are listed from the inner circle to the outer circle.
     """
 
     from_mm: Positive
@@ -106,7 +109,7 @@ class UnnoticedPresses(Struct, frozen=True, kw_only=True):
 
     @property
     def summary(self) -> str:
-        """Sentence about the share of all presses."""
+        """Sentence that states the share of unnoticed presses between the two circles."""
         lightest_N, hardest_N = self.force_N
         return (
             f"{percent_text(self.total_share)} of the presses outside the working area, from {self.from_mm:.3g} to "
@@ -116,9 +119,10 @@ class UnnoticedPresses(Struct, frozen=True, kw_only=True):
 
 
 def percent_text(share: float) -> str:
-    """Return a share of presses, 0 to 1, as text in percent with about two significant digits."""
+    """Format a share of presses, from 0 to 1, in percent with about two significant digits."""
     percent = 100.0 * share
-    return f"{percent:.0f} %" if percent >= 9.5 else f"{percent:.1f} %"
+    rounds_to_two_digits = percent >= 9.5
+    return f"{percent:.0f} %" if rounds_to_two_digits else f"{percent:.1f} %"
 
 
 class ModelMetadata(Settings, frozen=True, kw_only=True):
@@ -137,8 +141,8 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         errors: Measured errors by name. Each name contains the unit.
         made_with: Command and package versions with which the model was made.
         format_version: Version of the format of the metadata.
-        yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if that force is above
-            the range of forces, or unknown.
+        yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
+            or above the range of forces.
         unnoticed: Shares of presses outside the working area whose contact is wrong without a flag. None if they were
             not measured.
     """
@@ -195,7 +199,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         return str(self.sensor["name"])
 
     def to_props(self) -> dict[str, str]:
-        """Return the ONNX `metadata_props`, which contain the values of all fields except None as JSON.
+        """Return the metadata as ONNX `metadata_props`, in which every field that is not None is a JSON text.
 
         Raises:
             ModelError: If a value, such as NaN, cannot be expressed in JSON.
@@ -205,10 +209,10 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
 
     @classmethod
     def from_props(cls, props: Mapping[str, str], where: str) -> "ModelMetadata":
-        """Read ONNX `metadata_props`, a table of texts in the file of a model.
+        """Read the metadata from ONNX `metadata_props`, the table of texts in the file of a model.
 
         Args:
-            props: Value of each field as JSON. Other keys are ignored.
+            props: JSON text of each field, by the name of the field. Other keys are ignored.
             where: Name or file of the model, for error messages.
 
         Raises:
@@ -224,6 +228,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
                 return convert(values, cls, place, ModelError)
         except ModelError as error:
             raise ModelError(f"{error}; export the model again") from error
+        # The metadata have another version of the format.
         raise ModelError(
             f"{place} format {version} is not supported (this version reads {FORMAT_VERSION}); export it again or "
             "upgrade isocharge"
@@ -231,12 +236,17 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
 
 
 class _Version(Struct):
-    """Version of the format of the metadata. Every version of the format has this key."""
+    """Version of the format of the metadata. Metadata of every version have the key `format_version`."""
 
     format_version: Annotated[int, Meta(ge=1)]
 
 
 def _to_json(key: str, value: Any) -> str:
+    """Convert the value of a field to JSON. The name of the field is used in the error message.
+
+    Raises:
+        ModelError: If the value cannot be expressed in JSON.
+    """
     try:
         return json.dumps(value, allow_nan=False, default=to_builtins)
     except (TypeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""The folder of a model. The functions write a version, read a version, and find a model by its name or path.
+"""Folders of models: writing a version, reading a version, and finding a model by its name or path.
 
     <name>/config.pbtxt            configuration for Triton
     <name>/<version>/model.onnx    graph from charge_pC to contact, contact_std, contact_correlation and misfit,
@@ -9,9 +9,9 @@
 A version is written under a temporary name, read back with all checks of a reader, and then renamed. Other processes
 therefore never see an incomplete version.
 
-A model repository is a folder with the folders of several models. Other files in a repository are ignored. Names are
-looked up in the repository that the caller gives, in `$ISOCHARGE_MODELS`, in `./models`, and in the models that ship
-with isocharge, in this order.
+A model repository is a folder that contains the folders of several models. Other files in a repository are ignored. The
+name of a model is looked up in four repositories in this order: the repository that the caller gives,
+`$ISOCHARGE_MODELS`, `./models`, and the repository that is installed with isocharge.
 """
 
 import os
@@ -70,17 +70,17 @@ def find_model(model: str | Path, models: Path | None = None) -> Path:
 
 
 def find_labelled_model(label: str, models: Path | None = None) -> Path:
-    """Find the version folder of a model by its label, `NAME/VERSION`. The label was read from a file.
+    """Find the version folder of a model by a label `NAME/VERSION` that was read from a file.
 
     Unlike `find_model`, this function searches only the repositories. The label is never used as a path, because the
-    file that contains it may come from an untrusted source.
+    file that contains the label may come from an untrusted source.
 
     Args:
         label: The label, for example the one in a recording.
         models: Repository that is searched first.
 
     Raises:
-        ModelError: If the text is not a label, or no repository has the model.
+        ModelError: If the text is not a label, or if no repository contains the model.
     """
     name, _, version = label.partition("/")
     if not (NAME.fullmatch(name) and VERSION.fullmatch(version)):
@@ -94,7 +94,7 @@ def find_labelled_model(label: str, models: Path | None = None) -> Path:
 
 
 def repositories(models: Path | None = None) -> list[Path]:
-    """Return the folders in which the names of models are looked up, in the order of the search.
+    """Return the repositories in which the name of a model is looked up, in the order of the search.
 
     Args:
         models: Repository that is searched first. It must exist; the other folders need not exist.
@@ -121,20 +121,22 @@ def model_names(root: Path) -> list[str]:
 def _released_models() -> Path:
     """Return the folder of the released models in the installed package or at the top of a source checkout."""
     module = Path(__file__).resolve()
-    packaged = module.parents[1] / "released"
-    return packaged if packaged.is_dir() else module.parents[4] / "models"
+    package_folder = module.parents[1]
+    source_checkout = module.parents[4]
+    packaged_models = package_folder / "released"  # exists only in an installed package
+    return packaged_models if packaged_models.is_dir() else source_checkout / "models"
 
 
 def _version_folder(path: Path) -> Path | None:
-    """Return the version folder for a path.
+    """Return the version folder of the model at a path.
 
-    If the path is a model folder, the folder of its highest version is returned.
+    For the path of a model folder, the folder of the highest version is returned.
 
     Args:
         path: Path of a model folder, of a version folder, or of a `model.onnx`.
 
     Returns:
-        The version folder; None if the path is none of these.
+        The version folder; None if there is no model at this path.
     """
     if path.name == "model.onnx" and path.is_file():
         return path.parent
@@ -147,20 +149,20 @@ def _version_folder(path: Path) -> Path | None:
 
 
 def version_folders(folder: Path) -> dict[int, Path]:
-    """Return the version folders of a model folder by version, in ascending order.
+    """Return the version folders of a model, by their version numbers in ascending order.
 
-    A version folder is a sub-folder whose name is a whole number.
+    A version folder is a subfolder of the model folder whose name is a whole number.
     """
     return {version: folder / str(version) for version in sorted(_versions(folder))}
 
 
 def _versions(folder: Path) -> list[int]:
-    """Return the versions in a model folder, in any order."""
+    """Return the version numbers of a model in any order. The list is empty if the path is not a folder."""
     return [int(entry.name) for entry in _subfolders(folder) if VERSION.fullmatch(entry.name)]
 
 
 def _subfolders(folder: Path) -> list[Path]:
-    """Return the folders in a folder; an empty list if the path is not a folder.
+    """Return the subfolders of a folder. The list is empty if the path is not a folder.
 
     Raises:
         ModelError: If the folder cannot be listed.
@@ -174,12 +176,12 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def _not_found_message(model: str | Path, roots: list[Path], is_path: bool) -> str:
-    """Return the message for a model that is not found.
+    """Return the text of the error for a model that was not found.
 
     Args:
         model: Name or path of the model.
         roots: Repositories that were searched for the name.
-        is_path: Whether the model was given as a path, so that no repository was searched.
+        is_path: Whether the model was given as a path. No repository is searched for a path.
     """
     if is_path:
         return (
@@ -210,7 +212,7 @@ class Model:
 
 
 def load_model(folder: Path) -> Model:
-    """Read and check a model.
+    """Read a version of a model, and check that its files are complete and fit together.
 
     Args:
         folder: The version folder, as `find_model` returns it.
@@ -219,33 +221,39 @@ def load_model(folder: Path) -> Model:
         ModelError: If a file is missing or damaged, or has an unsupported format.
     """
     path = folder / "model.onnx"
-    data = read_needed(path, ModelError, "copy or export the model again")
+    onnx_model = read_needed(path, ModelError, "copy or export the model again")
     golden = read_golden(folder / "golden.json")
-    _check_checksum(data, golden, path)
-    session = open_session(data, str(path))
+    _check_checksum(onnx_model, golden, path)
+    session = open_session(onnx_model, str(path))
     metadata = ModelMetadata.from_props(session.get_modelmeta().custom_metadata_map, str(path))
     check_interface(session, len(metadata.electrodes), str(path))
     _check_golden_shapes(golden, metadata, folder / "golden.json")
-    return Model(folder, metadata, golden, session, data)
+    return Model(folder, metadata, golden, session, graph=onnx_model)
 
 
-def _check_checksum(data: bytes, golden: Golden, path: Path) -> None:
-    """Raise ModelError if the checksum of `model.onnx` is not the one in `golden.json`."""
-    actual = sha256_of(data)
+def _check_checksum(onnx_model: bytes, golden: Golden, path: Path) -> None:
+    """Raise ModelError if the checksum of `model.onnx` differs from the checksum in `golden.json`.
+
+    Args:
+        onnx_model: Content of `model.onnx`.
+        golden: Golden vectors, which contain the expected checksum.
+        path: Path of `model.onnx`, for the error message.
+    """
+    actual = sha256_of(onnx_model)
     if actual != golden.sha256:
         raise ModelError(
-            f"{path}: expected sha256 {golden.sha256} (golden.json), got {actual} over {len(data)} bytes; "
+            f"{path}: expected sha256 {golden.sha256} (golden.json), got {actual} over {len(onnx_model)} bytes; "
             "the file is damaged or changed: copy or export it again"
         )
 
 
 def _check_golden_shapes(golden: Golden, metadata: ModelMetadata, path: Path) -> None:
-    """Check that the golden vectors fit the number of electrodes, and that all outputs have one row for each press.
+    """Check that golden vectors have one charge for each electrode, and that each output has one row for each press.
 
     Args:
         golden: Golden vectors.
         metadata: Metadata of the model.
-        path: File of the golden vectors, for error messages.
+        path: File of the golden vectors, for the error message.
 
     Raises:
         ModelError: If a shape is wrong.
@@ -261,7 +269,7 @@ def _check_golden_shapes(golden: Golden, metadata: ModelMetadata, path: Path) ->
 
 
 def check_golden(model: Model) -> None:
-    """Compare the outputs that this machine computes with a model's golden vectors.
+    """Check that this machine computes the outputs that are stored in the golden vectors of a model.
 
     Raises:
         ModelError: If an output differs from the output in `golden.json` by more than the tolerance.
@@ -275,14 +283,14 @@ def check_golden(model: Model) -> None:
 
 
 def load_checked_model(folder: Path) -> Model:
-    """Read a model, and check that this machine computes its golden vectors.
+    """Read a version of a model, and check that this machine computes the outputs in its golden vectors.
 
     Args:
         folder: The version folder, as `find_model` returns it.
 
     Raises:
-        ModelError: If a file is missing or damaged, if an output differs from the golden vectors, or if the version in
-            the name of the folder differs from the version in the metadata.
+        ModelError: If a file is missing or damaged, if a computed output differs from the golden vectors, or if the
+            name of the folder is another version than the version in the metadata.
     """
     model = load_model(folder)
     if folder.name.isdecimal() and folder.name != str(model.metadata.version):
@@ -348,10 +356,10 @@ def write_model(
 
 
 def _write_triton_config(path: Path, metadata: ModelMetadata, *, has_correlation: bool) -> None:
-    """Write `config.pbtxt` so that Triton can serve all versions of the model.
+    """Write the file `config.pbtxt`, with which Triton can serve all versions of a model.
 
-    The file may list only outputs that every version computes. If an existing file does not list the output of the
-    correlations, an older version does not compute them, and the new file does not list this output either.
+    The file may list only outputs that every version computes. If an existing file does not list the correlations, an
+    older version does not compute the correlations. The new file then does not list the correlations either.
 
     Args:
         path: The file, which may exist already.
@@ -367,18 +375,19 @@ def _write_triton_config(path: Path, metadata: ModelMetadata, *, has_correlation
 
 
 def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Path:
-    """Check that a version of a model can be written, and return its folder.
+    """Check that a new version of a model can be written, and return the folder of this version.
 
-    A training calls this function before it starts, so that an invalid folder is reported at once.
+    A training calls this function before the computation starts, in order to report an invalid folder at once.
 
     Args:
         folder: The model's folder, which has the name of the model.
         version: Number of the version to write.
-        electrodes: Names of the model's electrodes.
+        electrodes: Names of the electrodes of the model.
 
     Raises:
         OutputExists: If the version exists already, or a file has the folder's name.
-        ModelError: If the folder's name is no valid model name, or the folder contains a model with other electrodes.
+        ModelError: If the name of the folder is not a valid name of a model, or if the folder contains a model with
+            another number of electrodes.
     """
     target = folder / str(version)
     refuse_existing(target)
@@ -421,9 +430,9 @@ def _check_triton_config(path: Path, name: str, electrodes: tuple[str, ...]) -> 
 
 
 def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
-    """Check the files of a new version in the same way as when a model is read.
+    """Check the files of a new version with all checks that are made when a model is read.
 
-    The metadata in its `model.onnx` are also compared with the expected metadata.
+    The metadata in the new `model.onnx` must also equal the expected metadata.
 
     Args:
         draft: Folder with the files of the new version.
@@ -442,13 +451,13 @@ def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
 
 
 def triton_config(name: str, electrodes: int, *, correlation: bool = True) -> str:
-    """Return the text of `config.pbtxt` for a model.
+    """Return the text of the file `config.pbtxt`, which describes the inputs and outputs of a model for Triton.
 
     Args:
         name: Name of the model.
         electrodes: Number of electrodes.
-        correlation: Whether the output with the correlations is listed. Without it, Triton also serves older versions,
-            which do not have this output.
+        correlation: Whether the output with the correlations is listed. If it is not listed, Triton can also serve
+            older versions, which do not have this output.
     """
     outputs = {tensor: width for tensor, width in OUTPUTS.items() if correlation or tensor != CORRELATION}
     head = f'name: "{name}"\nplatform: "onnxruntime_onnx"\nmax_batch_size: {MAX_BATCH}\n'
@@ -456,9 +465,13 @@ def triton_config(name: str, electrodes: int, *, correlation: bool = True) -> st
 
 
 def _tensor_list(kind: str, widths: dict[str, int]) -> str:
-    """Return the part of `config.pbtxt` that lists tensors.
+    """Return the part of `config.pbtxt` that lists the inputs or the outputs of a model.
 
-    Triton adds the batch dimension to the shapes of the tensors.
+    The list contains the widths of the tensors only, because Triton adds the batch dimension.
+
+    Args:
+        kind: "input" or "output".
+        widths: Width of each tensor by its name.
     """
     lines = [f'  {{ name: "{name}" data_type: TYPE_FP32 dims: [ {width} ] }}' for name, width in widths.items()]
     return f"{kind} [\n" + ",\n".join(lines) + "\n]\n"

@@ -1,11 +1,11 @@
-"""The file `pretensions.npz` of a calibrated model: the weights of its network at several pretensions of the film.
+"""The file `pretensions.npz` of a calibrated model, which contains the weights of its network at several pretensions.
 
     about                JSON: the numbers of `Pretensions`, and the names of the weights in the order of the layers
     node_MPa             pretensions at which the weights are given, including the pretension of the calibration
-    typical_pC           charges by which the charges are divided before the logarithm
-    <constant>           values of the constant of the graph with this name, at each of these pretensions
+    typical_pC           typical charge of each electrode, by which its charges are divided before the logarithm
+    <constant>           values of the constant of the graph with this name, at each pretension of `node_MPa`
 
-Between these pretensions, the weights are interpolated by a polynomial. All pretensions use the same graph,
+Between the pretensions of `node_MPa`, the weights are interpolated by a polynomial. All pretensions use the same graph,
 `model.onnx`. Only the constants of the graph differ. A prediction therefore takes the same time at every pretension.
 """
 
@@ -64,15 +64,15 @@ MIN_LENGTH = 1e-12
 
 @dataclass(frozen=True, kw_only=True)
 class Pretensions:
-    """Network of one film for every pretension within a range.
+    """Network that estimates the contacts on one film at every pretension within a range.
 
     Attributes:
         node_MPa: Pretensions at which the weights are given, shape (k,), MPa, in ascending order.
-        calibrated_MPa: Pretension that the calibration estimated, MPa; one of `node_MPa`.
+        calibrated_MPa: Pretension that the calibration estimated, MPa. It is one of `node_MPa`.
         std_MPa: Standard deviation of the pretension when a stream begins, MPa. It includes the uncertainty of the
-            calibration and of the drift since then.
-        floor_MPa: Smallest standard deviation that an estimate from many touches reaches, MPa. Errors of the other
-            parameters of the film cause it.
+            calibration and of the drift since the calibration.
+        floor_MPa: Smallest standard deviation that an estimate from many touches reaches, MPa. This limit is caused by
+            errors of the other parameters of the film.
         misfit_rms: Root mean square of the misfits of good touches, in standard deviations of the noise.
         misfit_unit: Scale of the misfit: misfit = misfit_unit * sinh(|misfit vector|).
         limits_pC: Smallest and largest charge, pC. Charges outside this range are clipped.
@@ -80,7 +80,7 @@ class Pretensions:
         weights: Arrays of the layers by the names of the constants in the graph, float32, in this order: weight, shape
             (k, n_input, n_output), and bias, shape (k, n_output), of each hidden layer; weight of the skip layer,
             shape (k, n_electrode, n_answer); bias and weight of the output layer.
-        activation: Name of the activation of the hidden layers.
+        activation: Name of the activation function of the hidden layers.
     """
 
     node_MPa: Array
@@ -97,8 +97,8 @@ class Pretensions:
     def to_bytes(self) -> bytes:
         """Return the content of the file `pretensions.npz`.
 
-        The file contains the pretensions, the typical charges and the weights as arrays. A JSON object with the name
-        `about` contains all other numbers, and the names of the weights in the order of the layers.
+        The file contains the pretensions, the typical charges and the weights as arrays. The JSON object `about`
+        contains all other numbers, and the names of the weights in the order of the layers.
         """
         numbers = {name: getattr(self, name) for name in _NUMBERS}
         constant_names = list(self.weights)  # the weights are constants of the graph
@@ -121,25 +121,31 @@ class Pretensions:
 
     @property
     def perceptron(self) -> Perceptron[Singles]:
-        """Perceptrons of all k pretensions. The weights of a layer have the shape (k, n_input, n_output)."""
-        *hidden_arrays, skip, bias, weight = self.weights.values()
-        hidden = [
-            Layer(hidden_weight, hidden_bias[:, None])
-            for hidden_weight, hidden_bias in zip(hidden_arrays[::2], hidden_arrays[1::2], strict=True)
+        """Networks of all k pretensions in one object. The weights of a layer have the shape (k, n_input, n_output)."""
+        # The arrays have the order of the layers. The weights and the biases of the hidden layers alternate.
+        *hidden_arrays, skip_weight, output_bias, output_weight = self.weights.values()
+        hidden_weights = hidden_arrays[::2]
+        hidden_biases = hidden_arrays[1::2]
+
+        # The new axis of a bias, shape (k, 1, n_output), stands for the presses.
+        hidden_layers = [
+            Layer(weight, bias[:, None]) for weight, bias in zip(hidden_weights, hidden_biases, strict=True)
         ]
-        return Perceptron(tuple(hidden), Layer(weight, bias[:, None]), skip, ACTIVATIONS[self.activation])
+        output_layer = Layer(output_weight, output_bias[:, None])
+        return Perceptron(tuple(hidden_layers), output_layer, skip_weight, ACTIVATIONS[self.activation])
 
     def interpolation_weights(self, pretension_MPa: Array) -> Array:
-        """Return the weights of the interpolation between the values at the k pretensions `node_MPa`.
+        """Compute the weights of the pretensions `node_MPa` (nodes) for an interpolation to other pretensions.
 
-        The weights are the Lagrange polynomials. The weight of node i is the product of (p - p_j) / (p_i - p_j) over
-        all j other than i.
+        An interpolated value is the sum of the values at the k nodes, each multiplied by its weight. The weight of node
+        i at the pretension p is a Lagrange polynomial, which is the product of (p - p_j) / (p_i - p_j) over all nodes j
+        other than i.
 
         Args:
             pretension_MPa: Pretensions p, shape (n,), MPa.
 
         Returns:
-            Weights, shape (n, k), dimensionless. Each row sums to 1.
+            Weights, shape (n, k), dimensionless. Each row contains the weights for one pretension p, whose sum is 1.
         """
         is_other_node = ~np.eye(self.node_MPa.size, dtype=bool)  # shape (k, k), False where i equals j
         node_difference_MPa = self.node_MPa[:, None] - self.node_MPa  # p_i - p_j, shape (k, k)
@@ -151,19 +157,21 @@ class Pretensions:
         return np.asarray(np.prod(factors, axis=2, where=is_other_node))
 
     def at(self, node_MPa: Array) -> "Pretensions":
-        """Return the same network with interpolated weights, which belong to other pretensions.
+        """Return the same network with weights that are interpolated to other pretensions.
 
         Args:
-            node_MPa: Pretensions within `range_MPa`, shape (k,), MPa, in ascending order.
+            node_MPa: The other pretensions, shape (n,), MPa, within `range_MPa` and in ascending order.
         """
-        factors = self.interpolation_weights(node_MPa)
-        weights = {name: np.tensordot(factors, rows, axes=1).astype(np.float32) for name, rows in self.weights.items()}
+        interpolation = self.interpolation_weights(node_MPa)  # shape (n, k)
+        weights = {}
+        for name, node_weights in self.weights.items():  # the first axis of each array has one entry for each node
+            weights[name] = np.tensordot(interpolation, node_weights, axes=1).astype(np.float32)
         return replace(self, node_MPa=node_MPa, weights=weights)
 
     def constants(self, pretension_MPa: float) -> dict[str, Singles]:
-        """Return a dictionary of the constants of the graph at one pretension within `range_MPa`."""
-        single = self.at(np.array([pretension_MPa]))
-        return {name: rows[0] for name, rows in single.weights.items()}
+        """Return the constants of the graph by their names, at one pretension within `range_MPa`."""
+        single_network = self.at(np.array([pretension_MPa]))
+        return {name: node_weights[0] for name, node_weights in single_network.weights.items()}
 
     def misfits(self, charge_pC: Array, pretension_MPa: Array) -> Array:
         """Compute the misfit of one press at several pretensions.
@@ -175,15 +183,17 @@ class Pretensions:
         Returns:
             Misfits, shape (n,), in standard deviations of the noise.
         """
-        (vectors,) = self.vectors(charge_pC[None], pretension_MPa)
+        charge_rows_pC = charge_pC[None]  # shape (1, n_electrode), because `vectors` expects several presses
+        (vectors,) = self.vectors(charge_rows_pC, pretension_MPa)
         return np.asarray(np.linalg.norm(vectors, axis=1))
 
     def vectors(self, charge_pC: Array, pretension_MPa: Array) -> Array:
         """Compute the misfit vectors of presses at several pretensions. The length of a misfit vector is the misfit.
 
-        The network computes a vector u for each pretension of `node_MPa`. The vector u is interpolated linearly between
-        these pretensions, which must therefore be close to each other; the method `at` returns such a network. The
-        misfit vector has the direction of u and the length misfit_unit * sinh(|u|).
+        The network computes a vector u at each pretension of `node_MPa`. At other pretensions, u is interpolated
+        linearly between the two nearest pretensions of `node_MPa`. The pretensions of `node_MPa` must therefore be
+        close to each other, as in a network that the method `at` returns. The misfit vector has the direction of u and
+        the length misfit_unit * sinh(|u|).
 
         Args:
             charge_pC: Charges of m presses, shape (m, n_electrode), pC.
@@ -193,26 +203,28 @@ class Pretensions:
             Misfit vectors, shape (m, n, n_electrode), in standard deviations of the noise.
         """
         inputs = self.features.evaluate(charge_pC).astype(np.float32)
-        # The last outputs of the network are the vectors u, shape (k pretensions, m presses, n_electrode).
-        outputs = evaluate(self.perceptron, inputs)
+        # The last `n_electrode` outputs of the network are the vector u. There is one vector for each of the k
+        # pretensions of `node_MPa` and each of the m presses.
+        outputs = evaluate(self.perceptron, inputs)  # shape (k, m, n_output)
         n_electrode = inputs.shape[1]
-        node_vectors = outputs[..., -n_electrode:]
+        node_vectors = outputs[..., -n_electrode:]  # shape (k, m, n_electrode)
 
-        # Indices of the two neighbouring pretensions of `node_MPa`, and the position between them from 0 to 1.
+        # Find the two neighbouring pretensions of `node_MPa`, and the position between both from 0 to 1.
         upper = np.clip(np.searchsorted(self.node_MPa, pretension_MPa), 1, self.node_MPa.size - 1)
         lower = upper - 1
         gap_MPa = self.node_MPa[upper] - self.node_MPa[lower]
-        fraction = np.clip((pretension_MPa - self.node_MPa[lower]) / gap_MPa, 0.0, 1.0)[:, None, None]
-        interpolated = (1.0 - fraction) * node_vectors[lower] + fraction * node_vectors[upper]
+        position = np.clip((pretension_MPa - self.node_MPa[lower]) / gap_MPa, 0.0, 1.0)  # shape (n,)
+        fraction = position[:, None, None]  # shape (n, 1, 1), the same for all presses and electrodes
+        interpolated = (1.0 - fraction) * node_vectors[lower] + fraction * node_vectors[upper]  # (n, m, n_electrode)
 
-        # Change the length from |u| to the misfit. A smallest length prevents a division by 0.
+        # Change the length of each vector from |u| to the misfit. A smallest length prevents a division by 0.
         length = np.maximum(np.linalg.norm(interpolated, axis=2, keepdims=True), MIN_LENGTH)
         vectors = interpolated * (self.misfit_unit * np.sinh(length) / length)
-        return np.asarray(vectors.swapaxes(0, 1))
+        return np.asarray(vectors.swapaxes(0, 1))  # shape (m, n, n_electrode)
 
 
 class _About(Struct):
-    """The JSON object `about` of the file: the numbers of `Pretensions`."""
+    """The JSON object `about` of the file: the numbers of `Pretensions`, and the names of the weights (`constants`)."""
 
     format_version: Annotated[int, Meta(ge=1)]
     constants: Annotated[list[Text], Meta(min_length=5, max_length=MAX_CONSTANTS)]
@@ -226,11 +238,14 @@ class _About(Struct):
 
 
 _NUMBERS = tuple(name for name in _About.__struct_fields__ if name not in ("format_version", "constants"))
-"""Attributes of `Pretensions` that the JSON object holds."""
+"""Attributes of `Pretensions` that the JSON object `about` contains."""
 
 
 def read_pretensions(version_folder: Path) -> Pretensions:
-    """Read the file `pretensions.npz` beside a model.
+    """Read the network of a film for several pretensions from the file `pretensions.npz` of a model.
+
+    Args:
+        version_folder: Folder of the model, which contains `model.onnx`.
 
     Raises:
         ModelError: If the file is missing, damaged, of another format, or belongs to another model.
@@ -245,10 +260,11 @@ def read_pretensions(version_folder: Path) -> Pretensions:
 
 
 def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
-    """Create the network from the arrays of a file, and check it.
+    """Check the arrays of a file, and return the network that they describe.
 
     Args:
-        arrays: Arrays of the file by name. The array `about` is a text, a JSON object with all single numbers.
+        arrays: Arrays of the file by name. The array `about` is the text of a JSON object, which contains all single
+            numbers.
 
     Raises:
         ValueError: If an array is missing or not valid, or the arrays do not fit together.
@@ -277,7 +293,7 @@ def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
 
 
 def _check_misfits(pretensions: Pretensions) -> None:
-    """Raise ValueError if the network computes misfits that are not finite at pretensions within its range."""
+    """Raise ValueError if the network computes a misfit that is not finite at any checked pretension in its range."""
     min_MPa, max_MPa = pretensions.range_MPa
     checked_MPa = np.linspace(min_MPa, max_MPa, CHECKED_PRETENSIONS)
     charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)  # a weak, a typical and a strong press
@@ -289,18 +305,20 @@ def _check_misfits(pretensions: Pretensions) -> None:
 
 
 def _check_nodes(node_MPa: Array, calibrated_MPa: float) -> None:
-    """Check the pretensions at which the weights are given.
+    """Check the pretensions (nodes) at which the weights of a network are given.
 
     Args:
         node_MPa: The pretensions, shape (k,), MPa.
         calibrated_MPa: Pretension of the calibration, MPa.
 
     Raises:
-        ValueError: If the weights cannot be interpolated between them, or the calibration is not one of them.
+        ValueError: If the pretensions are not in ascending order or too close to each other, if there are fewer than
+            two or too many, if a pretension is too large, or if the pretension of the calibration is not one of them.
     """
-    is_rising = node_MPa.size >= 2 and bool((np.diff(node_MPa) >= MIN_NODE_DISTANCE_MPa).all())
-    in_range = node_MPa.size <= MAX_NODES and bool((np.abs(node_MPa) <= MAX_PRETENSION_MPa).all())
-    if not (is_rising and in_range and calibrated_MPa in node_MPa):
+    has_valid_count = 2 <= node_MPa.size <= MAX_NODES
+    is_rising = bool((np.diff(node_MPa) >= MIN_NODE_DISTANCE_MPa).all())
+    is_in_range = bool((np.abs(node_MPa) <= MAX_PRETENSION_MPa).all())
+    if not (has_valid_count and is_rising and is_in_range and calibrated_MPa in node_MPa):
         raise ValueError(
             f"node_MPa: expected 2 to {MAX_NODES} rising pretensions up to {MAX_PRETENSION_MPa:g} MPa with "
             f"{calibrated_MPa:g} MPa among them, got {cut(str(node_MPa))}"
@@ -308,30 +326,32 @@ def _check_nodes(node_MPa: Array, calibrated_MPa: float) -> None:
 
 
 def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: int) -> list[str]:
-    """Check the shapes of the weights, and return their names in the order of the layers.
+    """Check the arrays that contain the weights, and return their names in the order of the layers.
 
-    The list `about.constants` contains the names. The names of the hidden layers are pairs: the weight and the bias of
-    each layer. The last three names are those of the skip layer, which connects the inputs with the outputs directly,
-    of the bias of the output layer, and of the weight of the output layer. The first axis of each array is the
-    pretension.
+    The list `about.constants` contains the names. The list begins with two names for each hidden layer, which are the
+    weight and the bias of the layer. The last three names are the weight of the skip layer, the bias of the output
+    layer and the weight of the output layer. The skip layer connects the inputs directly with the outputs. The first
+    axis of each array has one entry for each pretension.
 
     Args:
         arrays: Arrays of the file by name.
-        about: Description in the file, with the names of the weights.
+        about: The JSON object `about` of the file, which lists the names of the weights.
         n_node: Number of pretensions at which the weights are given.
 
     Raises:
-        ValueError: If an array is missing, or the shapes do not fit together.
+        ValueError: If names are equal or not in pairs, an array is missing, the shapes do not fit together, or a weight
+            is too large.
     """
     weight_names = about.constants
     *hidden_names, skip_weight, output_bias, output_weight = weight_names
     has_pairs = len(hidden_names) % 2 == 0
-    has_equal_names = len(set(weight_names)) < len(weight_names)
-    if has_equal_names or not has_pairs:
+    has_different_names = len(set(weight_names)) == len(weight_names)
+    if not (has_pairs and has_different_names):
         raise ValueError(f"constants: expected pairs of names that differ, got {cut(str(weight_names))}")
     n_electrode = finite_array(arrays, "typical_pC", (None,)).size
 
-    # The inputs of the first layer are the charges. The inputs of each later layer are the neurons of the layer before.
+    # `finite_array` raises an error if an array has another shape. The inputs of the first layer are the charges. The
+    # inputs of each later layer are the neurons of the previous layer.
     n_input = n_electrode
     hidden_weights = hidden_names[::2]
     hidden_biases = hidden_names[1::2]
@@ -340,13 +360,24 @@ def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: in
         finite_array(arrays, bias, (n_node, n_neuron))
         n_input = n_neuron
 
+    # The last outputs are a vector with one component for each electrode, from which the misfit is computed.
     n_output = finite_array(arrays, output_weight, (n_node, n_input, None)).shape[2]
     finite_array(arrays, output_bias, (n_node, n_output))
     finite_array(arrays, skip_weight, (n_node, n_electrode, n_output))
     if n_output < n_electrode:
         raise ValueError(f"{output_weight}: expected at least {n_electrode} outputs, got {n_output}")
+    _check_magnitudes(arrays, weight_names)
+    return weight_names
+
+
+def _check_magnitudes(arrays: Mapping[str, np.ndarray], weight_names: list[str]) -> None:
+    """Raise ValueError if the magnitude of a weight is larger than `MAX_WEIGHT`.
+
+    Args:
+        arrays: Arrays of the file by name.
+        weight_names: Names of the arrays that contain weights.
+    """
     for name in weight_names:
         largest = np.abs(arrays[name].astype(float)).max()
         if largest > MAX_WEIGHT:
             raise ValueError(f"{name}: expected weights up to {MAX_WEIGHT:g}, got {largest:g}")
-    return weight_names

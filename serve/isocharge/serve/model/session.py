@@ -1,13 +1,13 @@
-"""ONNX sessions: opening them, checking their interface, running them, and converting charges for them.
+"""Functions that open, check and run the ONNX session of a model, and convert charges to the inputs of the session.
 
-A network of this size takes microseconds. A session therefore uses one thread, because a second thread would cost more
-time than it saves. Between two runs, the session sleeps. By default, onnxruntime would wait actively, and a stream of
-100 frames per second would keep most of a core busy. `BoundPress` is the fastest way to compute one press, because its
-input and output memory is bound to the session once.
+The network of a model takes microseconds to run. A session therefore uses one thread, because a second thread would
+cost more time than it saves. Between two runs, the session sleeps. By default, onnxruntime would wait actively, and a
+stream of 100 frames per second would keep most of a processor core busy. `BoundPress` is the fastest way to compute one
+press, because its memory for input and output is bound to the session only once.
 
-Charges must be finite numbers in the order of the electrodes. The fast checks are `write_finite` for plain numbers and
-`as_float32` for arrays. If a fast check fails, the numbers are checked one by one, so that the error names the
-electrode.
+Charges must be finite numbers in the order of the electrodes. `write_finite` is a fast check for plain numbers, and
+`as_float32` for arrays. If a fast check fails, the charges are checked one by one in order to name the electrode in the
+error message.
 """
 
 import math
@@ -51,13 +51,15 @@ def output_widths(session: ort.InferenceSession) -> dict[str, int]:
 def open_session(
     onnx_model: bytes, where: str, constants: Mapping[str, Singles] = MappingProxyType({})
 ) -> ort.InferenceSession:
-    """Open a session with one thread. The inputs and outputs are not checked; use `check_interface` to check them.
+    """Open a session of a model that uses one thread.
+
+    This function does not check the inputs and outputs of the model. Use `check_interface` for this check.
 
     Args:
         onnx_model: Content of `model.onnx`.
         where: Name or file of the model, for error messages.
         constants: Arrays that replace constants of the graph, by the names of the constants. The session uses the
-            memory of the arrays, so they must not be changed afterwards.
+            memory of the arrays. The arrays must therefore not be changed afterwards.
 
     Raises:
         ModelError: If the bytes are not an ONNX graph that onnxruntime can run.
@@ -79,28 +81,28 @@ def open_session(
 
 
 def _decode_texts(session: ort.InferenceSession) -> None:
-    """Read the metadata and the names of a session.
+    """Check that the metadata and the names of the tensors of a session are valid UTF-8.
 
-    Reading them makes onnxruntime raise an exception if they are not valid UTF-8.
+    The texts are only read, because onnxruntime raises an exception when it reads a text that is not valid.
     """
     _ = session.get_modelmeta().custom_metadata_map
     _ = [tensor.name for tensor in (*session.get_inputs(), *session.get_outputs())]
 
 
 def _single_thread_options() -> ort.SessionOptions:
-    """Return the options of a session that computes in the calling thread. The session starts no other threads."""
+    """Return the options of a session that computes in the calling thread and starts no other threads."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
-    # A spinning thread would keep a core busy while it waits for work.
+    # A spinning thread would keep a processor core busy while it waits for work.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     return options
 
 
 def run(session: ort.InferenceSession, charge_pC: Singles, names: Sequence[str] | None = None) -> dict[str, Singles]:
-    """Run a model on a batch of presses.
+    """Compute the outputs of a model for a batch of presses.
 
     Args:
         session: Session of the model.
@@ -121,15 +123,15 @@ def run(session: ort.InferenceSession, charge_pC: Singles, names: Sequence[str] 
 
 
 def run_error(error: Exception) -> ModelError:
-    """Return the error to raise if onnxruntime could read a graph but fails to run it."""
+    """Return the error for a graph that onnxruntime can read but cannot run."""
     return ModelError(f"the model's graph fails when it is run ({cut(str(error))}); copy or export it again")
 
 
 def check_output_shapes(outputs: Mapping[str, Singles], count: int, where: str) -> None:
-    """Check the shapes of computed outputs. The declared shapes of a graph may differ from the computed shapes.
+    """Check the shapes of computed outputs, which may differ from the shapes that the graph declares.
 
     Args:
-        outputs: Outputs by name.
+        outputs: Computed outputs by name.
         count: Number of presses.
         where: Name or file of the model, for error messages.
 
@@ -146,7 +148,9 @@ def check_output_shapes(outputs: Mapping[str, Singles], count: int, where: str) 
 
 
 def check_interface(session: ort.InferenceSession, electrodes: int, where: str) -> None:
-    """Check the names, number types and shapes of a model's input and outputs. The batch size must be variable.
+    """Check that the input and the outputs of a model have the required names, number types and shapes.
+
+    The number of presses in a batch must be variable.
 
     Args:
         session: Session of the model.
@@ -162,16 +166,16 @@ def check_interface(session: ort.InferenceSession, electrodes: int, where: str) 
 
 
 def _check_tensors(kind: str, tensors: list[ort.NodeArg], widths: dict[str, int], where: str) -> None:
-    """Check the names, number types and widths of tensors.
+    """Check that the inputs or the outputs of a graph have the expected names, number types and widths.
 
     Args:
         kind: "input" or "outputs", for error messages.
-        tensors: The tensors of the graph.
+        tensors: The inputs or the outputs of the graph.
         widths: Expected width of each tensor by its name.
         where: Name or file of the model, for error messages.
 
     Raises:
-        ModelError: If a tensor is missing, unknown or different.
+        ModelError: If a tensor is missing, has another number type or width, or is not expected.
     """
     expected = {name: ("tensor(float)", width) for name, width in widths.items()}
     actual = {tensor.name: (tensor.type, _row_width(tensor.shape)) for tensor in tensors}
@@ -183,16 +187,16 @@ def _check_tensors(kind: str, tensors: list[ort.NodeArg], widths: dict[str, int]
 
 
 def _row_width(shape: list[int | str | None]) -> object:
-    """Return the width of a tensor of shape [variable, width].
+    """Return the width of a tensor of shape [n, width] with a variable n.
 
-    If a tensor has another shape, the whole shape is returned. It then differs from every expected width.
+    For any other shape, return the whole shape. A shape differs from every expected width, so the comparison fails.
     """
-    is_batch = len(shape) == 2 and not isinstance(shape[0], int)
+    is_batch = len(shape) == 2 and not isinstance(shape[0], int)  # a variable size is a name or None
     return shape[1] if is_batch else shape
 
 
 def _describe(tensors: Mapping[str, tuple[str, object]]) -> str:
-    """Return number types and widths of tensors as text for an error message."""
+    """Format the names, number types and widths of tensors for an error message."""
     return ", ".join(f"{name} {kind} [n, {width}]" for name, (kind, width) in tensors.items())
 
 
@@ -201,10 +205,10 @@ N_WITHOUT_CORRELATION = 7
 
 
 class BoundPress:
-    """Input and output memory of one press that is bound to a session.
+    """Memory for the input and the outputs of one press, which is bound to a session.
 
     Attributes:
-        write: Function that stores the charges, pC, which are passed as separate arguments.
+        write: Function that stores charges, pC, which are passed as separate arguments.
         run: Function that computes the outputs from the stored charges.
         read: Function that returns the computed values in the order of a `Contact`.
         size: Number of values that `read` returns: ten, or seven if the model computes no correlations.
@@ -226,16 +230,18 @@ class BoundPress:
         binding = _bind(session, charges, outputs, self.columns)
         self.run: Callable[[], None] = partial(session.run_with_iobinding, binding)
 
-        # Functions that pack float32 numbers into the memory of the charges, and unpack them from that of the outputs.
-        self.write = partial(struct.Struct(f"={electrodes}f").pack_into, charges.data.cast("B"), 0)
-        self.read = partial(struct.Struct(f"={outputs.size}f").unpack, outputs.data.cast("B"))
+        # Functions that write float32 numbers into the memory of the charges, and read the numbers of the outputs
+        charge_format = struct.Struct(f"={electrodes}f")
+        output_format = struct.Struct(f"={outputs.size}f")
+        self.write = partial(charge_format.pack_into, charges.data.cast("B"), 0)  # begins at byte 0
+        self.read = partial(output_format.unpack, outputs.data.cast("B"))
         # The type is Any because the type hints of memoryview cover only bytes.
         self._charge_view: Any = charges[0].data
         self._output_view: Any = outputs.data
         self._output_view_without_correlation: Any = outputs[:N_WITHOUT_CORRELATION].data
 
     def run_into(self, charge_pC: Singles, out: Singles) -> None:
-        """Compute one press, with the charges in one array and the results written into another array.
+        """Compute one press. The charges are read from one array, and the results are written into another array.
 
         The arrays are copied through memoryviews, which check the number type and the shape without extra time.
 
@@ -257,13 +263,14 @@ class BoundPress:
 
 
 def _columns(widths: Mapping[str, int]) -> dict[str, slice]:
-    """Return the positions of the outputs of a model among the values of a `Contact`.
+    """Return the slice that each output of a model occupies in the values of a `Contact`.
 
     Args:
-        widths: Number of values of each output by its name. The correlations, if there are any, are put last.
+        widths: Number of values of each output by its name.
 
     Returns:
-        Slice of the values of each output, by the name of the output.
+        Slice of each output, by the name of the output. The slices follow each other in the order of `widths`, except
+        that the slice of the correlations is the last.
     """
     names = [name for name in widths if name != CORRELATION]
     if CORRELATION in widths:
@@ -281,7 +288,7 @@ def _columns(widths: Mapping[str, int]) -> dict[str, slice]:
 def _bind(
     session: ort.InferenceSession, charges: Singles, outputs: Singles, columns: Mapping[str, slice]
 ) -> ort.IOBinding:
-    """Bind arrays to the input and the outputs of a session, so that it reads and writes them without copies.
+    """Bind arrays to the input and the outputs of a session, which then reads and writes the arrays without copies.
 
     Args:
         session: Session of the model.
@@ -314,7 +321,8 @@ def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
     try:
         numbers = tuple(values)
         write(*numbers)
-        return math.isfinite(sum(numbers))  # a float64 sum of float32 numbers cannot overflow
+        # The sum is not finite if a number is NaN or infinite. Otherwise it cannot overflow, because it is a float64.
+        return math.isfinite(sum(numbers))
     except (struct.error, TypeError, ValueError, OverflowError):
         return False
 
@@ -339,6 +347,10 @@ def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
 def as_batch(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
     """Convert the charges of n presses to a contiguous array of shape (n, electrodes), float32, pC.
 
+    Args:
+        charge_pC: Charges, shape (n, electrodes), pC, with the columns in the order of the electrodes.
+        electrodes: Names of the electrodes.
+
     Raises:
         ChargeError: If the shape is wrong, or a charge is not finite. The message names the electrode and the row.
     """
@@ -352,6 +364,7 @@ def as_batch(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
 
 
 def _expected_charges(electrodes: tuple[str, ...]) -> str:
+    """Return the number of charges and the names of the electrodes as text for an error message."""
     return f"{len(electrodes)} charges {electrodes}"
 
 
@@ -397,7 +410,7 @@ def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...], *, is_single_
 
 
 def _checked_float32(charges: NDArray[np.number], electrodes: tuple[str, ...], is_single_press: bool) -> Singles:
-    """Convert charges to float32, and check each of them.
+    """Convert charges to float32, and check that each charge is finite.
 
     Args:
         charges: Charges, shape (n, electrodes), pC.
@@ -405,7 +418,8 @@ def _checked_float32(charges: NDArray[np.number], electrodes: tuple[str, ...], i
         is_single_press: Whether the error message omits the number of the row.
 
     Raises:
-        ChargeError: If a charge is not finite. The message names the bad charges of the first row that has any.
+        ChargeError: If a charge is not finite in float32. The message names the electrodes of all such charges in the
+            first row that contains one.
     """
     with np.errstate(over="ignore"):  # charges beyond the range of float32 become infinite and are refused below
         converted = np.ascontiguousarray(charges, dtype=np.float32)

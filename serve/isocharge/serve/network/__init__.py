@@ -1,5 +1,6 @@
-"""Modules that the HTTP server and the gRPC server share, such as the model store, the statistics, the limits and the
-token.
+"""HTTP server and gRPC server for models, and the modules that both servers share.
+
+The shared modules include the model store, the statistics, the limits and the token.
 
 May import: prediction, model.
 """

@@ -1,6 +1,6 @@
-"""Settings of the HTTP and the gRPC server: address, TLS certificate, token, and limits.
+"""Settings of the HTTP server and of the gRPC server, namely address, TLS certificate, token and limits.
 
-By default, a server listens on the loopback address, so that only programs on the same machine can connect.
+By default, a server listens on the loopback address. Only programs on the same machine can then connect to the server.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ LISTEN_ERRORS = {
     errno.EADDRNOTAVAIL: "this machine has no such address; choose one that it has",
     errno.EACCES: "this user may not listen there; choose another place, or a port above 1023",
 }
-"""Cause and advice for the error numbers of the operating system when a server cannot listen."""
+"""Cause and advice by the error number of the operating system, if a server cannot listen."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Address:
     """Address on which a server listens.
 
     Attributes:
-        host: Name or IP address.
-        port: TCP port; 0 selects a free port.
-        uds: Path of a Unix socket, which is used instead of host and port. Only its owner can connect.
+        host: Host name or IP address.
+        port: TCP port. The port 0 selects a free port.
+        uds: Path of a Unix socket, to which only its owner can connect. If it is given, it replaces host and port.
     """
 
     host: str = "127.0.0.1"
@@ -42,12 +42,12 @@ class Address:
 
     @property
     def is_private(self) -> bool:
-        """Whether only this machine can connect."""
+        """Whether only programs on this machine can connect."""
         address = ip_address(self.host)
         return self.uds is not None or self.host == "localhost" or (address is not None and address.is_loopback)
 
     def listen(self, backlog: int) -> socket.socket:
-        """Open a Unix or TCP socket that listens on this address, and return it.
+        """Open a Unix socket or a TCP socket that listens on this address, and return the socket.
 
         Args:
             backlog: Largest number of connections that wait to be accepted.
@@ -58,11 +58,11 @@ class Address:
         try:
             if self.uds is not None:
                 return _listen_unix(self.uds, backlog)
-            # create_server sets SO_REUSEADDR, so that a port can be used again right after a server was killed.
+            # create_server sets SO_REUSEADDR. The port of an earlier server can therefore be used again at once.
             is_ipv6 = ":" in self.host
             family = socket.AF_INET6 if is_ipv6 else socket.AF_INET
             return socket.create_server((self.host, self.port), family=family, backlog=backlog)
-        except ListenError:  # from _listen_unix; its message already states what to do
+        except ListenError:  # an error of _listen_unix, whose message already states what to do
             raise
         except (OSError, UnicodeError) as error:  # a host name that cannot be encoded causes a UnicodeError
             reason = str(error)
@@ -72,29 +72,29 @@ class Address:
             raise ListenError(f"cannot listen on {place}: {reason}") from error
 
     def release(self) -> None:
-        """Remove the file of a closed Unix socket, unless another server listens on it."""
+        """Remove the file of the closed Unix socket, unless another server listens on this socket."""
         if self.uds:
             with contextlib.suppress(ListenError):
                 _remove_stale(self.uds)
 
     def url(self, listening: socket.socket, *, secure: bool) -> str:
-        """Return the URL for clients, or `unix:PATH` for a Unix socket.
+        """Return the URL that clients use, or `unix:PATH` if the address is a Unix socket.
 
         Args:
-            listening: The socket that `listen` returned.
-            secure: Whether the server uses TLS.
+            listening: Socket that `listen` has returned.
+            secure: Whether the server uses TLS, so that the URL begins with `https`.
         """
         if self.uds:
             return f"unix:{self.uds}"
         scheme = "https" if secure else "http"
         is_ipv6 = ":" in self.host
         host = f"[{self.host}]" if is_ipv6 else self.host
-        _, port, *_ = listening.getsockname()  # the actual port, also if the system has chosen it
+        _, port, *_ = listening.getsockname()  # the actual port, even if the system has chosen it
         return f"{scheme}://{host}:{port}"
 
 
 def ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """Parse an IP address; return None if the text is a name."""
+    """Parse an IP address, or return None if the text is not an IP address but a host name."""
     try:
         return ipaddress.ip_address(host)
     except ValueError:
@@ -104,18 +104,22 @@ def ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | Non
 def check_exposure(address: Address, *, has_token: bool) -> None:
     """Check that a server without a token is not reachable from other machines.
 
+    Args:
+        address: Address on which the server listens.
+        has_token: Whether the server has a token that clients must send.
+
     Raises:
-        InputError: If other machines can connect and there is no token.
+        InputError: If other machines can connect, but the server has no token.
     """
     if not (address.is_private or has_token):
         raise InputError(f"{address.host} lets other machines in: give --token TOKEN, which they then must send")
 
 
 def _listen_unix(path: Path, backlog: int) -> socket.socket:
-    """Open a listening Unix socket that only its owner can use, and return it.
+    """Open a Unix socket that listens and that only its owner can use, and return the socket.
 
     Args:
-        path: Path of the socket. A file that an earlier server left there is removed first.
+        path: Path of the socket. If an earlier server has left a file there, this file is removed first.
         backlog: Largest number of connections that wait to be accepted.
     """
     _remove_stale(path)
@@ -133,10 +137,10 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove the file of a Unix socket on which no server listens any more. If there is no file, do nothing.
+    """Remove the file of a Unix socket on which no server listens any more. If there is no such file, do nothing.
 
     Raises:
-        ListenError: If the path is another kind of file, or a server listens on the socket.
+        ListenError: If the file is not a socket, or if a server listens on the socket.
     """
     if not path.exists():
         return
@@ -144,28 +148,28 @@ def _remove_stale(path: Path) -> None:
         raise ListenError(f"{path}: expected nothing or a left-over socket, found a file; choose another path")
     with socket.socket(socket.AF_UNIX) as client:
         error_number = client.connect_ex(str(path))  # 0 if a server accepts the connection
-    if error_number != errno.ECONNREFUSED:  # a connection is refused only if no server listens
+    if error_number != errno.ECONNREFUSED:  # the system refuses a connection only if no server listens
         raise ListenError(f"{path}: another server listens there; stop it or choose another path")
     path.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
 class Tls:
-    """Certificate chain and private key of a server, as PEM files.
+    """Files with the certificate chain and the private key of a server, in the format PEM.
 
     Attributes:
-        certificate: File of the certificate chain.
-        key: File of the private key; None if the key is in the file of the certificate.
+        certificate: File with the certificate chain.
+        key: File with the private key, or None if the file of the certificate also contains the key.
     """
 
     certificate: Path
     key: Path | None = None
 
     def context(self) -> ssl.SSLContext:
-        """Create the TLS context of a server.
+        """Create the TLS context of a server from the files.
 
         Raises:
-            InputError: If a file cannot be read, or certificate and key do not belong together.
+            InputError: If a file cannot be read, or if the certificate and the key do not belong together.
         """
         paths = [self.certificate]
         if self.key is not None:
@@ -173,8 +177,8 @@ class Tls:
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         try:
             for path in paths:
-                read_whole(path)  # raises an error for a pipe, for which load_cert_chain would wait without end
-            # If the key is encrypted, OpenSSL uses this empty password and fails. It would otherwise ask for one.
+                read_whole(path)  # raises an error if the path is a pipe, from which load_cert_chain might wait forever
+            # If the key is encrypted, the empty password causes an error. Without it, OpenSSL would ask for a password.
             context.load_cert_chain(self.certificate, self.key, password=lambda: "")
         except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
             names = " and ".join(map(str, paths))
@@ -184,28 +188,32 @@ class Tls:
         return context
 
     def key_and_certificate(self) -> tuple[bytes, bytes]:
-        """Read the file of the key and the file of the certificate.
+        """Read the files, and return the private key and the certificate chain, in this order.
 
-        The results have the order in which gRPC takes them.
+        The function `grpc.ssl_server_credentials` requires this order.
 
         Raises:
-            InputError: If a file cannot be read, or certificate and key do not belong together.
+            InputError: If a file cannot be read, or if the certificate and the key do not belong together.
         """
-        self.context()
+        self.context()  # checks the files
         return read_whole(self.key or self.certificate), read_whole(self.certificate)
 
 
 class Token:
-    """A secret that clients must send.
+    """Secret text that clients must send.
 
-    The duration of the comparison does not depend on the number of correct characters.
+    The time that a comparison takes does not depend on how many characters of a wrong token are correct. A client
+    therefore cannot guess the token character by character.
     """
 
     def __init__(self, token: str) -> None:
-        """Check the characters of the token, and store the header that clients must send.
+        """Check the characters of the token, and store the value of the header that clients must send.
+
+        Args:
+            token: The secret text.
 
         Raises:
-            InputError: If the token is empty, or has characters that are not possible in a header or in a URL.
+            InputError: If the token is empty, or contains characters that a header or a URL cannot contain.
         """
         is_printable_ascii = token.isascii() and token.isprintable()
         has_outer_blanks = token != token.strip()
@@ -220,8 +228,8 @@ class Token:
         """Check the value of an Authorization header.
 
         Args:
-            authorization: Value of the header; empty if the request has none. The name of the scheme is compared
-                without regard to case (RFC 9110, 11.1).
+            authorization: Value of the header, which is empty if the request has no such header. The name `Bearer` may
+                be in upper case or lower case (RFC 9110, 11.1).
 
         Raises:
             TokenError: If the header does not contain the token.
@@ -230,7 +238,7 @@ class Token:
         normalised = authorization
         if scheme.lower() == b"bearer":
             normalised = b"Bearer " + token.lstrip(b" ")
-        # The duration of compare_digest does not depend on the number of correct characters.
+        # The time that compare_digest takes does not depend on the number of correct characters.
         if not hmac.compare_digest(normalised, self._expected_header):
             received = "a wrong one" if authorization else "none"
             raise TokenError(
@@ -242,16 +250,19 @@ class Token:
 class ServerLimits:
     """Limits of one server.
 
-    With the defaults, the largest batch of presses with four electrodes is accepted as JSON with all digits.
+    With the default values, a server accepts the largest batch of presses with four electrodes, even if it is sent as
+    JSON with all digits.
 
     Attributes:
         batch: Largest number of presses in one request.
-        body_bytes: Largest size of the body of a request, compressed or not.
-        header_bytes: Largest size of the request line and the headers together.
-        header_seconds: Longest time from the first byte of a request, or from connecting, to the end of its headers.
-        body_seconds: Longest time from the end of the headers to the end of the body, and longest time until the
-            client has received the response.
-        idle_seconds: Longest time between two requests.
+        body_bytes: Largest size of the body of a request, bytes. The limit applies before and after the body is
+            decompressed.
+        header_bytes: Largest total size of the request line and the headers, bytes.
+        header_seconds: Longest time in which the headers of a request must arrive, s. It begins with the connection or
+            with the first byte of the request.
+        body_seconds: Longest time from the end of the headers to the end of the body, s. It is also the longest time in
+            which the client must read the response.
+        idle_seconds: Longest time between two requests of a connection, s.
         connections: Largest number of open connections.
     """
 
@@ -264,10 +275,13 @@ class ServerLimits:
     connections: int = 1024
 
     def check_body(self, size: int) -> None:
-        """Check the size of a complete body, or of the part that has arrived.
+        """Check the size of a body, or the size of the part of a body that has arrived so far.
+
+        Args:
+            size: The size, bytes.
 
         Raises:
-            TooLarge: If the size is above `body_bytes`.
+            TooLarge: If the size exceeds `body_bytes`.
         """
         if size > self.body_bytes:
             raise TooLarge(f"expected a body of at most {self.body_bytes} bytes, got more; send smaller batches")

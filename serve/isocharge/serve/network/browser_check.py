@@ -1,18 +1,21 @@
 """Protection against requests from web pages of other sites.
 
-Every page in a browser can send requests to every address that the browser can reach, including the loopback address. A
-form or a `fetch` with `mode: "no-cors"` cannot read the response, but the server executes the request. With DNS
-rebinding, an attacker changes the address of a name to this machine after the page was loaded. The browser then treats
-the page as a page of this server, and the page can also read the responses. Pages cannot change the following headers,
-by which such requests are recognised.
+A page in a browser can send requests to every address that the browser can reach, including the loopback address. If
+the page sends a form, or a `fetch` with `mode: "no-cors"`, it cannot read the response, but the server executes the
+request. An attacker can also use DNS rebinding. After the page was loaded, the attacker changes the address of the host
+name of the page to the address of this machine. The browser then treats the page as a page of this server, so that the
+page can also read the responses.
 
-- `Host` is the name that the browser has requested. After DNS rebinding, this name is neither an IP address nor a name
-  of this server.
-- `Origin` is the site of the page that sent the request.
-- `Sec-Fetch-Site` states whether the page belongs to the same site. Browsers also send this header with requests that
-  have no `Origin`.
+The server recognises such requests by the following headers, which pages cannot change.
 
-Programs other than browsers send neither `Origin` nor `Sec-Fetch-Site`, so only their `Host` is checked.
+- The header `Host` contains the host name that the browser has requested. After DNS rebinding, this name is neither an
+  IP address nor a name of this server.
+- The header `Origin` contains the site of the page that has sent the request.
+- The header `Sec-Fetch-Site` states whether the page belongs to the same site. Browsers send this header even with
+  requests that have no header `Origin`.
+
+Programs other than browsers send neither `Origin` nor `Sec-Fetch-Site`. The server therefore checks only the header
+`Host` of their requests.
 """
 
 from collections.abc import Iterable, Mapping
@@ -23,43 +26,50 @@ from isocharge.common.errors import InputError, OriginError
 from isocharge.serve.network.address import ip_address
 
 CACHED_REQUESTS = 256
-"""Number of combinations of headers whose result is cached. Clients repeatedly send the same headers."""
+"""Number of combinations of headers for which the result of the check is cached.
+
+Clients send the same headers again and again.
+"""
 
 LOCALHOST = "localhost"
 
 TRUSTED_FETCH_SITES = (b"same-origin", b"none")
-"""Values of `Sec-Fetch-Site` of a request by a page of the server itself, and of an address that a user typed in."""
+"""Values of the header `Sec-Fetch-Site` that are accepted.
+
+Browsers send `same-origin` if a page of this server sends the request, and `none` if the user has typed in the address.
+"""
 
 
 class BrowserCheck:
-    """Checks whether a request was sent by a page of another site.
+    """Check that refuses requests from web pages of other sites.
 
     Args:
-        host: Name or address on which the server listens.
-        allowed_hosts: Further names by which the server is reached, for example through a reverse proxy. Pages of these
-            names may send requests, too.
-        any_host: Whether to accept every `Host`. DNS rebinding is harmless if requests need a token, which a page of
-            another site does not have, or if the server listens on a Unix socket.
+        host: Host name or address on which the server listens.
+        allowed_hosts: Further host names of the server, for example the name of a reverse proxy. Pages of these hosts
+            may also send requests.
+        any_host: Whether to accept every value of the header `Host`. DNS rebinding is harmless if requests must contain
+            a token, because a page of another site does not have the token. It is also harmless if the server listens
+            on a Unix socket.
     """
 
     def __init__(self, host: str = LOCALHOST, allowed_hosts: Iterable[str] = (), *, any_host: bool = False) -> None:
         self._allowed_names = frozenset(map(host_name, allowed_hosts))
         self._host_names = self._allowed_names | {LOCALHOST, host.lower()}
         self._any_host = any_host
-        self._problem = lru_cache(CACHED_REQUESTS)(self._find_problem)
+        self._cached_reason = lru_cache(CACHED_REQUESTS)(self._refusal_reason)
 
     def check(self, method: str, headers: Mapping[bytes, bytes]) -> None:
-        """Check the headers of a request.
+        """Check the headers of a request, and raise an error if the request is refused.
 
         Args:
             method: Method in capitals.
-            headers: Values by name in lower case.
+            headers: Value of each header by the name of the header in lower case.
 
         Raises:
-            OriginError: If a page of another site sent the request, or `Host` is not a name of this server.
+            OriginError: If a page of another site has sent the request, or if `Host` is not a name of this server.
         """
         get = headers.get
-        problem = self._problem(
+        reason = self._cached_reason(
             method,
             get(b"host", b""),
             get(b"origin"),
@@ -67,10 +77,10 @@ class BrowserCheck:
             get(b"sec-fetch-mode"),
             get(b"sec-fetch-dest"),
         )
-        if problem is not None:
-            raise OriginError(problem)
+        if reason is not None:
+            raise OriginError(reason)
 
-    def _find_problem(
+    def _refusal_reason(
         self,
         method: str,
         host: bytes,
@@ -79,19 +89,20 @@ class BrowserCheck:
         fetch_mode: bytes | None,
         fetch_dest: bytes | None,
     ) -> str | None:
-        """Return the reason why a request is refused; None if the request is accepted.
+        """Return the reason why a request is refused, or None if the request is accepted.
 
-        The requested host must be one that this server has, unless every host is accepted. If the browser states the
-        origin of the page that sends the request, the page must belong to this server. Otherwise the header
-        `Sec-Fetch-Site` must not name another site, unless the user follows a link to a page of this server.
+        The header `Host` must contain a name or an address of this server, unless every host is accepted. If the
+        request has a header `Origin`, the page with this origin must belong to this server. If the request has no
+        header `Origin`, the header `Sec-Fetch-Site` must not state that another site has sent the request. However, the
+        request is accepted if the user has followed a link from another site to a page of this server.
 
         Args:
             method: Method in capitals.
-            host: Value of the header `Host`; empty if the request has none.
-            origin: Value of `Origin`; None if the request has none.
-            fetch_site: Value of `Sec-Fetch-Site`; None if the request has none.
-            fetch_mode: Value of `Sec-Fetch-Mode`; None if the request has none.
-            fetch_dest: Value of `Sec-Fetch-Dest`; None if the request has none.
+            host: Value of the header `Host`. It is empty if the request has no such header.
+            origin: Value of the header `Origin`, or None if the request has no such header.
+            fetch_site: Value of the header `Sec-Fetch-Site`, or None if the request has no such header.
+            fetch_mode: Value of the header `Sec-Fetch-Mode`, or None if the request has no such header.
+            fetch_dest: Value of the header `Sec-Fetch-Dest`, or None if the request has no such header.
         """
         if not (self._any_host or self._is_served(host)):
             return (
@@ -105,10 +116,10 @@ class BrowserCheck:
                 f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
                 "itself, or name the page's host by --allow-host of `isocharge serve http`"
             )
-        # Programs other than browsers send no Sec-Fetch-Site.
+        # Programs other than browsers do not send the header Sec-Fetch-Site.
         if fetch_site is None or fetch_site.lower() in TRUSTED_FETCH_SITES:
             return None
-        # A link on a page of another site may open this page, because that site cannot read the answer.
+        # A link on another site may open a page of this server, because the other site cannot read the response.
         is_link = method in ("GET", "HEAD") and fetch_mode == b"navigate" and fetch_dest == b"document"
         if is_link:
             return None
@@ -118,18 +129,22 @@ class BrowserCheck:
         )
 
     def _is_served(self, host: bytes) -> bool:
-        """Return whether a `Host` is an IP address or a name of this server. A missing `Host` is accepted."""
-        if not host:  # HTTP/1.0 does not require the header. Browsers always send it.
+        """Return whether the header `Host` contains an IP address or a name of this server.
+
+        A missing header is accepted.
+        """
+        if not host:  # HTTP/1.0 does not require the header, but browsers always send it
             return True
         name = _name_in(f"//{host.decode('latin-1')}")
         return ip_address(name) is not None or name in self._host_names
 
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
-        """Return whether a request was sent by a page of this server.
+        """Return whether the page that has sent a request belongs to this server.
 
-        The page belongs to this server if its origin is the requested host. If a proxy has replaced the `Host`, the
-        page also belongs to this server if its origin is an allowed name. A page on another port of the requested host
-        belongs to another server.
+        The page belongs to this server if the page has the host and the port to which the request was sent. A reverse
+        proxy may have replaced the header `Host`. The page therefore also belongs to this server if its host name is
+        one of the allowed names. However, a page with the requested host name and another port belongs to another
+        server.
 
         Args:
             origin: Value of the header `Origin`, for example b"http://localhost:8000".
@@ -141,24 +156,26 @@ class BrowserCheck:
         requested_host = host.decode("latin-1").lower()
         if page_host == requested_host:
             return True
-        # The hosts may contain a port, the names do not. Equal names with different ports are two servers of a machine.
+        # `page_host` and `requested_host` may contain a port. The following names do not. If the names are equal, the
+        # ports differ, and the page belongs to another server on the same machine.
         page_name = _name_in(f"//{page_host}")
         requested_name = _name_in(f"//{requested_host}")
         return page_name in self._allowed_names and page_name != requested_name
 
     def _served_names(self) -> str:
-        """Return the names of this server, separated by commas."""
+        """Return the host names of this server in alphabetical order, separated by commas."""
         return ", ".join(sorted(self._host_names))
 
 
 def host_name(text: str) -> str:
-    """Check the value of the option --allow-host, and return the host name in lower case.
+    """Check a value of the option --allow-host, and return the host name in lower case.
 
     Args:
-        text: A host name, or an IP address. An IPv6 address may be in square brackets.
+        text: Host name or IP address. An IPv6 address may be in square brackets.
 
     Raises:
-        InputError: If the text is not a plain host name or address; a scheme, a port or a path is refused.
+        InputError: If the text is not a host name or an IP address, for example because it also contains a scheme, a
+            port or a path.
     """
     name = text.strip().lower()
     is_printable_ascii = name.isascii() and name.isprintable()
@@ -174,7 +191,7 @@ def host_name(text: str) -> str:
 
 
 def _name_in(url: str) -> str:
-    """Return the host name in a URL in lower case; "?" if there is none."""
+    """Return the host name in a URL in lower case, or "?" if the URL contains no host name."""
     try:
         name = urlsplit(url).hostname or "?"
     except ValueError:
@@ -183,5 +200,5 @@ def _name_in(url: str) -> str:
 
 
 def _quoted(value: bytes) -> str:
-    """Return the value of a header as text for an error message."""
+    """Return the value of a header as a quoted text for an error message. Long values are shortened."""
     return repr(value[:100].decode("latin-1"))

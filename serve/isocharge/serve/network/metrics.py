@@ -1,7 +1,8 @@
-"""Counters of models and traffic in the text format of Prometheus, for the path `/metrics`.
+"""Counters of the models and of the traffic in the text format of Prometheus, which the path `/metrics` returns.
 
-A request only increments plain integers, which takes a fraction of a microsecond. A histogram of the client library
-would take several microseconds. The metric families are computed from the integers when Prometheus requests them.
+While a request is answered, only plain integers are incremented, which takes a fraction of a microsecond. Updating a
+histogram of the package `prometheus_client` would take several microseconds. The metrics are computed from the integers
+when Prometheus requests them.
 """
 
 from collections.abc import Iterable
@@ -22,41 +23,41 @@ from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.traffic import LATENCY_BOUNDS_NS, STAGES, Statistics, Traffic
 
 CONTENT_TYPE = b"text/plain; version=0.0.4; charset=utf-8"
-"""Content type of the text format, which every version of Prometheus reads."""
+"""Content type of the text format, which every version of Prometheus can read."""
 
 VERSION_LABELS = ("model", "version")
-"""Labels of the metrics of one version of a model."""
+"""Labels of the metrics that have one value for each version of a model."""
 
 BUCKET_BOUNDS = (*(f"{ns / 1e9:g}" for ns in LATENCY_BOUNDS_NS), "+Inf")
-"""Upper bounds of the latency histogram as texts, s."""
+"""Upper bounds of the buckets of the latency histogram, s, as texts."""
 
 _Counters = dict[tuple[str, str], Statistics]
 
 
 class Metrics(Collector):
-    """Metrics of one server, computed for each scrape."""
+    """Metrics of one server, which are computed whenever Prometheus requests them."""
 
     def __init__(self, store: ModelStore, traffic: Traffic, server_version: str) -> None:
-        """Register the metrics of the server and of its process.
+        """Create a registry, and register the metrics of the server and of its process.
 
         Args:
-            store: The models of the server.
-            traffic: Counters of requests and connections.
-            server_version: Version of isocharge.
+            store: Store of the models that the server uses.
+            traffic: Counters of the requests and connections of the server.
+            server_version: Installed version of isocharge.
         """
         self._store = store
         self._traffic = traffic
         self._version = server_version
-        self._registry = CollectorRegistry(auto_describe=False)  # do not call `collect` at the registration
+        self._registry = CollectorRegistry(auto_describe=False)  # so that `register` does not call `collect`
         self._registry.register(self)
         ProcessCollector(registry=self._registry)
 
     def text(self) -> bytes:
-        """Return all metrics in the format of `CONTENT_TYPE`."""
+        """Return all metrics as text in the format of `CONTENT_TYPE`."""
         return generate_latest(self._registry)
 
     def collect(self) -> Iterable[Metric]:
-        """Yield the metric families; the registry calls this method for each scrape."""
+        """Yield all metrics of the server. The registry calls this method whenever Prometheus requests the metrics."""
         counters = self._store.counters()
         versions = {"version": self._version, "onnxruntime": ort.__version__}
         yield InfoMetricFamily("isocharge", "Versions of the server.", versions)
@@ -67,7 +68,11 @@ class Metrics(Collector):
 
 
 def _model_families(store: ModelStore) -> Iterable[Metric]:
-    """Return two metrics: the sensor and checksum of each loaded version, and the state of every version."""
+    """Return the metrics `isocharge_model` and `isocharge_model_ready`.
+
+    The first metric contains the sensor and the checksum of each loaded version. The second metric contains the state
+    of every version.
+    """
     info = InfoMetricFamily("isocharge_model", "Loaded versions of the models.", labels=VERSION_LABELS)
     for loaded in store.loaded_versions():
         properties = {"sensor": loaded.metadata.frame_id, "sha256": loaded.model.golden.sha256}
@@ -76,35 +81,38 @@ def _model_families(store: ModelStore) -> Iterable[Metric]:
         "isocharge_model_ready", "1 if the version is loaded, 0 if it was refused.", labels=VERSION_LABELS
     )
     for row in store.version_states():
-        is_ready = row["state"] == "READY"  # exported as 1 or 0
+        is_ready = row["state"] == "READY"  # Prometheus receives 1 or 0
         ready.add_metric((row["name"], row["version"]), is_ready)
     return info, ready
 
 
 def _traffic_families(traffic: Traffic) -> Iterable[Metric]:
-    """Return the metrics for requests, open connections and lost log lines."""
+    """Return the metrics with the numbers of requests, of open connections and of lost log lines."""
     requests = CounterMetricFamily(
         "isocharge_requests", "Requests that were answered or refused.", labels=("transport", "route", "status")
     )
     for labels, count in sorted(traffic.requests().items()):
         requests.add_metric(labels, count)
-    opened = GaugeMetricFamily(
+    open_connections = GaugeMetricFamily(
         "isocharge_open", "Open connections of HTTP and open calls of gRPC.", labels=("transport",)
     )
-    for transport, count_open in traffic.open.items():  # one function for each transport: "http", "grpc"
-        opened.add_metric((transport,), count_open())
+    for transport, count_open in traffic.open.items():  # the transports are "http" and "grpc"
+        open_connections.add_metric((transport,), count_open())
     lost_lines = CounterMetricFamily("isocharge_log_lines_lost", "Lines of the log that could not be written.")
     lost_line_count = 0 if traffic.lost_lines is None else traffic.lost_lines()
     lost_lines.add_metric((), lost_line_count)
-    return requests, opened, lost_lines
+    return requests, open_connections, lost_lines
 
 
 def _inference_families(counters: _Counters) -> Iterable[Metric]:
-    """Yield one metric for each counter of presses and refused requests, with a value for each version of a model.
+    """Yield the metrics that count presses and refused requests.
+
+    Each metric has one value for each version of a model.
 
     Args:
-        counters: Counters of each version, by the name and the version of the model.
+        counters: Counters of each version, by name and version of the model.
     """
+    # Attribute of `Statistics`, and name and description of the metric with its values
     metrics_of_attribute = {
         "presses": ("isocharge_presses", "Presses that were answered."),
         "checked": ("isocharge_misfit_checked", "Presses whose misfit was computed."),
@@ -119,10 +127,12 @@ def _inference_families(counters: _Counters) -> Iterable[Metric]:
 
 
 def _latency_families(counters: _Counters) -> Iterable[Metric]:
-    """Return the latency histogram and the time of each stage for each version of a model.
+    """Return the latency histogram, and the total time of each stage of an inference.
+
+    Both metrics have values for each version of a model.
 
     Args:
-        counters: Counters of each version, by the name and the version of the model.
+        counters: Counters of each version, by name and version of the model.
     """
     latency = HistogramMetricFamily(
         "isocharge_inference_seconds",
@@ -135,7 +145,7 @@ def _latency_families(counters: _Counters) -> Iterable[Metric]:
         labels=(*VERSION_LABELS, "stage"),
     )
     for name_and_version, statistics in counters.items():
-        # A bucket of Prometheus includes all lower buckets.
+        # The count of a bucket of Prometheus includes the counts of all lower buckets.
         cumulative_counts = accumulate(statistics.latency)
         buckets = list(zip(BUCKET_BOUNDS, cumulative_counts, strict=True))
         total_s = sum(statistics.stages_ns) / 1e9

@@ -1,11 +1,11 @@
-"""Store of the models that a server uses: all versions of all models in its folders.
+"""Store of the models that a server uses. The store contains all versions of all models in one or more folders.
 
-When a version is loaded, its checksum, its metadata and its shapes are checked, and its golden vectors are computed
-again. A version that fails a check is refused, and the reason is stored. All other versions stay available.
+When a version is loaded, the store checks its checksum, its metadata and its shapes, and computes its golden vectors
+again. If a check fails, the version is refused, and the reason is stored. All other versions remain available.
 
-When a model is loaded again, its files are read into new sessions, and one assignment then replaces the old sessions.
-Requests that have begun are finished with the old sessions. If the new files of a version are refused, the old version
-stays available.
+When a model is loaded again, its files are read into new sessions. The new sessions then replace the old sessions in a
+single assignment. Requests that have already begun are finished with the old sessions. If the new files of a version
+are refused, the old version remains available.
 """
 
 import logging
@@ -32,17 +32,17 @@ from isocharge.serve.prediction.contact import Validity
 log = logging.getLogger(__name__)
 
 UNLOADED = "unloaded"
-"""Reason in the index for a model that a client unloaded."""
+"""Reason in the index if a client has unloaded the model."""
 
 
 @dataclass(frozen=True)
 class LoadedVersion:
-    """One version of a model that is available for requests.
+    """Version of a model that is loaded and available for requests.
 
     Attributes:
-        model: The model with its session.
+        model: The model, which contains its session of onnxruntime.
         metadata: Metadata of the model.
-        version: Version as a text.
+        version: Number of the version as a text.
         statistics: Counters of the requests to this version.
     """
 
@@ -54,7 +54,7 @@ class LoadedVersion:
 
     @cached_property
     def validity(self) -> Validity:
-        """Domain in which the model is valid."""
+        """Limits of the contacts for which the model is valid."""
         return Validity.of(self.metadata)
 
     @cached_property
@@ -62,30 +62,30 @@ class LoadedVersion:
         """Names of the outputs of the model."""
         return tuple(output_widths(self.model.session))
 
-    def press(self) -> BoundPress:
-        """Return input and output memory for one press that is bound to the session of the model.
+    def press_of_thread(self) -> BoundPress:
+        """Return an object that runs the model for a single press, and that reuses its memory.
 
-        Each thread has its own memory, which is allocated at the first call of the thread.
+        Each thread has its own object, which is created when the thread calls this method for the first time.
         """
-        bound: BoundPress | None = getattr(self._thread_local, "press", None)
-        if bound is None:
-            bound = BoundPress(self.model.session, len(self.metadata.electrodes))
-            self._thread_local.press = bound
-        return bound
+        press: BoundPress | None = getattr(self._thread_local, "press", None)
+        if press is None:
+            press = BoundPress(self.model.session, len(self.metadata.electrodes))
+            self._thread_local.press = press
+        return press
 
 
 class ModelStore:
-    """Models by name and version.
+    """Loaded models by name and version.
 
-    All methods may be called from any thread. Loading and unloading are serialised by a lock.
+    Any thread may call any method. A lock ensures that only one thread at a time loads or unloads models.
     """
 
     def __init__(self, folders: Callable[[], Mapping[str, Path]]) -> None:
-        """Load all versions of all models.
+        """Load all versions of all models in the folders.
 
         Args:
-            folders: Function that returns the folder of each model by its name. Each call of `load` and `index` calls
-                this function.
+            folders: Function that returns the folder of each model by the name of the model. The methods `load` and
+                `index` call this function again, so that new models are found.
 
         Raises:
             ModelError: If there is no model, or no version passes its checks.
@@ -93,9 +93,9 @@ class ModelStore:
         self._folders = folders
         self._change_lock = threading.Lock()
         self._statistics: dict[tuple[str, int], Statistics] = {}
-        # Versions by name and version. An empty version in the key means the highest version.
+        # Loaded versions by name and version. The empty version in a key stands for the highest loaded version.
         self._loaded: dict[tuple[str, str], LoadedVersion] = {}
-        self._refused: dict[tuple[str, int], str] = {}  # reasons for refusals by name and version
+        self._refused: dict[tuple[str, int], str] = {}  # reasons why versions were refused, by name and version
         for name, folder in folders().items():
             self._load_versions(name, folder)
         if not self._loaded:
@@ -106,10 +106,10 @@ class ModelStore:
 
         Args:
             name: Name of the model.
-            version: Version; empty for the highest loaded version.
+            version: Number of the version as a text. An empty text means the highest loaded version.
 
         Raises:
-            ModelNotFound: If the version is not loaded. The message lists the loaded versions and the reason why this
+            ModelNotFound: If the version is not loaded. The message lists the loaded versions, and states why the
                 version was refused.
         """
         loaded = self._loaded.get((name, version))
@@ -118,13 +118,14 @@ class ModelStore:
         return loaded
 
     def _not_found_message(self, name: str, version: str) -> str:
-        """Return the message for a model that is not loaded.
+        """Return the error message for a model or a version that is not loaded.
 
-        The message lists all loaded versions, and the reasons why versions of this model were refused.
+        The message lists all loaded versions. The message also contains the reasons why requested versions of the model
+        were refused.
 
         Args:
             name: Name of the model.
-            version: Version; empty for any version.
+            version: Number of the requested version as a text. An empty text means that any version was requested.
         """
         label = f"{name}/{version}" if version else name
         loaded_labels = sorted(loaded.metadata.label for loaded in self.loaded_versions())
@@ -138,37 +139,37 @@ class ModelStore:
         return "; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *reasons])
 
     def label(self, name: str, version: str = "") -> str | None:
-        """Return the label `name/version` of a version; None if this version is not loaded.
+        """Return the label `name/version` of a version, or None if the version is not loaded.
 
         Args:
             name: Name of the model.
-            version: Version; empty for the highest loaded version.
+            version: Number of the version as a text. An empty text means the highest loaded version.
         """
         loaded = self._loaded.get((name, version))
         return None if loaded is None else loaded.metadata.label
 
     def loaded_versions(self) -> list[LoadedVersion]:
-        """Return all loaded versions, sorted by name and version."""
+        """Return all loaded versions of all models, sorted by name and version."""
         versions = [loaded for (_, version), loaded in self._loaded.items() if version]
         return sorted(versions, key=lambda loaded: (loaded.metadata.name, loaded.metadata.version))
 
     def versions_of(self, name: str) -> list[LoadedVersion]:
-        """Return the loaded versions of one model in ascending order.
+        """Return the loaded versions of one model, in ascending order of their numbers.
 
         Raises:
             ModelNotFound: If no version of the model is loaded.
         """
-        self.get(name)
+        self.get(name)  # raises ModelNotFound
         return [loaded for loaded in self.loaded_versions() if loaded.metadata.name == name]
 
     def refusals(self) -> list[str]:
-        """Return the reason for each version that was refused."""
+        """Return the reasons why versions were refused or unloaded, sorted by name and version."""
         return [reason for _, reason in sorted(self._refused.items())]
 
     def check_ready(self) -> None:
-        """Check that at least one version is loaded.
+        """Check that at least one version of a model is loaded.
 
-        The error message contains no names of files, because it is sent to any client.
+        The error message contains no names of files, because it is also sent to clients without a token.
 
         Raises:
             ModelError: If no version is loaded.
@@ -183,10 +184,14 @@ class ModelStore:
         )
 
     def version_states(self) -> list[dict[str, str]]:
-        """Return the name, version, state and reason of every version that is loaded or was refused."""
+        """Return one row for every version that is loaded, was refused or was unloaded.
+
+        A row contains the name of the model, the number of the version, the state of the version, and, if it is not
+        loaded, the reason.
+        """
         reasons = self._refused
         loaded_keys = {(loaded.metadata.name, loaded.metadata.version) for loaded in self.loaded_versions()}
-        all_keys = loaded_keys | set(reasons)
+        all_keys = loaded_keys | set(reasons)  # a loaded version whose new files were refused is in both sets
         return [
             {
                 "name": name,
@@ -198,7 +203,7 @@ class ModelStore:
         ]
 
     def index(self) -> list[dict[str, str]]:
-        """Return the rows of `version_states`, and one row for each model that has not been loaded."""
+        """Return the rows of `version_states`, followed by one row for each further model in the folders."""
         rows = self.version_states()
         listed_names = {row["name"] for row in rows}
         for name in self._folders():
@@ -207,27 +212,33 @@ class ModelStore:
         return rows
 
     def counters(self) -> dict[tuple[str, str], Statistics]:
-        """Return the present counters, by name and version, of every version that has ever been loaded."""
-        counters = sorted(dict(self._statistics).items())
+        """Return copies of the counters of every version, by name and version.
+
+        The result also contains versions that are no longer loaded.
+        """
+        counters = sorted(dict(self._statistics).items())  # a copy, because another thread may add a version
         return {(name, str(version)): statistics.snapshot() for (name, version), statistics in counters}
 
     def load(self, name: str) -> None:
-        """Read the files of a model again, and replace its versions.
+        """Read the files of a model again, and replace its loaded versions.
 
-        A loaded version is removed only if its folder has disappeared and all other versions are valid. A model
-        therefore stays available while its folders are copied or moved.
+        A loaded version is removed only if its folder no longer exists and all remaining versions are valid. A model
+        therefore remains available while its folders are being copied or moved.
+
+        Args:
+            name: Name of the model.
 
         Raises:
             ModelNotFound: If the folders contain no such model.
-            ModelError: If a version is refused, or no version is found. Versions that were loaded before stay loaded,
-                with their new files if these are valid.
+            ModelError: If a version is refused, or if the model has no version. In both cases, all valid versions are
+                loaded, and versions that were loaded before remain loaded.
         """
         with self._change_lock:
             folder = self._folders().get(name)
             if folder is None:
                 raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
             refused = self._load_versions(name, folder)
-        # The valid versions are loaded in any case. The errors only report what was not loaded.
+        # All valid versions are loaded now. The following errors only report which versions are not loaded.
         if refused:
             raise ModelError("; ".join(refused.values()))
         if not version_folders(folder):
@@ -237,7 +248,7 @@ class ModelStore:
             )
 
     def unload(self, name: str) -> None:
-        """Remove all versions of a model. Requests that have begun still finish.
+        """Remove all versions of a model. Requests that have already begun are still finished.
 
         Raises:
             ModelNotFound: If no version of the model is loaded.
@@ -249,7 +260,8 @@ class ModelStore:
     def _load_versions(self, name: str, folder: Path) -> dict[tuple[str, int], str]:
         """Load every version of a model from its folder, and replace the versions that were loaded before.
 
-        If a version is refused, or no version is found, the other versions that were loaded before stay loaded.
+        If a version is refused, or if no version is found, versions that were loaded before and were not replaced
+        remain loaded.
 
         Args:
             name: Name of the model.
@@ -258,44 +270,46 @@ class ModelStore:
         Returns:
             Reasons why versions were refused, by name and version.
         """
-        loaded: dict[int, LoadedVersion] = {}
+        new_versions: dict[int, LoadedVersion] = {}
         refused: dict[tuple[str, int], str] = {}
         for version, version_folder in version_folders(folder).items():
             # The counters continue when files are loaded again, because a Prometheus counter must never decrease.
             statistics = self._statistics.setdefault((name, version), Statistics())
             try:
-                loaded[version] = _load_version(name, version, version_folder, statistics)
-            except Exception as error:  # A folder may be broken in any way, and must not affect other models.
+                new_versions[version] = _load_version(name, version, version_folder, statistics)
+            except Exception as error:  # any error in one folder must not affect the other models
                 refused[name, version] = _refusal_reason(version_folder, error)
-        if refused or not loaded:
-            loaded = self._loaded_by_version(name) | loaded
-        ascending_versions = [loaded[version] for version in sorted(loaded)]
+        versions = new_versions
+        if refused or not new_versions:  # keep the versions that were loaded before, unless new files replace them
+            versions = self._loaded_by_version(name) | new_versions
+        ascending_versions = [versions[version] for version in sorted(versions)]
         self._replace(name, ascending_versions, refused)
         return refused
 
     def _loaded_by_version(self, name: str) -> dict[int, LoadedVersion]:
-        """Return the loaded versions of a model by version; empty if there are none."""
+        """Return the loaded versions of a model by the number of the version."""
         return {loaded.metadata.version: loaded for loaded in self.loaded_versions() if loaded.metadata.name == name}
 
     def _replace(self, name: str, versions: list[LoadedVersion], refused: dict[tuple[str, int], str]) -> None:
-        """Replace the versions of a model, and the reasons why versions were refused.
+        """Replace the loaded versions of a model, and the reasons why its versions were refused.
 
-        Each dictionary is replaced by one assignment, so that readers need no lock.
+        Each dictionary is replaced by a new dictionary in a single assignment. Other threads can therefore read the
+        dictionaries without a lock.
 
         Args:
             name: Name of the model.
-            versions: New versions of the model, in ascending order.
+            versions: New loaded versions of the model, in ascending order.
             refused: Reasons why versions were refused, by name and version.
         """
         loaded = {
-            (other_name, version): other_version
-            for (other_name, version), other_version in self._loaded.items()
+            (other_name, version): other_loaded
+            for (other_name, version), other_loaded in self._loaded.items()
             if other_name != name
         }
         for new_version in versions:
             loaded[name, new_version.version] = new_version
         if versions:
-            loaded[name, ""] = versions[-1]  # the highest version
+            loaded[name, ""] = versions[-1]  # the empty version stands for the highest version
 
         other_refused = {
             (other_name, version): reason
@@ -307,14 +321,14 @@ class ModelStore:
 
 
 def open_model_store(models: Path | None = None) -> ModelStore:
-    """Load all models of one repository, or of all repositories that `find_model` searches.
+    """Load all models in one repository, or in all repositories that `find_model` searches.
 
     Args:
-        models: The only repository. By default all repositories are searched; if a model is in several repositories,
-            the first one is used.
+        models: Folder of the only repository. By default, all repositories are searched. If several repositories
+            contain a model, the model in the first of them is used.
 
     Raises:
-        ModelError: If `models` is not a folder or contains no model, or no version passes its checks.
+        ModelError: If `models` is not a folder or contains no model, or if no version passes its checks.
     """
     if models is None:
         return ModelStore(partial(_find_model_folders, repositories()))
@@ -325,10 +339,11 @@ def open_model_store(models: Path | None = None) -> ModelStore:
 
 
 def _find_model_folders(roots: Sequence[Path]) -> Mapping[str, Path]:
-    """Return the present folder of each model by its name.
+    """Search repositories for models, and return the folder of each model by the name of the model.
 
     Args:
-        roots: Repositories. If a model is in several repositories, the first one takes precedence.
+        roots: Folders of the repositories. If several repositories contain a model, its folder in the first of them is
+            returned.
     """
     folder_of_model: dict[str, Path] = {}
     for root in roots:
@@ -338,7 +353,15 @@ def _find_model_folders(roots: Sequence[Path]) -> Mapping[str, Path]:
 
 
 def _refusal_reason(folder: Path, error: Exception) -> str:
-    """Return the reason why a version is refused. An error that is not a ModelError is also written to the log."""
+    """Return the reason why a version is refused.
+
+    An error that is not a ModelError is unexpected. Such an error is therefore also written to the log with its
+    traceback.
+
+    Args:
+        folder: Folder of the version.
+        error: Error that has occurred while the version was loaded and checked.
+    """
     if isinstance(error, ModelError):
         return str(error)
     log.error("%s: the model cannot be checked", folder, exc_info=error)
@@ -346,16 +369,16 @@ def _refusal_reason(folder: Path, error: Exception) -> str:
 
 
 def _load_version(name: str, version: int, folder: Path, statistics: Statistics) -> LoadedVersion:
-    """Load one version of a model, check it, and return it.
+    """Load one version of a model, check its files, and return the version.
 
     Args:
         name: Name of the model, which is the name of the parent folder.
-        version: Version, which is the name of the folder.
+        version: Number of the version, which is the name of the folder.
         folder: Folder of the version.
-        statistics: Counters of the version.
+        statistics: Counters of the requests to this version, which may have begun before.
 
     Raises:
-        ModelError: If a check fails, or the metadata name another model than the folders.
+        ModelError: If a check fails, or if the metadata contain another name than the folder.
     """
     model = load_checked_model(folder)
     if model.metadata.name != name:

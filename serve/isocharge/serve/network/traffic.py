@@ -1,12 +1,12 @@
-"""Counters and log of the servers.
+"""Counters and log of the HTTP server and of the gRPC server.
 
-`Traffic` counts requests by route and status, and open connections. `Statistics` counts the requests to a model, their
-time and its misfit alarms, for Triton's statistics and for `/metrics`. `RequestLog` writes one line of JSON for each
-request.
+The class `Traffic` counts requests by route and status. The class `Statistics` counts the requests to one version of a
+model, their duration, and the presses with a large misfit. The statistics of Triton's protocol and the path `/metrics`
+return these counts. The class `RequestLog` writes one line of JSON for each request.
 
-A line of the log contains no text that a client has sent. Routes, models, statuses and types of errors are names of
-this server, and the address of the client comes from the operating system. A client therefore cannot forge a line, fill
-the disk with long lines, write a secret into the log, or create counters.
+The line of a request contains no text that a client has sent. The names of routes, models, statuses and errors are
+defined by this server, and the address of the client comes from the operating system. A client therefore cannot forge a
+line, fill the disk with long lines, write a secret into the log, or create new counters.
 """
 
 import logging
@@ -22,25 +22,25 @@ from typing import Any, NamedTuple
 import orjson
 
 MAX_TEXT_CHARACTERS = 4000
-"""Largest number of characters of a message or traceback in a line. Of longer texts, the middle is left out."""
+"""Largest number of characters of a message or a traceback in a line. The middle of a longer text is left out."""
 
 Client = tuple[str, int] | None
-"""Address and port of a client; None on a Unix socket."""
+"""Address and port of a client. None if the client has connected through a Unix socket."""
 
 
 class Exchange(NamedTuple):
-    """One request and its response.
+    """Properties of a request and of its response, for the counters and the log.
 
     Attributes:
-        transport: "http" or "grpc".
-        route: Name of the route; "none" if the request could not be read.
+        transport: Transport of the request, which is "http" or "grpc".
+        route: Name of the route, or "none" if the request could not be read.
         status: HTTP status, or name of the gRPC status.
-        model: Label `name/version` of the requested model; None if the request names no model.
-        error: Type of the error; None if there was no error.
-        ns: Time from the complete request to the complete response, ns; 0 if unknown.
+        model: Label `name/version` of the requested model, or None if no loaded model was requested.
+        error: Name of the type of the error, or None if no error occurred.
+        ns: Time from the complete request to the complete response, ns. It is 0 if the time is unknown.
         bytes_in: Size of the body of the request, bytes.
         bytes_out: Size of the body of the response, bytes.
-        client: Address of the client.
+        client: Address and port of the client, or a text that contains both.
     """
 
     transport: str
@@ -55,11 +55,12 @@ class Exchange(NamedTuple):
 
 
 class RequestLog(logging.Handler):
-    """Log in JSON, with one line for each request and one line for each message of the module `logging`.
+    """Log with one line of JSON for each request, and for each message of the module `logging`.
 
     Args:
-        write: Function that takes a line without a line feed. It is called from any thread and must not block.
-        secret: Text that is replaced by `[secret]` in all messages.
+        write: Function that writes a line, which is given without a line feed. The function is called by several
+            threads and must not wait.
+        secret: Secret text, such as a token, that is replaced by `[secret]` in all messages.
     """
 
     def __init__(self, write: Callable[[str], object], *, secret: str | None = None) -> None:
@@ -67,32 +68,32 @@ class RequestLog(logging.Handler):
         self._write = write
         self._secret = secret
 
-    def exchange(self, exchange: Exchange) -> None:
-        """Write a line about a request."""
-        transport, route, status, model, error, ns, bytes_in, bytes_out, client = exchange
-        is_internal_error = status in (500, "INTERNAL")
+    def write_exchange(self, exchange: Exchange) -> None:
+        """Write a line about a request and its response."""
+        is_internal_error = exchange.status in (500, "INTERNAL")  # the status of HTTP, and that of gRPC
+        client = exchange.client
         line = {
             "time": datetime.now(UTC),
             "level": "error" if is_internal_error else "info",
             "event": "request",
-            "transport": transport,
-            "route": route,
-            "status": status,
-            "model": model,
-            "error": error,
-            "duration_us": ns / 1000,
-            "bytes_in": bytes_in,
-            "bytes_out": bytes_out,
+            "transport": exchange.transport,
+            "route": exchange.route,
+            "status": exchange.status,
+            "model": exchange.model,
+            "error": exchange.error,
+            "duration_us": exchange.ns / 1000,
+            "bytes_in": exchange.bytes_in,
+            "bytes_out": exchange.bytes_out,
             "client": "%s:%d" % client if isinstance(client, tuple) else client,  # noqa: UP031 - twice as fast
         }
         self._write(orjson.dumps(line).decode())
 
-    def message(self, level: str, event: str, message: str) -> None:
-        """Write a line about the server itself."""
+    def write_message(self, level: str, event: str, message: str) -> None:
+        """Write a line about the server itself, for example when the server starts."""
         self._write_line(level, event=event, message=self._clean(message))
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a message of the module `logging`, and its traceback if there is one."""
+        """Write a line with a message of the module `logging`, and with its traceback if there is one."""
         fields = {"event": "message", "logger": record.name, "message": self._clean(record.getMessage())}
         if record.exc_info and record.exc_info[0] is not None:
             fields["traceback"] = self._clean("".join(traceback.format_exception(*record.exc_info)))
@@ -102,11 +103,12 @@ class RequestLog(logging.Handler):
         self._write(orjson.dumps({"time": datetime.now(UTC), "level": level} | fields).decode())
 
     def _clean(self, text: str) -> str:
-        """Return a text as valid UTF-8 without the secret.
+        """Prepare a text for the log, and return the result.
 
-        If the text has more than `MAX_TEXT_CHARACTERS` characters, its middle is replaced by " [...] ".
+        Characters that UTF-8 cannot encode are replaced by "?", and the secret is replaced by "[secret]". If the text
+        is then longer than `MAX_TEXT_CHARACTERS` characters, its middle is replaced by " [...] ".
         """
-        cleaned = text.encode("utf-8", "replace").decode()  # lone surrogates cannot be encoded and become "?"
+        cleaned = text.encode("utf-8", "replace").decode()  # lone surrogates become "?"
         if self._secret:
             cleaned = cleaned.replace(self._secret, "[secret]")
         if len(cleaned) <= MAX_TEXT_CHARACTERS:
@@ -116,12 +118,12 @@ class RequestLog(logging.Handler):
 
 
 class Traffic:
-    """Counters of the servers of one process. All methods may be called from any thread.
+    """Counters that all servers of one process share. Any thread may call any method.
 
     Attributes:
-        log: Log to which each request is written; None if there is no log.
-        open: Function for each transport that returns the number of its open connections or calls.
-        lost_lines: Function that returns the number of log lines that could not be written; None if there is no log.
+        log: Log to which each request is written, or None if there is no log.
+        open: Function by transport, which returns the number of open connections or calls of this transport.
+        lost_lines: Function that returns the number of log lines that could not be written, or None if there is no log.
     """
 
     def __init__(self, log: RequestLog | None = None) -> None:
@@ -132,26 +134,29 @@ class Traffic:
         self._lock = threading.Lock()
 
     def count(self, transport: str, route: str, status: int | str) -> None:
-        """Count a request that was answered. The answer may be an error."""
+        """Count a request that was answered, possibly with an error."""
         key = transport, route, status
         with self._lock:
             self._requests[key] = self._requests.get(key, 0) + 1
 
-    def note(self, exchange: Exchange) -> None:
-        """Count a request that was answered, and write it to the log."""
+    def count_and_log(self, exchange: Exchange) -> None:
+        """Count a request that was answered, and write a line about the request to the log if there is a log."""
         self.count(exchange.transport, exchange.route, exchange.status)
         if self.log is not None:
-            self.log.exchange(exchange)
+            self.log.write_exchange(exchange)
 
     def requests(self) -> dict[tuple[str, str, str], int]:
-        """Return the numbers of requests by transport, route and status."""
+        """Return the number of requests by transport, route and status."""
         with self._lock:
             counts = dict(self._requests)
         return {(transport, route, str(status)): count for (transport, route, status), count in counts.items()}
 
 
 STAGES = ("compute_input", "compute_infer", "compute_output")
-"""Triton's names of the three stages of an inference: reading the request, running the model, writing the response."""
+"""Triton's names of the three stages of an inference.
+
+In these stages, the server reads the request, runs the model, and writes the response.
+"""
 
 LATENCY_BOUNDS_NS = (
     10_000,
@@ -166,23 +171,27 @@ LATENCY_BOUNDS_NS = (
     5_000_000,
     20_000_000,
 )
-"""Upper bounds of the latency histogram, ns: from half the time of one press to three times that of a full batch."""
+"""Upper bounds of the buckets of the latency histogram, ns.
+
+They range from half the latency of a single press to three times the latency of the largest batch.
+"""
 
 
 @dataclass
 class Statistics:
-    """Counters of one version of a model since the start of the server. All methods may be called from any thread.
+    """Counters of one version of a model since the start of the server. Any thread may call any method.
 
     Attributes:
-        presses: Number of presses that were answered.
+        presses: Number of presses for which contacts were returned.
         unchecked: Number of these presses whose misfit was not computed.
         alarms: Number of these presses whose misfit is above the limit of the model.
         answered: Number of requests that were answered.
         refused: Number of requests that were refused.
-        latency: Number of answered requests in each bucket of the histogram. The last bucket has no upper bound.
+        latency: Number of answered requests in each bucket of the latency histogram. The last bucket has no upper
+            bound.
         stages_ns: Total time of the answered requests in each of `STAGES`, ns.
         refused_ns: Total time of the refused requests, ns.
-        last_ms: Time of the last response, Unix time, ms.
+        last_ms: Unix time of the last response, ms.
     """
 
     presses: int = 0
@@ -196,17 +205,19 @@ class Statistics:
     last_ms: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock, compare=False)
 
-    def succeeded(self, presses: int, stages_ns: tuple[int, int, int], unchecked: int = 0, alarms: int = 0) -> None:
+    def count_answered(
+        self, presses: int, stages_ns: tuple[int, int, int], unchecked: int = 0, alarms: int = 0
+    ) -> None:
         """Count a request that was answered.
 
         Args:
-            presses: Number of its presses.
-            stages_ns: Its time in each of `STAGES`, ns.
+            presses: Number of presses in the request.
+            stages_ns: Time that the request has spent in each of `STAGES`, ns.
             unchecked: Number of presses whose misfit was not computed.
             alarms: Number of presses whose misfit is above the limit.
         """
         read_ns, run_ns, write_ns = stages_ns
-        # Index of the first bucket of the latency histogram whose upper bound is not below the total time.
+        # The request belongs to the first bucket whose upper bound is at least as large as the total time.
         bucket = bisect_left(LATENCY_BOUNDS_NS, read_ns + run_ns + write_ns)
         with self._lock:
             self.presses += presses
@@ -214,14 +225,18 @@ class Statistics:
             self.alarms += alarms
             self.answered += 1
             self.latency[bucket] += 1
-            # Three statements take half a microsecond less than a loop.
+            # A loop over the three stages would take half a microsecond more.
             self.stages_ns[0] += read_ns
             self.stages_ns[1] += run_ns
             self.stages_ns[2] += write_ns
             self.last_ms = time.time_ns() // 1_000_000
 
-    def failed(self, ns: int) -> None:
-        """Count a request that was refused, and add the time that it took, ns."""
+    def count_refused(self, ns: int) -> None:
+        """Count a request that was refused.
+
+        Args:
+            ns: Time from the complete request to the refusal, ns.
+        """
         with self._lock:
             self.refused += 1
             self.refused_ns += ns
@@ -232,12 +247,12 @@ class Statistics:
         return self.presses - self.unchecked
 
     def snapshot(self) -> "Statistics":
-        """Return a copy of all counters, which are read at the same moment."""
+        """Return a copy of all counters. No other thread can change a counter while they are copied."""
         with self._lock:
             return replace(self, latency=[*self.latency], stages_ns=[*self.stages_ns], _lock=threading.Lock())
 
     def to_json(self) -> dict[str, Any]:
-        """Return the counters under the names of Triton's statistics."""
+        """Return the counters as a JSON object with the names that Triton uses in its statistics."""
         counters = self.snapshot()
         durations_ns = dict(zip(STAGES, counters.stages_ns, strict=True))
         durations_ns["queue"] = 0  # no request waits in a queue

@@ -1,12 +1,11 @@
-"""Records as an MCAP file, for Foxglove, PlotJuggler and ROS 2."""
+"""Output of records to an MCAP file, which Foxglove, PlotJuggler and ROS 2 can read."""
 
 from contextlib import ExitStack
 from pathlib import Path
 
-from isocharge.common.errors import OutputError
 from isocharge.common.files import as_output_errors, new_file
 from isocharge.serve.export.record_messages import RecordEncoding
-from isocharge.serve.outputs.output import Output, OutputContext, OutputKind
+from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, exit_with_error
 from isocharge.serve.record.record import PredictionRecord
 
 SUFFIX = ".mcap"
@@ -17,17 +16,17 @@ ROS2_SUFFIX = ".ros2.mcap"
 class McapOutput:
     """Writes records into a new MCAP file.
 
-    If the records come from a sensor, the file is created under its final name. In a replay, the file gets its name
-    when it is complete.
+    If the records come from a sensor, the file is created under its final name. In a replay, the file has a temporary
+    name until it is complete.
     """
 
     def __init__(self, path: Path, electrodes: tuple[str, ...], encoding: RecordEncoding, *, is_live: bool) -> None:
         """Create the file.
 
         Args:
-            path: The file; it must not exist.
-            electrodes: Names of the electrodes.
-            encoding: Encoding of the records.
+            path: Path of the file, which must not exist yet.
+            electrodes: Names of the electrodes, in the order of the charges.
+            encoding: Whether the records are written as JSON or as ROS 2 messages.
             is_live: Whether the records come from a sensor.
 
         Raises:
@@ -38,9 +37,9 @@ class McapOutput:
         from isocharge.serve.export.mcap_file import McapFile  # needs the extra `record`
 
         self._path = path
-        self._stack = ExitStack()  # closes the file and, in a replay, then renames it
-        draft = path if is_live else self._stack.enter_context(new_file(path))
-        self._file = self._stack.enter_context(McapFile(draft, electrodes, encoding))
+        self._stack = ExitStack()  # closes the file; in a replay, it then gives the file its final name
+        written_path = path if is_live else self._stack.enter_context(new_file(path))
+        self._file = self._stack.enter_context(McapFile(written_path, electrodes, encoding))
 
     def write(self, record: PredictionRecord) -> None:
         """Write a record.
@@ -53,20 +52,17 @@ class McapOutput:
             self._file.write(record)
 
     def close(self) -> None:
-        """Write the index and close the file. In a replay, the file gets its name now."""
+        """Write the index and close the file.
+
+        In a replay, this method also renames the file from its temporary name to its final name.
+        """
         with as_output_errors(self._path):
             self._stack.close()
 
     def discard(self) -> None:
-        """Close the file without an index. In a replay, the file is removed."""
+        """Close the file without writing the index. In a replay, also remove the file."""
         self._file.is_abandoned = True
-        # The contexts are left with an error, so that they remove an incomplete file. They raise this error again.
-        incomplete = OutputError(f"{self._path}: incomplete")
-        try:
-            self._stack.__exit__(OutputError, incomplete, None)
-        except OutputError as error:
-            if error is not incomplete:
-                raise
+        exit_with_error(self._stack)  # in a replay, the stack contains `new_file`, which removes an incomplete file
 
 
 def _open_mcap(target: str, context: OutputContext) -> Output:

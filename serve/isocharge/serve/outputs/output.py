@@ -1,7 +1,7 @@
-"""The interface of an output, and the description of a kind of output.
+"""Interface of an output, and description of a kind of output.
 
-Another package adds a kind of output through an entry point of the group "isocharge.outputs", which refers to an
-`OutputKind`.
+Another package can add a kind of output. The package must declare an entry point in the group "isocharge.outputs" that
+refers to an `OutputKind`.
 
 Example of such an entry point in pyproject.toml:
 
@@ -11,6 +11,7 @@ Example of such an entry point in pyproject.toml:
 
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -20,32 +21,54 @@ from isocharge.serve.record.record import PredictionRecord
 class Output(Protocol):
     """A destination of prediction records.
 
-    An output may have a method `discard()`. This method is called instead of `close` if the records are incomplete
-    because of an error, or because a replay was stopped. An output can then remove a file that contains only a part of
-    the records.
+    An output may also have a method `discard()`. If the records are incomplete because of an error, or because a replay
+    was stopped, `discard` is called instead of `close`. In its method `discard`, an output can remove a file that
+    contains only some of the records.
     """
 
     def write(self, record: PredictionRecord, /) -> None:
-        """Write a record. After an exception, the output receives no more records, but the stream continues."""
+        """Write a record.
+
+        If this method raises an exception in a live stream, the output receives no more records, and the stream
+        continues without this output.
+        """
 
     def close(self) -> None:
-        """Write all records that are still in memory, and release files and sockets."""
+        """Write all records that are still in memory, and close the files and sockets of the output."""
 
 
 def discard(output: Output) -> None:
-    """Close an output whose records are incomplete."""
-    getattr(output, "discard", output.close)()
+    """Call the method `discard` of an output whose records are incomplete, or `close` if it has no such method."""
+    discard_or_close = getattr(output, "discard", output.close)
+    discard_or_close()
+
+
+class _Incomplete(Exception):
+    """Error with which `exit_with_error` leaves contexts."""
+
+
+def exit_with_error(contexts: ExitStack) -> None:
+    """Leave contexts as if their block had raised an error.
+
+    A context that creates a file then removes the incomplete file.
+
+    Args:
+        contexts: The contexts that were entered.
+    """
+    with suppress(_Incomplete), contexts:
+        raise _Incomplete
 
 
 @dataclass(frozen=True, kw_only=True)
 class OutputContext:
-    """Properties of the stream that an output may need.
+    """Properties of the stream of records that an output may need.
 
     Attributes:
         electrodes: Names of the electrodes, in the order of the charges.
         with_tracking: Whether contacts are tracked, so that the records have the fields of a `Tracking`.
         with_film: Whether the film is followed, so that the records have the field `film`.
-        is_live: Whether the records come from a sensor, which does not wait, or from a recording.
+        is_live: True if the records come from a sensor, which does not wait for the outputs. False if they come from a
+            recording.
         write_stdout: Function that writes a text to standard output.
         stdout_is_ready: Function that waits a short time and returns whether standard output would accept a line.
     """
@@ -60,15 +83,15 @@ class OutputContext:
 
 @dataclass(frozen=True, kw_only=True)
 class OutputKind:
-    """A kind of output, which is chosen by the form of its target.
+    """A kind of output, such as CSV files. The form of a target decides which kind is used.
 
     Attributes:
         form: Form of the targets, for help and messages, such as `FILE.csv`.
-        accepts: Function that returns whether a target has this form.
-        open: Function that opens a target. It raises an `IsochargeError` if this is impossible.
+        accepts: Function that returns whether the text of a target has this form.
+        open: Function that opens the output with the given target. It raises an `IsochargeError` if this is impossible.
         may_block: Whether `write` may wait. In a live stream, such an output has its own thread and queue.
-        is_standard_output: Whether the output writes to standard output. At most one target may do that, and the stream
-            ends when standard output is closed.
+        is_standard_output: Whether the output writes to standard output. Only one output of a command may write to
+            standard output. The stream ends when standard output is closed.
     """
 
     form: str

@@ -1,4 +1,4 @@
-"""An output with its own queue and thread, so that a live stream never waits for a slow consumer."""
+"""Output with its own queue and thread. A live stream therefore never waits for a slow consumer."""
 
 import logging
 from collections.abc import Callable
@@ -11,7 +11,7 @@ log = logging.getLogger(__name__)
 
 
 class QueuedOutput:
-    """Writes records to another output in a thread.
+    """Output that passes its records to another output in a separate thread.
 
     Attributes:
         has_failed: Whether the other output has raised an error. It receives no more records afterwards.
@@ -23,8 +23,8 @@ class QueuedOutput:
         """Start the thread.
 
         Args:
-            output: The other output.
-            target: Its target, for messages.
+            output: The other output, to which the thread writes the records.
+            target: Target of the other output, for messages.
             is_ready: Function that waits a short time and returns whether the consumer would accept a record.
             ends_stream: Whether an error of the other output ends the stream. The next call of `write` then raises the
                 error. Otherwise the error is written to the log.
@@ -37,20 +37,25 @@ class QueuedOutput:
 
     @property
     def lost(self) -> int:
-        """Number of records that were never written, because the consumer was too slow."""
+        """Number of records that were dropped because the consumer was too slow."""
         return self._queue.lost
 
     def write(self, record: PredictionRecord) -> None:
-        """Append a record to the queue, or raise the error of the other output if this error ends the stream."""
+        """Append a record to the queue. The thread later writes the record to the other output.
+
+        Raises:
+            Exception: The error of the other output, if its errors end the stream.
+        """
         self._queue.put(record)
 
     def close(self) -> None:
-        """Write the waiting records until the consumer no longer accepts them, and close the other output.
+        """Write the records that are still in the queue, and close the other output.
 
-        If the other output has failed, it is discarded instead.
+        If the consumer no longer accepts records, the remaining records are dropped. If the other output has raised an
+        error before, it is discarded instead of closed.
         """
         self._queue.close()
-        if self._queue.is_stuck:  # the thread still writes to the other output, which therefore cannot be closed
+        if self._queue.is_stuck:  # the thread is still in `write` of the other output, which therefore cannot be closed
             return
         try:
             if self.has_failed:
@@ -61,7 +66,10 @@ class QueuedOutput:
             self._handle_error(error)
 
     def _write(self, record: PredictionRecord) -> None:
-        """Write a record to the other output, unless this output has failed before. The thread calls this method."""
+        """Write a record to the other output, unless the other output has failed before.
+
+        The thread of the queue calls this method.
+        """
         if self.has_failed:
             return
         try:
@@ -70,10 +78,13 @@ class QueuedOutput:
             self._handle_error(error)
 
     def _handle_error(self, error: Exception) -> None:
-        """Raise an error that ends the stream, or write the first error of the output to the log.
+        """Handle an error of the other output.
+
+        If errors of the other output end the stream, the error is raised. Otherwise the first error is written to the
+        log, and later errors are ignored.
 
         Raises:
-            Exception: The error, if the errors of this output end the stream.
+            Exception: The given error, if errors of the other output end the stream.
         """
         is_first_error = not self.has_failed
         self.has_failed = True

@@ -1,4 +1,4 @@
-"""The registered kinds of outputs, and the outputs of a command."""
+"""List of the available kinds of outputs, and the class that writes records to all outputs of a command."""
 
 from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint, entry_points
@@ -22,21 +22,21 @@ OUTPUT_KINDS: tuple[OutputKind, ...] = (
     MCAP_FILE,
     UDP,
 )
-"""The kinds of outputs of this package. The first kind that accepts a target opens it."""
+"""Kinds of outputs of this package. If several kinds accept a target, the first of them is used."""
 
 ENTRY_POINTS = "isocharge.outputs"
 """Group of the entry points through which other packages add kinds of outputs."""
 
 
 def target_forms() -> str:
-    """Return the forms of the targets of this package, separated by commas, for help and messages."""
+    """Return the forms of all targets that this package accepts, separated by commas, for help texts and messages."""
     return ", ".join(kind.form for kind in OUTPUT_KINDS)
 
 
 def kind_of(target: str) -> OutputKind:
-    """Return the kind of output for a target.
+    """Return the kind of output that accepts a target.
 
-    The built-in kinds are tried first, and then the kinds that installed packages add by entry points.
+    The built-in kinds are tried before the kinds that other installed packages add through entry points.
 
     Args:
         target: Target of an output, such as `json` or `touch.csv`.
@@ -60,7 +60,7 @@ def kind_of(target: str) -> OutputKind:
 
 
 def _load_kind(entry_point: EntryPoint) -> OutputKind:
-    """Return the kind of output that a package adds.
+    """Load and return the kind of output that another package adds.
 
     Args:
         entry_point: Entry point of the package, which refers to an OutputKind.
@@ -84,12 +84,15 @@ def _load_kind(entry_point: EntryPoint) -> OutputKind:
 
 
 def _failure(target: str, error: Exception) -> OutputError:
-    """Return the error that the user sees after an unexpected exception, for example in another package."""
+    """Return an OutputError that tells the user which output raised an unexpected exception.
+
+    Such an exception may come from another package, which adds a kind of output.
+    """
     return OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
 
 
 class Outputs:
-    """The outputs of a command; a context manager that closes them.
+    """All outputs of a command. The object is a context manager that opens and closes the outputs.
 
     Attributes:
         not_written: For each target that did not receive all records, the number of missing records, or None if an
@@ -97,14 +100,14 @@ class Outputs:
     """
 
     def __init__(self, targets: Sequence[str], context: OutputContext) -> None:
-        """Find the kind of each target without opening it.
+        """Determine the kind of output for each target, without opening the outputs.
 
         Args:
-            targets: Targets, such as `json` or `touch.csv`.
-            context: Description of the stream.
+            targets: Targets of the outputs, such as `json` or `touch.csv`.
+            context: Properties of the stream, which are passed to each output.
 
         Raises:
-            InputError: If a target has none of the forms, two targets are equal, or two targets write to standard
+            InputError: If no kind of output accepts a target, two targets are equal, or two targets write to standard
                 output.
         """
         kinds = {target: kind_of(target) for target in targets}
@@ -116,7 +119,8 @@ class Outputs:
             )
         if len(set(targets)) < len(targets):
             raise InputError(f"outputs {shown(list(targets))}: expected targets that differ; remove one of them")
-        # Standard output is written last. If its reader has closed it, the other outputs have received the record.
+        # Standard output is written last: if the program that reads it has ended, the write raises an error, but all
+        # other outputs have received the record before.
         self._kinds = {target: kinds[target] for target in other_targets + standard_targets}
         self._context = context
         self._outputs: dict[str, Output] = {}
@@ -144,19 +148,24 @@ class Outputs:
         return self
 
     def _queued(self, output: Output, target: str, kind: OutputKind) -> QueuedOutput:
-        """Return an output that writes to another output in a thread.
+        """Return an output that passes its records to an open output in a separate thread.
 
         Args:
-            output: The other output.
-            target: Its target, for messages.
-            kind: Its kind. Only standard output can report that its reader is slow, and ends the stream on an error.
+            output: The open output.
+            target: Target of the open output, for messages.
+            kind: Kind of the open output. Only standard output can report that its reader is slow. An error of standard
+                output ends the stream.
         """
         if kind.is_standard_output:
             return QueuedOutput(output, target, is_ready=self._context.stdout_is_ready, ends_stream=True)
         return QueuedOutput(output, target)
 
     def __exit__(self, error: type[BaseException] | None, *_: Any) -> None:
-        """Close the outputs. If a replay was stopped, its files are removed."""
+        """Close the outputs.
+
+        If an exception has ended a replay, the outputs are discarded instead of closed. Their incomplete files are then
+        removed.
+        """
         if error is not None and not self._context.is_live:
             self._discard()
         else:
@@ -164,7 +173,10 @@ class Outputs:
 
     @property
     def has_incomplete_file(self) -> bool:
-        """Whether an output other than standard output lacks records. The outputs must be closed before."""
+        """Whether an output other than standard output did not receive all records.
+
+        The value is only valid after the outputs were closed.
+        """
         return any(not kind_of(target).is_standard_output for target in self.not_written)
 
     def write(self, record: PredictionRecord) -> None:
@@ -176,19 +188,19 @@ class Outputs:
         for target, output in self._outputs.items():
             try:
                 output.write(record)
-            except (IsochargeError, OSError):  # its message already states the reason
+            except (IsochargeError, OSError):  # the message of such an error already states the reason
                 raise
             except Exception as error:  # an unexpected error, for example of another package
                 raise _failure(target, error) from error
 
     def close(self) -> None:
-        """Close all open outputs, and store in `not_written` how many records each of them lacks.
+        """Close all open outputs, and store in `not_written` how many records each output did not receive.
 
         Raises:
-            OSError, IsochargeError: The first error of an output. The other outputs are closed as well.
+            OSError, IsochargeError: The first error that occurred. All other outputs are closed before it is raised.
         """
         errors: list[BaseException] = []
-        for target, output in self._remove_all():
+        for target, output in self._remove_each():
             try:
                 output.close()
             except (OSError, IsochargeError) as error:
@@ -202,12 +214,12 @@ class Outputs:
             raise errors[0]
 
     def _discard(self) -> None:
-        """Discard all open outputs, because their records are incomplete."""
-        for target, output in self._remove_all():
+        """Discard all open outputs, because they have not received all records."""
+        for target, output in self._remove_each():
             discard(output)
-            self.not_written[target] = None
+            self.not_written[target] = None  # the number of missing records is unknown
 
-    def _remove_all(self) -> Iterator[tuple[str, Output]]:
-        """Remove the open outputs one by one, and yield each of them with its target."""
+    def _remove_each(self) -> Iterator[tuple[str, Output]]:
+        """Remove the open outputs one after the other, the last one first, and yield each output with its target."""
         while self._outputs:
             yield self._outputs.popitem()

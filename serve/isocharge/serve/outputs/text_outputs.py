@@ -1,29 +1,28 @@
-"""Records as lines of text, JSON or CSV, on standard output or in a new file."""
+"""Output of records as lines of JSON or CSV, to standard output or to a new file."""
 
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from isocharge.common.errors import OutputError
 from isocharge.common.files import AtomicWriter, as_output_errors, new_file
-from isocharge.serve.outputs.output import Output, OutputContext, OutputKind
+from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, exit_with_error
 from isocharge.serve.record.csv_rows import csv_header, csv_row
 from isocharge.serve.record.record import PredictionRecord
 
 LineOf = Callable[[PredictionRecord], str]
-"""Function that returns a record as a line, without the line feed."""
+"""Function that converts a record to a line of text without the line feed."""
 
 
 class StandardOutput:
-    """Writes a line for each record to standard output."""
+    """Output that writes one line to standard output for each record."""
 
     def __init__(self, write: Callable[[str], object], line_of: LineOf, header: str | None = None) -> None:
-        """Write the header, if there is one.
+        """Write the header to standard output, if there is a header.
 
         Args:
             write: Function that writes a text to standard output.
-            line_of: Function that returns a record as a line.
-            header: First line.
+            line_of: Function that converts a record to a line of text.
+            header: First line of the output, without the line feed. None if there is no header.
         """
         self._write = write
         self._line_of = line_of
@@ -39,19 +38,19 @@ class StandardOutput:
 
 
 class TextFile:
-    """Writes a line for each record into a new file.
+    """Output that writes one line to a new file for each record.
 
     If the records come from a sensor, the file is created under its final name, and whole lines are appended to it. In
-    a replay, the file gets its name when it is complete.
+    a replay, the file has a temporary name until it is complete.
     """
 
     def __init__(self, path: Path, line_of: LineOf, header: str | None = None, *, is_live: bool) -> None:
         """Create the file.
 
         Args:
-            path: The file; it must not exist.
-            line_of: Function that returns a record as a line.
-            header: First line.
+            path: Path of the file, which must not exist yet.
+            line_of: Function that converts a record to a line of text.
+            header: First line of the output, without the line feed. None if there is no header.
             is_live: Whether the records come from a sensor.
 
         Raises:
@@ -60,30 +59,28 @@ class TextFile:
         """
         self._path = path
         self._line_of = line_of
-        self._stack = ExitStack()  # closes the file and, in a replay, then renames it
-        draft = path if is_live else self._stack.enter_context(new_file(path))
-        self._file = AtomicWriter(draft)
+        self._stack = ExitStack()  # closes the file; in a replay, it then gives the file its final name
+        written_path = path if is_live else self._stack.enter_context(new_file(path))
+        self._file = AtomicWriter(written_path)
         self._stack.callback(self._file.close)
         if header is not None:
             self._write_line(header)
 
     def write(self, record: PredictionRecord) -> None:
-        """Write one line for a record. Raise OutputError if the disk is full."""
+        """Write one line for a record.
+
+        Raises:
+            OutputError: If the disk is full.
+        """
         self._write_line(self._line_of(record))
 
     def close(self) -> None:
-        """Close the file. In a replay, the file gets its name now."""
+        """Close the file. In a replay, also rename the file from its temporary name to its final name."""
         self._stack.close()
 
     def discard(self) -> None:
-        """Close the file. In a replay, the file is removed."""
-        # The contexts are left with an error, so that they remove an incomplete file. They raise this error again.
-        incomplete = OutputError(f"{self._path}: incomplete")
-        try:
-            self._stack.__exit__(OutputError, incomplete, None)
-        except OutputError as error:
-            if error is not incomplete:
-                raise
+        """Close the file. In a replay, also remove the file."""
+        exit_with_error(self._stack)  # in a replay, the stack contains `new_file`, which removes an incomplete file
 
     def _write_line(self, line: str) -> None:
         with as_output_errors(self._path):
@@ -103,7 +100,7 @@ def _csv_header(context: OutputContext) -> str:
 
 
 class _NoOutput:
-    """Writes nothing."""
+    """Output that ignores all records."""
 
     def write(self, record: PredictionRecord) -> None:
         pass

@@ -1,8 +1,9 @@
-"""Output of records as UDP datagrams. Each datagram contains one JSON object.
+"""Output of records as UDP datagrams, each of which contains one record as a JSON object.
 
-The UDP server of PlotJuggler with the JSON protocol can read the records without a conversion. PlotJuggler expects one
-object in each datagram, and uses the number `timestamp` as the time. Nulls are ignored. Each other number is shown as a
-series under the path to the number, such as `charge_pC/A`.
+The UDP server of PlotJuggler can read the records if its protocol is set to JSON. PlotJuggler expects one JSON object
+in each datagram. PlotJuggler uses the number `timestamp` as the time, and ignores values that are null. Every other
+number is shown as a time series. The name of a time series is the path of the number in the object, such as
+`charge_pC/A`.
 """
 
 import socket
@@ -18,13 +19,13 @@ MAX_PORT = 65535
 
 
 class UdpOutput:
-    """Sends each record as a datagram. A program need not receive the datagram."""
+    """Output that sends each record as a datagram, even if no program receives the datagrams."""
 
     def __init__(self, address: str) -> None:
-        """Look up the receiver, and open the socket.
+        """Resolve the address of the receiver, and open the socket.
 
         Args:
-            address: `HOST:PORT`.
+            address: Address of the receiver in the form `HOST:PORT`.
 
         Raises:
             InputError: If the address has another form, or the host is unknown.
@@ -45,7 +46,7 @@ class UdpOutput:
         self._socket.setblocking(False)  # a live stream must not wait for the network
 
     def write(self, record: PredictionRecord) -> None:
-        """Send a record. If the network is not ready, drop the record, because a live stream never waits."""
+        """Send a record. If the record cannot be sent at once, it is dropped, because a live stream never waits."""
         with suppress(OSError):  # the receiver is unreachable, or the buffer is full
             self._socket.sendto(record.to_json().encode(), self._address)
 

@@ -1,6 +1,7 @@
-"""Files that are given as a port by mistake: recordings, records, tables of presses, MCAP and Parquet files.
+"""Recognition of files that are given as a port by mistake.
 
-The lines of such files contain numbers, which the parsers of text would read as the charges of a board.
+Examples are recordings, records, tables of presses, MCAP files and Parquet files. The parsers of text would misread the
+numbers in such files as charges from a board.
 """
 
 import codecs
@@ -9,7 +10,7 @@ import shlex
 from isocharge.common.errors import InputError
 
 HEAD_BYTES = 4096
-"""Number of bytes at the start of a file from which its kind is recognised."""
+"""Number of bytes at the start of a file from which the kind of the file is recognised."""
 
 RECORDING_START = b'{"isocharge_recording"'
 RECORD_KEYS = (b'"frame_id"', b'"charge_pC"', b'"tare_pC"')
@@ -24,23 +25,23 @@ COLUMNS_OF_BOARDS = frozenset({"seq", "t_us", "t_ms", "t_s"})
 
 
 def refuse_foreign_file(name: str, head: bytes) -> None:
-    """Refuse a file that does not contain the bytes of a board.
+    """Raise an error if a file does not contain the bytes that a board sends.
 
     Args:
         name: Path of the file, or - for the standard input.
-        head: Its first bytes.
+        head: First bytes of the file.
 
     Raises:
-        InputError: If the file is of another kind. The message names the command that reads the file.
+        InputError: If the file is of another kind. The message states the kind, and how to use such a file.
     """
-    kind_and_command = _kind_and_command(name, head)
-    if kind_and_command is not None:
-        kind, command = kind_and_command
-        raise InputError(f"{name}: expected a port, or a file of bytes from a board, got {kind}; {command}")
+    kind_and_advice = _kind_and_advice(name, head)
+    if kind_and_advice is not None:
+        kind, advice = kind_and_advice
+        raise InputError(f"{name}: expected a port, or a file of bytes from a board, got {kind}; {advice}")
 
 
-def _kind_and_command(name: str, head: bytes) -> tuple[str, str] | None:
-    """Return the kind of a file that does not come from a board, and advice on what to do with the file.
+def _kind_and_advice(name: str, head: bytes) -> tuple[str, str] | None:
+    """Return the kind of a file that does not come from a board, and advice on how to use the file.
 
     Args:
         name: Path of the file, or - for the standard input.
@@ -49,11 +50,11 @@ def _kind_and_command(name: str, head: bytes) -> tuple[str, str] | None:
     Returns:
         Kind and advice, as parts of a sentence; None if the bytes may come from a board.
     """
-    file = shlex.quote(name)  # for the commands in the advice
-    text_start = head.removeprefix(codecs.BOM_UTF8).lstrip()
-    first_line, _, _ = text_start.partition(b"\n")
+    quoted_name = shlex.quote(name)  # for the commands in the advice
+    text = head.removeprefix(codecs.BOM_UTF8).lstrip()
+    first_line, _, _ = text.partition(b"\n")
     if first_line.startswith(RECORDING_START):
-        return "a recording", f"play it with: isocharge serve replay {file}"
+        return "a recording", f"play it with: isocharge serve replay {quoted_name}"
     if first_line.startswith(b"{") and all(key in first_line for key in RECORD_KEYS):
         return (
             "records of `serve stream`",
@@ -67,24 +68,24 @@ def _kind_and_command(name: str, head: bytes) -> tuple[str, str] | None:
             "`isocharge serve replay touch.rec`",
         )
     if head.startswith(PARQUET_START):
-        return "a Parquet file", f"compute its contacts with: isocharge serve predict MODEL {file}"
+        return "a Parquet file", f"compute its contacts with: isocharge serve predict MODEL {quoted_name}"
     if _is_table_of_presses(name, first_line):
         return (
             "a table of presses",
-            f"compute its contacts with: isocharge serve predict MODEL {file}; if a board has sent these lines, use: "
-            f"isocharge serve stream MODEL --port - < {file}",
+            f"compute its contacts with: isocharge serve predict MODEL {quoted_name}; if a board has sent these lines, "
+            f"use: isocharge serve stream MODEL --port - < {quoted_name}",
         )
     return None
 
 
 def _is_table_of_presses(name: str, first_line: bytes) -> bool:
-    """Return whether a file is a CSV table of presses or records.
+    """Return whether a file is a CSV table of presses or of records.
 
-    A table has columns that only presses or records have. A file whose name ends in `.csv` is also a table if its
-    header contains only names, and boards send no columns with these names.
+    The file is a table if its header contains a column that only presses or records have. A file whose name ends in
+    `.csv` is also a table if its header consists of names, and boards send no column with one of these names.
 
     Args:
-        name: Name of the file.
+        name: Path of the file, or - for the standard input.
         first_line: First line of the file.
     """
     header = first_line.decode("utf-8", "replace").strip()
@@ -93,5 +94,5 @@ def _is_table_of_presses(name: str, first_line: bytes) -> bool:
     if has_press_column:
         return True
     has_board_column = bool(columns & COLUMNS_OF_BOARDS)
-    has_only_names = len(columns) > 1 and all(column[:1].isalpha() for column in columns)
+    has_only_names = len(columns) > 1 and all(column[:1].isalpha() for column in columns)  # and no numbers
     return name.endswith(".csv") and has_only_names and not has_board_column

@@ -1,6 +1,7 @@
-"""Recordings: files of the chunks of a port and of the records that were computed from them.
+"""Recordings: files that contain the bytes from a port and the records that were computed from these bytes.
 
-Each line of the file is a JSON object:
+The bytes are stored in chunks. A chunk consists of the bytes that arrived together. Each line of the file is a JSON
+object:
 
     {"isocharge_recording": 1, "model": "three/1", "policy": "every", "device": {...}, "name": "left"}
     {"chunk": [timestamp, clock_ns, outage_s, "base64 of the bytes"]}
@@ -11,8 +12,8 @@ Each line of the file is a JSON object:
     {"marker": [timestamp, "text"]}               a moment that the user has marked
 
 A replay computes all fields of the records again, except `latency_us`, which is copied from the recording. With the
-same model, the records are the same, bit for bit. Whole lines are written at once. If a full disk or a power failure
-leaves an incomplete last line, this line is ignored.
+same model, the records of the replay are bitwise equal to the recorded records. Each write appends complete lines. If a
+full disk or a power failure leaves an incomplete last line, the incomplete line is ignored.
 """
 
 import base64
@@ -56,11 +57,11 @@ Line = TypeVar("Line")
 
 
 class Marker(NamedTuple):
-    """A moment that the user has marked.
+    """A moment that the user has marked, with a note.
 
     Attributes:
         timestamp: Time of the marker, unix seconds.
-        text: Note of the user; may be empty.
+        text: Note of the user. It may be empty.
     """
 
     timestamp: float
@@ -68,21 +69,22 @@ class Marker(NamedTuple):
 
 
 class Recorder:
-    """Writes a recording.
+    """Context manager that writes a recording.
 
     Attributes:
-        path: The file.
+        path: File to which the recording is written.
         model_label: Label of the model at the beginning of the recording, `name/version`.
-        failed: Whether writing has stopped because the disk is full. All lines before are complete.
+        failed: Whether writing has stopped because of an error, for example because the disk is full. All lines that
+            were written before the error are complete.
     """
 
     def __init__(self, path: Path, model: str, policy: str, device: Mapping[str, Any], name: str | None = None) -> None:
         """Store the description of a recording. The file is created when the context is entered.
 
         Args:
-            path: The file; it must not exist.
+            path: File to which the recording is written. It must not exist.
             model: Label of the model, `name/version`.
-            policy: Which frames have a record; a `Policy`.
+            policy: Value of a `Policy`, which states for which frames records are written.
             device: Content of the device file.
             name: Name of the film in the records; None for the name of the sensor of the model.
         """
@@ -93,10 +95,10 @@ class Recorder:
         if name:
             self._header["name"] = name
         self._last_chunk: Chunk | None = None  # chunk of the latest call of `chunk`
-        self._size_before_last_chunk = 0  # size of the file before this chunk was written, bytes
+        self._size_before_last_chunk = 0  # size of the file before the last chunk was written, bytes
 
     def __enter__(self) -> Self:
-        """Create the file.
+        """Create the file, and write its first line.
 
         Raises:
             OutputExists: If the file exists already.
@@ -115,14 +117,14 @@ class Recorder:
         self._file.close()
 
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
-        """Write a chunk and the lines of its records.
+        """Write a chunk and the records that were computed from it.
 
-        If a call was interrupted, for example by Ctrl-C, the caller passes the same chunk again. The chunk is written
-        only once: nothing is written if the file has grown since the first call.
+        If Ctrl-C interrupts a call, the caller passes the same chunk again. The second call writes nothing if the file
+        has grown since the first call, because the first call has then written the chunk.
 
         Args:
             chunk: The chunk.
-            records: Records of the frames in the chunk, each a line of JSON.
+            records: Records of the frames in the chunk, each as a line of JSON.
         """
         is_same_chunk = chunk is self._last_chunk
         if is_same_chunk and self._file.tell() > self._size_before_last_chunk:
@@ -142,17 +144,21 @@ class Recorder:
         self._write('{"back": true}')
 
     def model(self, label: str) -> None:
-        """Write the label (`name/version`) of the model that computes all later records."""
+        """Write the label (`name/version`) of the model that computes all records after this line."""
         self._write(json.dumps({"use": label}))
 
     def mark(self, marker: Marker) -> None:
-        """Write a marker."""
+        """Write a moment that the user has marked."""
         self._write(json.dumps({"marker": list(marker)}))
 
     def _write(self, lines: str) -> None:
-        """Write complete lines. Lines that an interruption left incomplete are overwritten.
+        """Append complete lines to the file.
 
-        If the disk is full, log an error and write nothing from then on.
+        If an interruption has left an incomplete line, this line is overwritten. If the disk is full, an error is
+        logged, and all later calls write nothing.
+
+        Args:
+            lines: One or more lines, without the line feed after the last line.
         """
         if self.failed:
             return
@@ -164,11 +170,11 @@ class Recorder:
 
 
 class Event(NamedTuple):
-    """A chunk of the recording, or a request for a new tare.
+    """A recorded chunk, or a recorded request for a new tare.
 
     Attributes:
-        chunk: The chunk; None for a request for a new tare.
-        latencies_us: Latencies of the records of the chunk, us.
+        chunk: The chunk; None if the event is a request for a new tare.
+        latencies_us: Latency of each record that was computed from the chunk, us.
     """
 
     chunk: Chunk | None
@@ -176,27 +182,34 @@ class Event(NamedTuple):
 
 
 class Back(NamedTuple):
-    """A request to reset the followed film to its calibration."""
+    """A recorded request to reset the followed film to its calibration."""
 
 
 class NewModel(NamedTuple):
-    """Label (`name/version`) of the model that computed all records after this line."""
+    """A recorded change of the model that computes the records.
+
+    Attributes:
+        label: Label of the new model, `name/version`. The model computed all records after this line.
+    """
 
     label: str
 
 
 class Recording:
-    """Reads a recording.
+    """Reader of a recording.
 
     Attributes:
         model: Label of the model, `name/version`, at the beginning of the recording.
-        policy: Which frames have a record; a `Policy`.
+        policy: Value of a `Policy`, which states for which frames records were written.
         device: Content of the device file.
         name: Name of the film in the records; empty for the name of the sensor of the model.
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the first line.
+        """Read the first line of the file, which describes the recording.
+
+        Args:
+            path: File of the recording.
 
         Raises:
             RecordingError: If the file cannot be read, or is not a recording of this version.
@@ -223,13 +236,14 @@ class Recording:
         self.name = header.name
 
     def events(self) -> Iterator[Event | Marker | NewModel | Back]:
-        """Yield the chunks with the latencies of their records, and all other events of the recording, in their order.
+        """Yield all events of the recording in their order. Each chunk contains the latencies of its records.
 
         Raises:
-            RecordingError: If a line other than the last one is damaged.
+            RecordingError: If a line other than the last line is damaged.
         """
-        # The records of a chunk follow it, so a chunk is yielded at the next event or at the end of the file.
-        chunk: Chunk | None = None
+        # The records of a chunk follow the chunk. A chunk is therefore yielded when the next line that is not a record
+        # has been read, or at the end of the file.
+        chunk: Chunk | None = None  # chunk whose records are being read
         latencies_us: list[float] = []
         for entry in self._lines(_Entry):
             if entry.latency_us is not None:  # only records have a latency
@@ -237,7 +251,7 @@ class Recording:
                 continue
             if chunk is not None:
                 yield Event(chunk, tuple(latencies_us))
-            chunk = entry.recorded_chunk  # None if the entry is another event
+            chunk = entry.recorded_chunk  # None if the line is another event
             latencies_us = []
             if chunk is None:
                 yield entry.other_event
@@ -245,13 +259,13 @@ class Recording:
             yield Event(chunk, tuple(latencies_us))
 
     def records(self, kind: type[Line]) -> Iterator[Line]:
-        """Yield the records as they were written, in their order.
+        """Yield the records that were written, in their order.
 
         Args:
-            kind: Struct with the fields that are read of each record.
+            kind: Struct type whose fields are read from each record.
 
         Raises:
-            RecordingError: If a line other than the last one is damaged, or a record lacks a field of the struct.
+            RecordingError: If a line other than the last line is damaged, or a record lacks a field of the struct.
         """
         return self._lines(kind, beginning='{"timestamp"')
 
@@ -259,22 +273,22 @@ class Recording:
         """Parse the lines after the first line, yield their content, and report the progress of reading.
 
         Args:
-            kind: Struct as which each line is parsed.
-            beginning: First characters of the lines to parse; empty for all lines. A line that does not begin with a
-                brace is damaged. It is always parsed, so that an error is raised.
+            kind: Struct type to which each line is converted.
+            beginning: First characters of the lines to parse; empty for all lines. Lines that do not begin with a brace
+                are also parsed. Such a line is damaged, and parsing it raises an error.
 
         Raises:
-            RecordingError: If a line other than the last one is damaged.
+            RecordingError: If a line other than the last line is damaged.
         """
         line_number = 1
-        read_characters = 0  # nearly all characters are one byte
+        read_characters = 0  # about the number of bytes, because nearly all characters have one byte
         file_bytes = self._path.stat().st_size
         try:
             with self._path.open(encoding="utf-8", errors="replace") as file:
                 for line in bounded_lines(file, LONGEST_ENTRY):
                     is_complete = line.endswith("\n")
                     if not is_complete:
-                        return  # the power failed while the line was written
+                        return  # writing the last line was interrupted, for example by a power failure
                     is_damaged = not line.startswith("{")
                     is_selected = line.startswith(beginning) or is_damaged
                     if line_number > 1 and is_selected:
@@ -302,7 +316,11 @@ class _Header(Struct):
 
 
 class _Entry(Struct):
-    """A line of a recording after the first line. The line is a record, or an object with one of the other keys."""
+    """A line of a recording after the first line, which is a record or an event.
+
+    A record contains `timestamp`, `latency_us` and other keys, which are ignored. An event contains one of the other
+    keys of this class.
+    """
 
     timestamp: float | None = None
     latency_us: Latency | None = None
@@ -328,7 +346,7 @@ class _Entry(Struct):
 
     @property
     def other_event(self) -> Event | Marker | NewModel | Back:
-        """The event of this line, if the line is neither a record nor a chunk."""
+        """The event that this line contains. The line must be neither a record nor a chunk."""
         if self.marker is not None:
             return Marker(*self.marker)
         if self.back is not None:
@@ -339,22 +357,26 @@ class _Entry(Struct):
 
 
 class RecordedClock:
-    """The clock of a replay. For each record, the clock returns the time at which the original record was created."""
+    """Clock of a replay, which returns the times at which the records were created during the recording."""
 
     def __init__(self) -> None:
-        """Begin at the time 0."""
-        self._base_ns = 0
-        self._latencies_us: deque[float] = deque()
+        """Start with the time 0."""
+        self._arrival_ns = 0
+        self._remaining_latencies_us: deque[float] = deque()
 
     def set(self, event: Event) -> None:
-        """Set the clock to a chunk, whose records are created next."""
-        self._base_ns = event.chunk.clock_ns if event.chunk else 0
-        self._latencies_us = deque(event.latencies_us)
+        """Set the clock to the arrival of a chunk, before the records of the chunk are computed again.
+
+        Args:
+            event: The chunk and the latencies of its records. A request for a new tare sets the clock to 0.
+        """
+        self._arrival_ns = event.chunk.clock_ns if event.chunk else 0
+        self._remaining_latencies_us = deque(event.latencies_us)
 
     def __call__(self) -> int:
-        """Return the time of the next record, ns. The clock is the same as for `Chunk.clock_ns`.
+        """Return the time at which the next record of the chunk was created, in ns on the clock of `Chunk.clock_ns`.
 
-        After the last record of the chunk, the time of its arrival is returned.
+        After the last record, the arrival of the chunk is returned.
         """
-        latency_us = self._latencies_us.popleft() if self._latencies_us else 0.0
-        return self._base_ns + round(latency_us * 1e3)
+        latency_us = self._remaining_latencies_us.popleft() if self._remaining_latencies_us else 0.0
+        return self._arrival_ns + round(latency_us * 1e3)

@@ -1,14 +1,16 @@
 """Connections to a board, and the requests that some boards need before they send a frame.
 
-A line is a serial port, opened by pyserial, or a UDP socket. If the system has file descriptors for ports, reading a
-serial port takes two system calls. Each datagram of a socket is one chunk.
+A connection is called a line. A line is either a serial port, which pyserial opens, or a UDP socket. If the system has
+file descriptors for serial ports, each read from a serial port needs only two system calls. Each datagram of a socket
+is one chunk.
 
-Some boards send one line of text in each datagram, without a line feed at its end. A line feed is then added, because
-parsers of text need it. If a datagram of the board has ended with a line feed, nothing is added to later datagrams.
+Some boards send one line of text in each datagram, without a line feed at the end. A line feed is then added to the
+datagram, because parsers of text need it. If a datagram of the board has ended with a line feed, nothing is added to
+later datagrams.
 
-On a line with two wires, both ends receive everything that is sent. The line therefore returns the request as an echo
-before the answer, and the echo has to be removed from the received bytes. The next request waits until the answer has
-arrived and the line is quiet.
+On a connection with only two wires, each end also receives the bytes that it sends itself. The received bytes then
+begin with an echo of the request, and the echo must be removed. The next request is sent only after the answer has
+arrived and the connection is quiet.
 """
 
 import importlib
@@ -25,7 +27,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 QUIET_TIME_s = 0.002
-"""Silence after which an answer is complete, s. Two bytes take this time at 9600 baud."""
+"""Silence after which an answer is considered complete, s. Two bytes take this time at 9600 baud."""
 
 REPEAT_TIME_s = 0.2
 """Time after which a request without an answer is repeated, s."""
@@ -36,9 +38,9 @@ class Request:
     """Request that a board needs for each frame.
 
     Attributes:
-        data: The bytes to send.
+        data: The bytes of the request.
         rate_Hz: Largest number of requests per second.
-        echo: Whether the line returns the bytes of the request before the answer.
+        echo: Whether the connection returns each request as an echo, which must be removed from the received bytes.
     """
 
     data: bytes
@@ -47,37 +49,37 @@ class Request:
 
 
 class Requester:
-    """Computes when a request is due, and removes the echo of requests from received bytes."""
+    """Scheduler of the requests to a board, which also removes the echoes of the requests from received bytes."""
 
     def __init__(self, request: Request, now_s: Callable[[], float] = time.monotonic) -> None:
-        """Begin with a request that is due.
+        """Start in a state in which the first request is due at once.
 
         Args:
-            request: The request.
-            now_s: Clock, s.
+            request: The request that the board needs for each frame.
+            now_s: Function that returns the present time on a clock that does not jump, s.
         """
         self._request = request
         self._now_s = now_s
-        self._requests = 0  # number of requests so far
-        self._echoes = 0  # number of complete echoes so far
-        self.reset()  # makes the first request due
+        self._request_count = 0  # number of requests that were sent
+        self._echo_count = 0  # number of complete echoes that were received
+        self.reset()
 
     @property
     def echo_share(self) -> float:
-        """Share of the requests that the line returned, whether or not the echo was removed."""
-        return self._echoes / max(1, self._requests)
+        """Fraction of the requests that came back as an echo, whether or not the echoes were removed."""
+        return self._echo_count / max(1, self._request_count)
 
     def reset(self) -> None:
-        """Make the next request due at once, because the line was opened again."""
-        self._requested_s = -float("inf")
-        self._received_s = -float("inf")
-        self._expected_echo = b""
+        """Make the next request due at once, for example because the line was opened again."""
+        self._requested_s = -float("inf")  # time of the latest request
+        self._received_s = -float("inf")  # time of the latest received byte
+        self._expected_echo = b""  # bytes of the echo that have not been received yet
 
     def wait_s(self) -> float:
-        """Return the time until the next request is due, s; 0 if it is due now.
+        """Return the time until the next request is due, s; 0 if a request is due now.
 
-        Requests are due at the rate of the board. After a request without an answer, at least `REPEAT_TIME_s` must
-        pass. After the latest received byte, at least `QUIET_TIME_s` must pass.
+        At least 1 / `rate_Hz` must pass between two requests. After a request without an answer, at least
+        `REPEAT_TIME_s` must pass. After the latest received byte, at least `QUIET_TIME_s` must pass.
         """
         now_s = self._now_s()
         due_s = self._requested_s + 1.0 / self._request.rate_Hz
@@ -88,17 +90,20 @@ class Requester:
         return max(0.0, due_s - now_s, quiet_end_s - now_s)
 
     def next_request(self) -> bytes:
-        """Return the bytes of the next request, and store the time of the request."""
+        """Return the bytes of the next request, which the caller must send now, and store the time of the request."""
         self._requested_s = self._now_s()
-        self._requests += 1
+        self._request_count += 1
         self._expected_echo = self._request.data
         return self._request.data
 
     def remove_echo(self, received: bytes) -> bytes:
         """Return the received bytes without the echo of the request.
 
-        The echo consists of the bytes of the request, and may arrive in several parts. If the line has no echo
-        according to the request, complete echoes are counted, but the bytes are returned unchanged.
+        The echo consists of the same bytes as the request, and may arrive in several parts. If `Request.echo` is false,
+        complete echoes are only counted, and the received bytes are returned unchanged.
+
+        Args:
+            received: Bytes that arrived after the latest request; may be empty.
         """
         if not received:
             return b""
@@ -108,25 +113,25 @@ class Requester:
         echo_length = min(len(received), len(self._expected_echo))
         is_echo = received[:echo_length] == self._expected_echo[:echo_length]
         if echo_length == 0 or not is_echo:
-            self._expected_echo = b""  # the answer has begun, so no echo follows
+            self._expected_echo = b""  # the answer has begun, so no echo can follow
             return received
 
         self._expected_echo = self._expected_echo[echo_length:]  # the part that has not arrived yet
         if not self._expected_echo:
-            self._echoes += 1
-        if not self._request.echo:  # the line has no echo, so these bytes belong to the answer
+            self._echo_count += 1
+        if not self._request.echo:  # no echo is expected, so these bytes are part of the answer
             return received
         return received[echo_length:]
 
 
 MAX_READ_BYTES = 65536
-"""Largest number of bytes that are read at once. No datagram is larger."""
+"""Largest number of bytes that are read at the same time. No datagram is larger."""
 
 
 def _terminal_errors() -> tuple[type[Exception], ...]:
-    """Return the exceptions other than OSError that pyserial raises.
+    """Return the exception types, other than OSError, that pyserial raises on this system.
 
-    The result is empty on systems without POSIX terminals.
+    On systems without POSIX terminals, the result is empty.
     """
     try:
         return (importlib.import_module("termios").error,)
@@ -145,10 +150,10 @@ OPEN_ERRORS: tuple[type[Exception], ...] = (ValueError, *READ_ERRORS)
 
 
 class SerialLine:
-    """An open line that pyserial provides."""
+    """An open connection to a board through a serial port or another port that pyserial supports."""
 
     def __init__(self, url: str, baud: int) -> None:
-        """Open the line. The system is set to deliver bytes without a delay.
+        """Open the line, and request from the system that it delivers received bytes without a delay.
 
         Args:
             url: Device path, or a URL that pyserial accepts.
@@ -157,7 +162,7 @@ class SerialLine:
         Raises:
             OSError, ValueError: If the line cannot be opened.
         """
-        # pyserial is imported only here, so that programs that only predict need not wait for the import.
+        # pyserial is imported only here, so programs that open no port do not wait for the import.
         serial = importlib.import_module("serial")
         if url.startswith("tcp://"):  # pyserial has another name for this scheme
             url = url.replace("tcp://", "socket://", 1)
@@ -172,11 +177,11 @@ class SerialLine:
                 self._descriptor = int(self._serial.fileno())
 
     def reset_input_buffer(self) -> None:
-        """Drop the bytes that have arrived."""
+        """Discard the bytes that have arrived and were not read."""
         self._serial.reset_input_buffer()
 
     def write(self, data: bytes) -> None:
-        """Send bytes."""
+        """Send bytes to the board."""
         self._serial.write(data)
 
     def close(self) -> None:
@@ -190,7 +195,7 @@ class SerialLine:
             timeout_s: Longest time to wait, s.
 
         Returns:
-            The bytes; empty if none arrive in time.
+            The bytes; empty if no byte arrives in time.
 
         Raises:
             READ_ERRORS: If the line disappears.
@@ -200,9 +205,9 @@ class SerialLine:
         readable, _, _ = select.select([self._descriptor], [], [], timeout_s)
         if not readable:
             return b""
-        # This needs one system call. pyserial would need five, or one for each byte of a socket.
+        # `os.read` needs one system call. pyserial would need five, or one for each byte of a socket.
         data = os.read(self._descriptor, MAX_READ_BYTES)
-        if not data:  # the end of the stream is also readable
+        if not data:  # `select` also reports the end of a stream as readable
             raise OSError("it is readable and has no data: it was unplugged, or the other end has closed")
         return data
 
@@ -213,27 +218,30 @@ class SerialLine:
             timeout_s: Longest time to wait for the first byte, s.
 
         Returns:
-            All bytes that have arrived; empty if none arrive in time.
+            All bytes that have arrived; empty if no byte arrives in time.
         """
-        if timeout_s != self._serial.timeout:  # Setting the timeout costs a system call.
+        if timeout_s != self._serial.timeout:  # each assignment of the timeout costs a system call
             self._serial.timeout = timeout_s
-        data: bytes = self._serial.read(1)  # waits for at most the timeout
+        data: bytes = self._serial.read(1)  # waits until a byte arrives or the timeout has passed
         if data:
             data += self._serial.read(self._serial.in_waiting)
         return data
 
 
 UDP_SCHEME = "udp://"
-"""First characters of the URL of a UDP socket, udp://HOST:PORT, which names the address on which it receives."""
+"""First characters of the URL of a UDP socket, `udp://HOST:PORT`.
+
+The URL contains the address on which the socket receives datagrams.
+"""
 
 _CONTROL_CHARACTER = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
 class UdpSocket:
-    """An open socket that receives datagrams."""
+    """An open UDP socket that receives datagrams from a board."""
 
     def __init__(self, url: str) -> None:
-        """Open the socket and bind it to the address.
+        """Open the socket, and bind it to the address in the URL.
 
         Args:
             url: udp://HOST:PORT. Without a host, the socket receives on every address of the machine.
@@ -259,12 +267,14 @@ class UdpSocket:
         self._peer: tuple[str, int] | None = None  # sender of the latest datagram, to which answers are sent
 
     def reset_input_buffer(self) -> None:
-        """Drop the datagrams that have arrived."""
+        """Discard the datagrams that have arrived and were not read."""
         while self._is_ready(0.0):
             self._socket.recv(MAX_READ_BYTES)
 
     def receive(self, timeout_s: float) -> bytes:
-        """Return the next datagram that is not empty. A line feed is added to text if the board sends none.
+        """Wait for a datagram that is not empty, and return it.
+
+        If the datagram is text and the board sends no line feeds, a line feed is added at the end.
 
         Args:
             timeout_s: Longest time to wait, s.
@@ -280,7 +290,7 @@ class UdpSocket:
         return b""
 
     def write(self, data: bytes) -> None:
-        """Send bytes to the board that sent the latest datagram. Without such a board, nothing is sent."""
+        """Send bytes to the sender of the latest datagram. If no datagram was received yet, nothing is sent."""
         if self._peer is not None:
             self._socket.sendto(data, self._peer)
 
@@ -289,7 +299,7 @@ class UdpSocket:
         self._socket.close()
 
     def _is_ready(self, timeout_s: float) -> bool:
-        """Return whether a datagram has arrived or arrives within `timeout_s`, s."""
+        """Return whether a datagram has already arrived, or arrives within `timeout_s` seconds."""
         readable, _, _ = select.select([self._socket], [], [], timeout_s)
         return bool(readable)
 
@@ -297,11 +307,14 @@ class UdpSocket:
         """Add a line feed to a datagram of text, unless the board ends its datagrams with line feeds.
 
         A datagram is text if it is valid UTF-8 without control characters. Other datagrams are returned unchanged.
+
+        Args:
+            data: The datagram.
         """
         if data.endswith(b"\n"):
             self._board_ends_lines = True
         has_control_characters = _CONTROL_CHARACTER.search(data) is not None
         if self._board_ends_lines or has_control_characters:
             return data
-        is_utf8 = data.decode("utf-8", "replace").encode() == data  # invalid bytes would have been replaced
+        is_utf8 = data.decode("utf-8", "replace").encode() == data  # decoding replaces invalid bytes
         return data + b"\n" if is_utf8 else data

@@ -1,10 +1,14 @@
-"""Sources of bytes: ports, files and the standard input. Each source is a context manager and an iterator of chunks.
+"""Sources of bytes from a board: ports, files and the standard input.
 
-A port is any URL that pyserial accepts: `/dev/ttyACM0`, a pseudo-terminal, `socket://host:port`, `rfc2217://host:port`
-or `loop://`. In addition, `tcp://host:port` means the same as `socket://`, and `udp://host:port` receives datagrams.
+A source yields the bytes in chunks. A chunk consists of the bytes that arrived together. `open_source` returns each
+source as a context manager.
+
+A port is a device path or a URL that pyserial accepts, such as `/dev/ttyACM0`, a pseudo-terminal, `socket://host:port`,
+`rfc2217://host:port` or `loop://`. In addition, `tcp://host:port` means the same as `socket://host:port`, and
+`udp://host:port` receives datagrams.
 
 If `reconnect` is true, a port that disappears or falls silent is opened repeatedly until it is back. The first chunk
-afterwards contains the length of the outage. If a board sends frames only on request, the port sends the requests.
+after an outage contains the length of the outage. If a board sends frames only on request, the port sends the requests.
 """
 
 import contextlib
@@ -40,13 +44,13 @@ log = logging.getLogger(__name__)
 
 
 class Chunk(NamedTuple):
-    """Bytes that arrived together.
+    """Bytes that arrived together, with the time of arrival.
 
     Attributes:
-        data: The bytes; at least one.
+        data: The bytes, at least one byte.
         timestamp: Host time of arrival, unix seconds.
         clock_ns: Value of `time.perf_counter_ns` at arrival, from which latencies are computed.
-        outage_s: Length of the outage just before the bytes, s; 0 if there was none.
+        outage_s: Length of the outage that ended with these bytes, s; 0 if there was no outage.
     """
 
     data: bytes
@@ -56,13 +60,13 @@ class Chunk(NamedTuple):
 
 
 class Port:
-    """A port. Iterating over it yields `Chunk`s without end.
+    """Context manager that opens a port, and iterator that yields a `Chunk` whenever bytes arrive.
 
-    The port is opened when its context is entered.
+    The port is opened when the context is entered. The iterator does not end by itself.
 
     Args:
         url: Device path or URL.
-        baud: Bits per second; USB ports and pseudo-terminals ignore it.
+        baud: Speed of a serial port, bits per second. USB ports and pseudo-terminals ignore it.
         silence_s: Time without a byte after which the port is considered lost, s.
         reconnect: Whether to open a lost port repeatedly until it is back, instead of raising an error.
         request: Request that the board needs for each frame; None for a board that sends frames by itself.
@@ -70,7 +74,8 @@ class Port:
 
     Attributes:
         outages: Number of times that the port was lost and came back.
-        is_live: True, because the bytes arrive whether or not they are read, and are lost if they are not read.
+        is_live: Always True, because the bytes arrive whether or not the program reads them, and are lost if the
+            program does not read them.
 
     Example:
         >>> with Port("/dev/ttyACM0") as port:  # doctest: +SKIP
@@ -90,7 +95,7 @@ class Port:
         request: Request | None = None,
         wait: float = 0.0,
     ) -> None:
-        """Store the settings, which the class describes. The port is opened when the context is entered."""
+        """Store the settings. The docstring of the class describes the arguments."""
         self.url = url
         self.outages = 0
         self._baud = baud
@@ -101,10 +106,12 @@ class Port:
         self._line: SerialLine | UdpSocket | None = None
 
     def __enter__(self) -> Self:
-        """Open the port, and drop the bytes that it has buffered. Try again until `wait` seconds have passed.
+        """Open the port, and discard the bytes in its buffer.
+
+        If the port cannot be opened, try again until `wait` seconds have passed.
 
         Raises:
-            PortError: If the port cannot be opened within `wait`, or its URL is wrong.
+            PortError: If the port cannot be opened within `wait` seconds, or its URL is wrong.
             InputError: If the port is a file.
         """
         deadline_s = time.monotonic() + self._wait
@@ -113,19 +120,19 @@ class Port:
                 self._open()
                 return self
             except PortError as error:
-                is_wrong_url = isinstance(error.__cause__, ValueError)  # waiting would not help
+                is_wrong_url = isinstance(error.__cause__, ValueError)  # another attempt would fail, too
                 if is_wrong_url or time.monotonic() >= deadline_s:
                     raise
                 time.sleep(FIRST_RETRY_PAUSE_s)
 
     def _open(self) -> None:
-        """Open the line, and drop the bytes that it has buffered.
+        """Open the line to the board, and discard the bytes in its buffer.
 
         Raises:
             PortError: If the line cannot be opened.
             InputError: If the port is a file.
         """
-        # On systems without POSIX ports, the name of a port, such as COM3, is no path of a file.
+        # On systems without POSIX ports, the name of a port, such as COM3, is not the path of a file.
         is_path = "://" not in self.url
         if is_path and HAS_POSIX_PORTS and not Path(self.url).exists():
             raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
@@ -136,7 +143,7 @@ class Port:
                 self._line = UdpSocket(self.url)
             else:
                 self._line = SerialLine(self.url, self._baud)
-            self._line.reset_input_buffer()  # a terminal drops its buffer when it is opened, a socket does not
+            self._line.reset_input_buffer()  # opening a terminal also discards it, opening a socket does not
         except OPEN_ERRORS as error:
             self._close()
             raise self._opening_error(error, is_path=is_path) from error
@@ -144,11 +151,11 @@ class Port:
             self._requester.reset()  # the first request is due at once
 
     def _opening_error(self, cause: Exception, *, is_path: bool) -> PortError:
-        """Return the error of a port that cannot be opened.
+        """Return the exception for a port that cannot be opened. Its message contains the cause and advice.
 
         Args:
-            cause: Error of the operating system or of pyserial.
-            is_path: Whether the port is a device path, not a URL.
+            cause: Exception of the operating system or of pyserial.
+            is_path: Whether the port is a device path, and not a URL.
         """
         speed = ""
         hint = "check the host and the port number, that the board is on, and that no other program uses it"
@@ -161,7 +168,7 @@ class Port:
         return PortError(f"{self.url}: cannot be opened{speed} ({cause}); {hint}")
 
     def __exit__(self, *_: object) -> None:
-        """Close the port."""
+        """Close the port when the context is left."""
         self._close()
 
     def _close(self) -> None:
@@ -172,11 +179,11 @@ class Port:
 
     @property
     def echo_share(self) -> float:
-        """Share of the requests that the line returned; 0 for a board that sends frames by itself."""
+        """Fraction of the requests that came back as an echo; 0 for a board that sends frames by itself."""
         return self._requester.echo_share if self._requester else 0.0
 
     def __iter__(self) -> Iterator[Chunk]:
-        """Yield chunks as they arrive. If the port is lost, open it again if `reconnect` is true.
+        """Yield chunks as they arrive. If the port is lost and `reconnect` is true, open the port again.
 
         Raises:
             PortLost: If the port disappears or stays silent for `silence_s`, and `reconnect` is false.
@@ -194,7 +201,13 @@ class Port:
             yield Chunk(data, time.time(), time.perf_counter_ns(), outage_s)
 
     def read(self, timeout_s: float) -> Chunk | None:
-        """Return the bytes that arrive within a time, s; None if there are none.
+        """Wait for bytes, and return them as a chunk.
+
+        Args:
+            timeout_s: Longest time to wait, s.
+
+        Returns:
+            The chunk; None if no bytes arrive in time.
 
         Raises:
             PortLost: If the port disappears.
@@ -209,10 +222,10 @@ class Port:
         """Open the port repeatedly until bytes arrive, and return these bytes.
 
         Args:
-            reason: Error that states why the port was lost.
+            reason: Exception that states why the port was lost.
 
         Raises:
-            PortLost: The error `reason`, if the port must not be opened again.
+            PortLost: The exception `reason`, if `reconnect` is false.
         """
         if not self._reconnect:
             raise reason
@@ -229,10 +242,11 @@ class Port:
                 continue
 
     def _read(self) -> bytes:
-        """Wait for a byte, and return all bytes that arrived with it.
+        """Wait for a byte, and return all bytes that have arrived.
 
         Raises:
-            PortLost: If the port disappears, or nothing arrives in time.
+            PortLost: If the port disappears, or no byte arrives within `silence_s`.
+            PortError: If the port is not open.
         """
         data = self._receive(self._silence_s)
         if not data:
@@ -244,7 +258,13 @@ class Port:
         return data
 
     def _receive(self, timeout_s: float) -> bytes:
-        """Return the bytes that arrive within `timeout_s`, s; empty if there are none.
+        """Wait for bytes, and return them. If the board needs requests, send the requests that are due.
+
+        Args:
+            timeout_s: Longest time to wait, s.
+
+        Returns:
+            The bytes; empty if no bytes arrive in time.
 
         Raises:
             PortError: If the port is not open.
@@ -262,15 +282,15 @@ class Port:
             ) from error
 
     def _receive_answer(self, line: SerialLine | UdpSocket, requester: Requester, timeout_s: float) -> bytes:
-        """Send requests when they are due, until an answer arrives, and return the answer.
+        """Send each request when it is due, until an answer arrives, and return the answer.
 
         Args:
-            line: The open line.
-            requester: Computes when a request is due, and removes the echo of the requests.
+            line: The open line to the board.
+            requester: Object that computes when a request is due, and removes the echo of the requests.
             timeout_s: Longest time to wait, s.
 
         Returns:
-            The answer; empty if none arrives in time.
+            The answer; empty if no answer arrives in time.
         """
         deadline_s = time.monotonic() + timeout_s
         while True:
@@ -279,7 +299,7 @@ class Port:
                 return b""
             if requester.wait_s() == 0.0:
                 line.write(requester.next_request())
-            # Wait for bytes until the next request is due.
+            # Wait for bytes, at most until the next request is due.
             received = line.receive(min(requester.wait_s(), remaining_s))
             answer = requester.remove_echo(received)
             if answer:
@@ -287,7 +307,7 @@ class Port:
 
 
 def has_speed(url: str) -> bool:
-    """Return whether a port has a baud rate. Sockets and pseudo-terminals have none."""
+    """Return whether a port has a baud rate. Sockets and pseudo-terminals have no baud rate."""
     return "://" not in url and not os.path.realpath(url).startswith("/dev/pts/")
 
 
@@ -301,15 +321,15 @@ Chunks = contextlib.AbstractContextManager["Port | FileSource"]
 
 
 class FileSource:
-    """Source of the chunks of a file, a pipe or the standard input, up to its end.
+    """Iterator over the chunks of a file, a pipe or the standard input, up to its end.
 
     Args:
-        descriptor: File descriptor, open for reading.
+        descriptor: File descriptor that is open for reading.
         name: Path of the file, or - for the standard input.
 
     Attributes:
-        outages: Always 0.
-        is_live: False, because bytes are kept until they are read.
+        outages: Always 0, because a file is never lost.
+        is_live: Always False, because no bytes are lost if they are read later.
     """
 
     outages = 0
@@ -321,7 +341,10 @@ class FileSource:
         self._name = name
 
     def __iter__(self) -> Iterator[Chunk]:
-        """Yield chunks until the file ends. The bytes of a file on a disk have the time at which reading begins.
+        """Yield chunks until the file ends.
+
+        All chunks of a file on a disk have the time at which reading began. The chunks of a pipe have the time at which
+        they were read.
 
         Raises:
             InputError: If the file is a recording, a table or another file that does not come from a board.
@@ -346,10 +369,10 @@ def open_source(
     request: Request | None = None,
     wait: float = 0.0,
 ) -> Chunks:
-    """Return the source of chunks that a URL or a path names, as a context manager.
+    """Return a context manager that opens a port, a file or the standard input as a source of chunks.
 
     Args:
-        url: A device path or URL, the path of a file or a named pipe, or - for the standard input.
+        url: Device path or URL of a port, path of a file or of a named pipe, or - for the standard input.
         baud: Baud rate of a serial port, bit/s.
         silence_s: Time without a byte after which a port is considered lost, s.
         reconnect: Whether to open a lost port repeatedly until it is back, instead of raising an error.
@@ -363,7 +386,7 @@ def open_source(
     if url == STDIN:
         return contextlib.nullcontext(FileSource(sys.stdin.fileno(), STDIN))
 
-    # Wait until the path exists, because only then it is known whether it is a file or a port.
+    # Wait until the path exists, because only an existing path shows whether it is a file or a port.
     is_path = "://" not in url
     deadline_s = time.monotonic() + wait
     while is_path and not Path(url).exists() and time.monotonic() < deadline_s:
@@ -375,10 +398,13 @@ def open_source(
 
 
 def _refuse_file(path: Path) -> None:
-    """Refuse a file where only a port is possible.
+    """Raise an error for a file that was given where only a port is possible.
+
+    Args:
+        path: Path of the file.
 
     Raises:
-        InputError: Always.
+        InputError: Always. If the kind of the file is recognised, the message states how to use such a file.
     """
     with contextlib.suppress(OSError), path.open("rb") as file:
         refuse_foreign_file(str(path), file.read(HEAD_BYTES))
@@ -388,7 +414,10 @@ def _refuse_file(path: Path) -> None:
 
 
 def _is_file_or_pipe(path: Path) -> bool:
-    """Return whether a path is a file or a named pipe, and not a device."""
+    """Return whether a path is a file or a named pipe.
+
+    The result is False for a device, and for a path that does not exist.
+    """
     with contextlib.suppress(OSError):
         mode = path.stat().st_mode
         return stat.S_ISREG(mode) or stat.S_ISFIFO(mode)
@@ -397,7 +426,13 @@ def _is_file_or_pipe(path: Path) -> bool:
 
 @contextlib.contextmanager
 def _open_file(path: Path) -> Iterator[FileSource]:
-    """Open a file or a named pipe as a source while the block runs.
+    """Open a file or a named pipe as a source of chunks for the `with` block.
+
+    Args:
+        path: Path of the file or the pipe.
+
+    Yields:
+        The source.
 
     Raises:
         InputError: If the file cannot be read, or does not come from a board.
@@ -407,7 +442,7 @@ def _open_file(path: Path) -> Iterator[FileSource]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); expected a file of frames") from error
     with file:
-        if path.is_file():  # the first bytes of a pipe cannot be read twice, so FileSource checks them
+        if path.is_file():  # the first bytes of a pipe cannot be read twice, so only `FileSource` checks them
             head = os.pread(file.fileno(), HEAD_BYTES, 0)
             refuse_foreign_file(str(path), head)
         yield FileSource(file.fileno(), str(path))

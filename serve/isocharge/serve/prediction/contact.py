@@ -1,7 +1,8 @@
 """Contacts that a model computes from charges, and the domain in which the model is valid.
 
-A contact has ten numbers. Other programs rely on the order of these numbers. `Validity` compares contacts with the
-domain for which a model was trained, and returns the flags `outside`, `beyond`, `misfit` and `stress`.
+A contact consists of ten numbers. Other programs rely on the order of the ten numbers. The class `Validity` compares
+contacts with the domain for which a model was trained. The result of the comparison is a subset of the flags `outside`,
+`beyond`, `misfit` and `stress`.
 """
 
 import math
@@ -22,17 +23,19 @@ MAX_DECIMALS = 6
 
 
 class Contact(NamedTuple):
-    """Position and force of one press with their uncertainties. `Predictor.flags` checks whether a contact is valid.
+    """Position and force of one press, with the uncertainties of the position and the force.
+
+    `Predictor.flags` returns the reasons why a contact may be wrong.
 
     Attributes:
-        x_mm: Position in the frame of the sensor, mm.
-        y_mm: Position in the frame of the sensor, mm.
+        x_mm: Coordinate x of the position in the frame of the sensor, mm.
+        y_mm: Coordinate y of the position in the frame of the sensor, mm.
         force_N: Force, N, positive if the probe pushes.
         x_std_mm: Standard deviation of x, mm.
         y_std_mm: Standard deviation of y, mm.
         force_std_N: Standard deviation of the force, N.
-        misfit: Distance of the charges from the charges of the nearest single contact, in standard deviations of the
-            noise.
+        misfit: Distance between the measured charges and the nearest charges that a single contact can produce, in
+            standard deviations of the noise.
         xy_correlation: Correlation of the errors of x and y, -1 to 1; NaN if the model computes no correlations.
         xF_correlation: Correlation of the errors of x and the force, -1 to 1; NaN without correlations.
         yF_correlation: Correlation of the errors of y and the force, -1 to 1; NaN without correlations.
@@ -50,14 +53,15 @@ class Contact(NamedTuple):
     yF_correlation: float = math.nan
 
     def widened(self, shift: tuple[float, float, float]) -> "Contact":
-        """Return the contact with larger standard deviations, which include an additional, independent error.
+        """Return the contact with standard deviations and correlations that include an additional independent error.
 
-        A single error changes x, y and the force together, so their changes are fully correlated. The correlations of
-        the contact therefore change as well. The variance of x grows by x_shift^2, and the covariance of x and y by
-        x_shift * y_shift.
+        The additional error changes x, y and the force together. The changes of x, y and the force are therefore fully
+        correlated. The additional error increases the variance of x by the square of the change of x. It increases the
+        covariance of x and y by the product of the changes of x and y.
 
         Args:
-            shift: Changes of x and y, mm, and of the force, N, that one standard deviation of the error causes.
+            shift: Changes of x (mm), y (mm) and the force (N) that one standard deviation of the additional error
+                causes.
         """
         x_shift, y_shift, force_shift = shift
         x_std_mm = math.hypot(self.x_std_mm, x_shift)
@@ -76,22 +80,25 @@ class Contact(NamedTuple):
         )
 
     def fields(self) -> dict[str, Any]:
-        """Return the contact as fields of a record. Correlations that the model does not compute are None."""
+        """Return the values of the contact by the names of the fields of a prediction record.
+
+        If the model computes no correlations, the correlations are None instead of NaN.
+        """
         fields = self._asdict()
         if math.isnan(self.xy_correlation):
             fields |= NO_CORRELATION
         return fields
 
     def __repr__(self) -> str:
-        """Return each number with its standard deviation. The standard deviation is rounded to two digits."""
+        """Return a text with x, y, the force and their standard deviations, rounded to two significant digits."""
         numbers = ", ".join(f"{name}={value} +- {std}" for name, value, std in self._rounded())
         return f"Contact({numbers}, misfit={self.misfit:.2g})"
 
     def _rounded(self) -> Iterator[tuple[str, str, str]]:
-        """Yield the name, the rounded value and the rounded standard deviation of x, y and the force.
+        """Yield the name, the rounded value and the rounded standard deviation of x, of y and of the force.
 
-        The value and the standard deviation have so many decimals that the standard deviation has two significant
-        digits.
+        The number of decimals is chosen so that the standard deviation has two significant digits. The value has as
+        many decimals as its standard deviation.
         """
         stds = {"x_mm": self.x_std_mm, "y_mm": self.y_std_mm, "force_N": self.force_std_N}
         for name, std in stds.items():
@@ -104,68 +111,68 @@ class Contact(NamedTuple):
 
 
 NO_CORRELATION = dict.fromkeys(Contact._fields[N_WITHOUT_CORRELATION:])
-"""Fields of a record for a model that computes no correlations."""
+"""Correlations of a contact in a record, all None, for a model that computes no correlations."""
 
 REUSE_DISTANCE_mm = 0.3
-"""Largest change of x or y for which a sensitivity is reused, mm."""
+"""Largest change of x or of y after which a sensitivity is still used again, mm."""
 
 REUSE_FORCE_RATIO = 0.05
-"""Largest change of the force for which a sensitivity is reused, relative to the force, dimensionless."""
+"""Largest relative change of the force after which a sensitivity is still used again, dimensionless."""
 
 
 class Sensitivity:
-    """Sensitivity of a contact to a parameter whose value is uncertain.
+    """Sensitivity of a contact to an uncertain parameter of the film.
 
-    The sensitivity is computed from a second prediction with another value of the parameter. It is reused while the
-    contact hardly moves, so that most frames of a held press need one prediction instead of two.
+    The sensitivity is computed from a second prediction with another value of the parameter. The sensitivity is used
+    again while the contact hardly moves. Most frames of a held press therefore need only one prediction.
     """
 
-    def __init__(self, unit: float) -> None:
-        """Begin without a contact.
+    def __init__(self, parameter_step: float) -> None:
+        """Start without a stored sensitivity.
 
         Args:
-            unit: Difference of the parameter between the two predictions.
+            parameter_step: Difference between the values of the parameter in the two predictions.
         """
-        self._unit = unit
-        self._reference: Contact | None = None
-        self._unit_shift = (0.0, 0.0, 0.0)
+        self._parameter_step = parameter_step
+        self._reference: Contact | None = None  # contact for which the stored sensitivity was computed
+        self._shift_per_step = (0.0, 0.0, 0.0)  # changes of x and y, mm, and of the force, N
 
     def shift(
-        self, contact: Contact, size: float, predict_after_unit: Callable[[], Contact]
+        self, contact: Contact, parameter_change: float, predict_after_step: Callable[[], Contact]
     ) -> tuple[float, float, float]:
         """Compute by how much a change of the parameter changes the position and the force of a contact.
 
-        The contact is assumed to change in proportion to the parameter. The change of the contact for a fixed step of
-        the parameter, which the constructor was given, is stored. The stored change is used again for contacts that are
-        close to the contact for which it was computed, so that no second prediction is needed.
+        The contact is assumed to change in proportion to the parameter. A second prediction gives the change of the
+        contact for one step of the parameter. This change is stored. No second prediction is made for later contacts
+        that are close to the contact for which the change was stored.
 
         Args:
             contact: The contact at the present value of the parameter.
-            size: Change of the parameter, in the same unit as the step.
-            predict_after_unit: Function that predicts the contact with the parameter increased by the step.
+            parameter_change: Change of the parameter, in the same unit as the step.
+            predict_after_step: Function that predicts the contact with the parameter changed by one step.
 
         Returns:
             Changes of x and y, mm, and of the force, N.
         """
         if not is_close(contact, self._reference):
-            contact_after_unit = predict_after_unit()
+            contact_after_step = predict_after_step()
             self._reference = contact
-            self._unit_shift = (
-                contact_after_unit.x_mm - contact.x_mm,
-                contact_after_unit.y_mm - contact.y_mm,
-                contact_after_unit.force_N - contact.force_N,
+            self._shift_per_step = (
+                contact_after_step.x_mm - contact.x_mm,
+                contact_after_step.y_mm - contact.y_mm,
+                contact_after_step.force_N - contact.force_N,
             )
-        x_shift, y_shift, force_shift = self._unit_shift
-        factor = size / self._unit
-        return factor * x_shift, factor * y_shift, factor * force_shift
+        x_shift, y_shift, force_shift = self._shift_per_step
+        step_count = parameter_change / self._parameter_step
+        return step_count * x_shift, step_count * y_shift, step_count * force_shift
 
 
 def is_close(contact: Contact, reference: Contact | None) -> bool:
-    """Return whether a contact is so close to a reference that both have the same sensitivity to a parameter.
+    """Return whether a contact is close enough to a reference for the same sensitivity to apply to both.
 
     Args:
-        contact: The contact.
-        reference: The contact to compare it with. The result is False for None.
+        contact: The contact that is compared with the reference.
+        reference: The contact for which a sensitivity was computed. If it is None, the result is False.
     """
     if reference is None:
         return False
@@ -176,9 +183,9 @@ def is_close(contact: Contact, reference: Contact | None) -> bool:
 
 
 class Contacts(NamedTuple):
-    """Contacts of n presses. Each field of `Contact` is a float32 array of shape (n,).
+    """Contacts of n presses, with one float32 array of shape (n,) for each field of `Contact`.
 
-    `np.asarray` converts the fields to one array of shape (n, 10) with one press in each row.
+    `np.asarray` converts the fields to one array of shape (n, 10) in which each row contains one press.
     """
 
     x_mm: Singles
@@ -193,7 +200,12 @@ class Contacts(NamedTuple):
     yF_correlation: Singles
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray[Any, Any]:
-        """Return an array of shape (n, 10) with one press in each row."""
+        """Return an array of shape (n, 10) in which each row contains one press. NumPy calls this method.
+
+        Args:
+            dtype: Requested number type; None for float32.
+            copy: Ignored, because the result is always a new array.
+        """
         return np.stack(tuple(self), axis=1).astype(dtype or np.float32, copy=False)
 
 
@@ -207,25 +219,30 @@ TOUCH_LIMIT = 5.0
 """Charge, in standard deviations of the white noise, above which an electrode indicates a touch."""
 
 IMPLAUSIBLE_FACTOR = 3.0
-"""Factor for the limits beyond which an output of the model cannot be a measurement, dimensionless.
+"""Factor that gives the limits beyond which an output of the model cannot be a measurement, dimensionless.
 
-The limits are this multiple of the largest force, and of the radius of the circle around the working area.
+The limit of the force is the largest force times this factor. The limit of the distance from the centre of the working
+area is the radius of the circle around the working area times this factor.
 """
 
 MAX_CENTRE_OFFSET = 0.05
-"""Largest distance of the centre of a centred working area from the origin, relative to the radius of the area."""
+"""Largest distance between the origin and the centre of a working area that is called centred, dimensionless.
+
+The distance is relative to the radius of the area.
+"""
 
 
 @dataclass(frozen=True)
 class Validity:
-    """The domain in which a model is valid: working area, range of forces, and limit of the misfit.
+    """The domain in which a model is valid: the working area, the range of forces and the limit of the misfit.
 
     Attributes:
-        corners_mm: Corners of the working area, a polygon, shape (n, 2), mm.
+        corners_mm: Corners of the polygon that is the working area, shape (n, 2), mm.
         force_range_N: Smallest and largest force, N.
-        misfit_limit: Largest misfit of a single contact, in standard deviations.
+        misfit_limit: Misfit above which the charges are not attributed to a single contact, in standard deviations.
         yield_force_N: Force above which the film yields, N.
-        white_pC: Standard deviation of the white noise, pC: one number for all electrodes, or one for each electrode.
+        white_pC: Standard deviation of the white noise, pC: one number for all electrodes, or one number for each
+            electrode.
     """
 
     corners_mm: Array
@@ -236,8 +253,12 @@ class Validity:
 
     @classmethod
     def of(cls, metadata: ModelMetadata) -> "Validity":
-        """Return the domain that the metadata of a model describe."""
-        measured_limit = metadata.errors.get("misfit_p999", MISFIT_LIMIT)
+        """Return the domain that the metadata of a model describe.
+
+        Args:
+            metadata: Metadata of the model.
+        """
+        measured_limit = metadata.errors.get("misfit_p999", MISFIT_LIMIT)  # 0.1 % of good presses exceed it
         return cls(
             corners_mm=np.array(metadata.working_area_mm),
             force_range_N=metadata.force_range_N,
@@ -261,19 +282,24 @@ class Validity:
 
     @cached_property
     def implausible_limits(self) -> tuple[float, float]:
-        """Squared distance from the centre, mm^2, and force, N, beyond which an output cannot be a measurement."""
-        radius_mm = np.linalg.norm(self.corners_mm - self.centre_mm, axis=1).max()
+        """Limits beyond which an output of the model cannot be a measurement.
+
+        The first limit is a squared distance from `centre_mm`, mm^2. The second limit is a force, N.
+        """
+        circumscribed_radius_mm = np.linalg.norm(self.corners_mm - self.centre_mm, axis=1).max()
         _, max_force_N = self.force_range_N
-        return float(IMPLAUSIBLE_FACTOR * radius_mm) ** 2, IMPLAUSIBLE_FACTOR * max_force_N
+        return float(IMPLAUSIBLE_FACTOR * circumscribed_radius_mm) ** 2, IMPLAUSIBLE_FACTOR * max_force_N
 
     def is_touch(self, charge_pC: Array) -> Booleans:
-        """Return whether charges exceed the noise on at least one electrode.
+        """Compute for each press whether a charge exceeds the noise on at least one electrode.
+
+        A charge exceeds the noise if its magnitude is larger than `TOUCH_LIMIT` standard deviations of the white noise.
 
         Args:
-            charge_pC: Charges, shape (n, electrodes), pC.
+            charge_pC: Charges of n presses, shape (n, electrodes), pC.
 
         Returns:
-            Whether each row of charges is a touch, shape (n,).
+            Whether each press is a touch, shape (n,).
         """
         limit_pC = TOUCH_LIMIT * np.asarray(self.white_pC)
         return np.asarray((np.abs(charge_pC) > limit_pC).any(axis=1))
@@ -288,24 +314,30 @@ class Validity:
         """Description of the working area for messages: its radius, or its bounding box if it is not centred."""
         if self.is_centred:
             return f"up to {self.radius_mm:.3g} mm"
-        # Corners of the bounding box
+        # The limits are the corners of the bounding box of the working area.
         left, bottom = self.corners_mm.min(axis=0)
         right, top = self.corners_mm.max(axis=0)
         return f"from ({left:.3g}, {bottom:.3g}) to ({right:.3g}, {top:.3g}) mm"
 
     def is_beyond(self, contact: Contact) -> bool:
-        """Return whether a contact is so far outside the domain that it cannot be a measurement."""
+        """Return whether a contact is so far outside the domain that it cannot be a measurement.
+
+        Args:
+            contact: Contact that the model computed.
+        """
         centre_x_mm, centre_y_mm = self.centre_mm
-        limit_mm2, limit_N = self.implausible_limits  # squared distance from the centre, and force
-        x_mm = contact.x_mm - centre_x_mm
-        y_mm = contact.y_mm - centre_y_mm
-        return x_mm * x_mm + y_mm * y_mm > limit_mm2 or contact.force_N > limit_N
+        max_distance_squared_mm2, max_force_N = self.implausible_limits
+        x_from_centre_mm = contact.x_mm - centre_x_mm
+        y_from_centre_mm = contact.y_mm - centre_y_mm
+        distance_squared_mm2 = x_from_centre_mm * x_from_centre_mm + y_from_centre_mm * y_from_centre_mm
+        return distance_squared_mm2 > max_distance_squared_mm2 or contact.force_N > max_force_N
 
     @cached_property
     def inscribed_radius_squared_mm2(self) -> float:
-        """Squared radius of the largest circle around the origin inside the working area, mm^2.
+        """Squared radius of the largest circle around the origin that lies inside the working area, mm^2.
 
-        It is the squared distance of the origin from the nearest edge of the area, or 0 if the origin is outside.
+        The squared radius is the squared distance from the origin to the nearest edge of the working area. If the
+        origin is outside the working area, the squared radius is 0.
         """
         origin_x_mm = np.zeros(1)  # `inside_polygon` takes arrays of points, here of one point
         origin_y_mm = np.zeros(1)
@@ -314,8 +346,8 @@ class Validity:
             return 0.0
 
         # The nearest point of each edge is the projection of the origin onto the edge, limited to the ends of the edge.
-        start = self.corners_mm  # shape (edges, 2)
-        edge = np.roll(start, -1, axis=0) - start
+        start = self.corners_mm  # start of each edge, shape (edges, 2)
+        edge = np.roll(start, -1, axis=0) - start  # the last edge ends at the first corner
         edge_length_squared = np.maximum((edge * edge).sum(axis=1), 1e-30)  # the last corner may repeat the first one
         projection = -(start * edge).sum(axis=1) / edge_length_squared  # as a fraction of the edge, shape (edges,)
         fraction = np.clip(projection, 0.0, 1.0)
@@ -326,8 +358,15 @@ class Validity:
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """Return the flags of one contact.
 
-        Most contacts take about a microsecond. If a contact is near the edge of the working area, it is compared with
-        the polygon of the area, which takes about 30 us.
+        For most contacts, the method takes about a microsecond. For a contact near the edge of the working area, the
+        method takes about 30 us, because the contact is compared with the polygon of the area.
+
+        Args:
+            contact: Contact that the model computed.
+
+        Returns:
+            The words `outside`, `beyond`, `misfit` and `stress` whose conditions are true; empty if the contact is
+            valid.
         """
         return _flag_words(
             is_outside=self._is_outside(contact),
@@ -339,8 +378,12 @@ class Validity:
     def _is_outside(self, contact: Contact) -> bool:
         """Return whether a contact is outside the working area or the range of forces.
 
-        Only a contact between the inscribed and the circumscribed circle of the area, both around the origin, is
-        compared with the polygon. This saves time, because most contacts lie inside the inscribed circle.
+        The contact is first compared with two circles around the origin. One circle lies inside the working area, and
+        the other circle encloses it. The slow comparison with the polygon of the area is only needed for a contact
+        between the two circles.
+
+        Args:
+            contact: Contact that the model computed.
         """
         min_force_N, max_force_N = self.force_range_N
         if contact.force_N < min_force_N or contact.force_N > max_force_N:
@@ -348,18 +391,18 @@ class Validity:
         distance_squared_mm2 = contact.x_mm * contact.x_mm + contact.y_mm * contact.y_mm
         if distance_squared_mm2 < self.inscribed_radius_squared_mm2:
             return False
-        if distance_squared_mm2 <= self.radius_mm * self.radius_mm:
-            return not inside_polygon(np.array([contact.x_mm]), np.array([contact.y_mm]), self.corners_mm)[0]
-        return True
+        if distance_squared_mm2 > self.radius_mm * self.radius_mm:
+            return True
+        return not inside_polygon(np.array([contact.x_mm]), np.array([contact.y_mm]), self.corners_mm)[0]
 
     def batch_flags(self, contacts: Contacts) -> list[tuple[str, ...]]:
-        """Return the flags of each contact.
+        """Return the flags of n contacts.
 
         Args:
             contacts: Contacts of n presses.
 
         Returns:
-            For each press, the flags that `flags` returns for a single contact.
+            A list of length n with the flags of each press, as the method `flags` returns them for a single contact.
         """
         min_force_N, max_force_N = self.force_range_N
         is_outside_area = ~inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm)
@@ -367,22 +410,23 @@ class Validity:
         is_outside = is_outside_area | is_outside_forces
         has_misfit = contacts.misfit > self.misfit_limit
         is_above_yield = contacts.force_N > self.yield_force_N
-        # Every contact that is beyond the limits is also outside, so that `is_beyond` need not be tested here.
+        # Every contact beyond the implausible limits is also outside, so `is_beyond` need not be tested here.
         if not (is_outside | has_misfit | is_above_yield).any():  # no contact has a flag
             return [()] * len(is_outside)
 
         centre_x_mm, centre_y_mm = self.centre_mm
-        limit_mm2, limit_N = self.implausible_limits  # squared distance from the centre, and force
+        max_distance_squared_mm2, implausible_force_N = self.implausible_limits
         with np.errstate(over="ignore"):  # a distance that overflows is infinite and exceeds the limit
             distance_squared_mm2 = (contacts.x_mm - centre_x_mm) ** 2 + (contacts.y_mm - centre_y_mm) ** 2
-        is_beyond = (distance_squared_mm2 > limit_mm2) | (contacts.force_N > limit_N)
-        # The four conditions of each contact are converted to the words of the flags.
+        is_beyond = (distance_squared_mm2 > max_distance_squared_mm2) | (contacts.force_N > implausible_force_N)
+
+        # Convert the four conditions of each contact to the words of the flags.
         columns = (is_outside.tolist(), is_beyond.tolist(), has_misfit.tolist(), is_above_yield.tolist())
         return [_flag_words(*conditions) for conditions in zip(*columns, strict=True)]
 
 
 def _flag_words(is_outside: bool, is_beyond: bool, has_misfit: bool, is_above_yield: bool) -> tuple[str, ...]:
-    """Return the flags of all conditions that are true.
+    """Return the flags whose conditions are true, in a fixed order.
 
     Args:
         is_outside: Whether the contact is outside the working area or the range of forces.
@@ -403,15 +447,16 @@ def _flag_words(is_outside: bool, is_beyond: bool, has_misfit: bool, is_above_yi
 
 
 def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
-    """Return whether points lie inside a polygon.
+    """Compute whether points lie inside a polygon.
 
-    A point is inside if a horizontal ray from the point to the right crosses an odd number of edges. An edge is crossed
-    if one of its ends is above the point and the other is not, and if the edge is to the right of the point.
+    A point is inside the polygon if a horizontal ray from the point to the right crosses an odd number of edges. The
+    ray crosses an edge if exactly one end of the edge is above the ray, and the edge intersects the horizontal line to
+    the right of the point.
 
     Args:
         x: First coordinates of the points, shape (n,), in the unit of the corners.
         y: Second coordinates of the points, shape (n,).
-        corners: Corners in order, shape (m, 2). The last corner may repeat the first one.
+        corners: Corners in their order along the polygon, shape (m, 2). The last corner may repeat the first corner.
 
     Returns:
         Whether each point is inside, shape (n,). The result for points on an edge is undefined.

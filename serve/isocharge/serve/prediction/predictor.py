@@ -1,10 +1,11 @@
-"""Prediction of contacts from charges in the same process.
+"""Prediction of contacts from charges in the process of the caller, without a server.
 
-A single press uses memory that is bound to the session once. The prediction of a single press therefore allocates no
-arrays and is faster than `session.run`. Batches use `session.run`.
+The charges and the contact of a single press are stored in memory that is bound to the onnxruntime session once. The
+prediction of a single press therefore allocates no arrays and is faster than `session.run`. Batches are predicted with
+`session.run`.
 
-`predict` checks the charges and returns a named tuple. `predict_into` is for fast loops: it writes the contact into an
-existing array and does not check the charges.
+`Predictor.predict` checks the charges and returns a named tuple. `Predictor.predict_into` does not check the charges
+and writes the contact into an existing array, which is faster in a loop.
 """
 
 import logging
@@ -41,7 +42,7 @@ class Predictor:
 
     Attributes:
         folder: Version folder of the model.
-        metadata: Metadata of the model: sensor, electrodes, working area, measured errors.
+        metadata: Metadata of the model, such as the sensor, the electrodes, the working area and the measured errors.
         validity: Domain in which the model is valid. `validity.batch_flags` returns the flags of a batch.
 
     Example:
@@ -58,8 +59,8 @@ class Predictor:
         """Load a model.
 
         Args:
-            model: Name or path of the model, as `find_model` takes it.
-            models: Repository in which a name is looked up first.
+            model: Name or path of the model, as `find_model` accepts it.
+            models: Repository that is searched first for a model with this name.
 
         Raises:
             ModelError: If the model is missing or damaged, or has an unsupported format.
@@ -71,23 +72,23 @@ class Predictor:
         self._graph = loaded.graph
         self._session = loaded.session
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
-        # The limits are looked up once, because they are compared with every contact.
+        # The limits of implausible contacts are stored here, because `predict` compares them with every contact.
         self._centre_x_mm, self._centre_y_mm = self.validity.centre_mm
-        self._limit_mm2, self._limit_N = self.validity.implausible_limits
+        self._max_distance_squared_mm2, self._max_force_N = self.validity.implausible_limits
         self._has_warned = False
         self._constants: Mapping[str, Singles] = {}
         _check_bound_memory(self._press, loaded)
 
     def with_constants(self, constants: Mapping[str, Singles]) -> "Predictor":
-        """Return a predictor with the same graph, but other values of some of its constants.
+        """Return a predictor with the same ONNX graph in which the values of some constants are replaced.
 
         The call takes about a millisecond.
 
         Args:
-            constants: New values by the names of the graph's constants.
+            constants: New values by the names of the constants in the graph.
 
         Raises:
-            ModelError: If the graph has no constant with one of the names, or a shape differs.
+            ModelError: If the graph contains no constant with one of the names, or a new value has another shape.
         """
         other = copy(self)
         other._constants = constants  # keeps the arrays alive, because onnxruntime uses their memory
@@ -96,9 +97,10 @@ class Predictor:
         return other
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
-        """Compute the contact of one press. Call `flags` to learn whether the contact is valid.
+        """Compute the contact of one press. Call `flags` to find out whether the contact is valid.
 
-        The first contact that is too far away or too hard to be a measurement is logged as a warning.
+        If the position or the force is too large to be a measurement, a warning is logged. Only the first warning of a
+        predictor is logged.
 
         Args:
             charge_pC: Touch charges, shape (electrodes,), pC, in the order of `metadata.electrodes`.
@@ -109,36 +111,44 @@ class Predictor:
         values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else charge_pC
         # `write_finite` writes the charges, and returns False if it cannot convert them or a charge is not finite.
         if not write_finite(self._press.write, values):
-            # The slow conversion accepts other number types. It raises an error that names the electrode.
+            # The slow conversion `as_press` accepts more number types. Its errors name the electrode.
             self._press.write(*as_press(charge_pC, self.metadata.electrodes))
         self._press.run()
         contact = Contact(*self._press.read())
 
-        # The distance is compared with its square, which is faster.
-        x_mm = contact.x_mm - self._centre_x_mm
-        y_mm = contact.y_mm - self._centre_y_mm
-        is_implausible = contact.force_N > self._limit_N or x_mm * x_mm + y_mm * y_mm > self._limit_mm2
+        # These lines repeat `Validity.is_beyond`, because a call would slow down the prediction.
+        x_from_centre_mm = contact.x_mm - self._centre_x_mm
+        y_from_centre_mm = contact.y_mm - self._centre_y_mm
+        distance_squared_mm2 = x_from_centre_mm * x_from_centre_mm + y_from_centre_mm * y_from_centre_mm
+        is_implausible = contact.force_N > self._max_force_N or distance_squared_mm2 > self._max_distance_squared_mm2
         if is_implausible:
             self._warn_once(charge_pC, contact)
         return contact
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
-        """Return the reasons why a contact of this model may be wrong: `outside`, `beyond`, `misfit`, `stress`.
+        """Return the reasons why a contact may be wrong: `outside`, `beyond`, `misfit` and `stress`.
 
-        With three electrodes, there are as many charges as unknowns, so the charges contain no redundancy. A wrong
-        charge then usually gives the charges of another press. The wrong charge is detected only if the contact of this
-        press lies outside the working area or the range of forces.
+        A film with three electrodes has as many charges as unknowns, so the misfit cannot reveal a wrong charge. On
+        such a film, a contact that is computed from a wrong charge usually has no flag. The wrong charge is noticed
+        only if the computed contact lies outside the working area or the range of forces.
+
+        Args:
+            contact: Contact that this model computed.
+
+        Returns:
+            The reasons; empty if the contact is valid.
         """
         return self.validity.flags(contact)
 
     def predict_into(self, charge_pC: Singles, out: Singles) -> None:
-        """Compute the contact of one press, and write it into an existing array. The charges are not checked.
+        """Compute the contact of one press, and write the contact into an existing array without checking the charges.
 
         Args:
             charge_pC: Touch charges, shape (electrodes,), float32, pC, in the order of `metadata.electrodes`. If a
                 charge is NaN, the result is NaN.
-            out: Array of float32 that receives the values of a Contact in their order, shape (10,), or only the first
-                seven values, shape (7,). A model without correlations computes only seven values.
+            out: Array of float32 for the values of the contact in the order of the attributes of `Contact`. With the
+                shape (10,), it receives all values. With the shape (7,), it receives the values without correlations. A
+                model that computes no correlations needs the shape (7,).
 
         Raises:
             ChargeError: If an array is not float32 or has another shape. Nothing is written in this case.
@@ -165,18 +175,19 @@ class Predictor:
         Raises:
             ChargeError: If the shape is wrong, or a charge is not finite. The message names the electrode and the row.
         """
-        columns_of_output = self._press.columns
+        columns_of_output = self._press.columns  # the columns of a contact that each output of the graph contains
         charges = as_batch(charge_pC, self.metadata.electrodes)
         outputs = run(self._session, charges, tuple(columns_of_output))
-        # One row for each press and one column for each attribute of Contact. Correlations are NaN if the model does
-        # not compute them.
+
+        # One row for each press and one column for each attribute of `Contact`. Correlations remain NaN if the model
+        # computes no correlations.
         contacts = np.full((len(charges), len(Contact._fields)), np.nan, np.float32)
         for name, columns in columns_of_output.items():
             contacts[:, columns] = outputs[name]
         return Contacts(*contacts.T)
 
     def __repr__(self) -> str:
-        """Return the label of the model, its sensor and electrodes, and the domain in which it is valid."""
+        """Return a text with the label, the sensor, the electrodes and the valid domain of the model."""
         metadata = self.metadata
         low_N, high_N = self.validity.force_range_N
         return (
@@ -185,7 +196,12 @@ class Predictor:
         )
 
     def _warn_once(self, charge_pC: object, contact: Contact) -> None:
-        """Log a warning for the first contact that cannot be a measurement."""
+        """Log a warning for a contact that cannot be a measurement, unless a warning was logged before.
+
+        Args:
+            charge_pC: Charges of the press, as they were passed to `predict`.
+            contact: Contact that the model computed from the charges.
+        """
         if self._has_warned:
             return
         self._has_warned = True
@@ -202,24 +218,24 @@ class Predictor:
 
 
 def _describe(value: object) -> str:
-    """Return the number type and shape of an array, or the type of another object, for an error message."""
+    """Describe a value for an error message: number type and shape of an array, or type of any other object."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype} of shape {value.shape}"
     return type(value).__name__
 
 
 def _check_bound_memory(press: BoundPress, model: Model) -> None:
-    """Check that this version of onnxruntime reads and writes the bound memory itself, not a copy.
+    """Check that this version of onnxruntime reads and writes the bound memory itself, and not a copy of the memory.
 
-    A press is computed both in the bound memory and with `session.run`, which copies the arrays. A small difference is
-    allowed.
+    The contact of one press is computed in the bound memory, and again with `session.run`, which copies the arrays. The
+    results must agree within a small tolerance.
 
     Args:
         press: Bound memory for one press of the model.
-        model: The model. Its golden vectors contain charges, of which the first press is computed.
+        model: The model. The check uses the charges of the first press in its golden vectors.
 
     Raises:
-        ModelError: If the bound press and `session.run` give different results.
+        ModelError: If the results in the bound memory and with `session.run` differ.
     """
     charges = model.golden.charge_pC[:1]  # shape (1, electrodes)
     press.write(*charges[0])

@@ -1,10 +1,11 @@
 """Comparison of a model with measured presses.
 
-The result contains the errors of the model, the part that noise and rig explain, and a verdict.
+The rig is the machine that sets the position and the force of each press. The result of the comparison contains the
+errors of the model, the part of the errors that the noise and the uncertainty of the rig explain, and a verdict.
 
 If the noise of the charges and the uncertainty of the rig do not explain the errors, the model does not describe the
-film. Either the film was never calibrated, or it has aged or crept since its calibration. A drift of the film first
-appears as a common scale of the forces and as a common shift of the positions.
+film. Either the film was never calibrated, or the film has aged or crept since its calibration. A drift of the film
+first appears as a common scale factor of all forces and as a common shift of all positions.
 """
 
 import math
@@ -38,13 +39,13 @@ MIN_PRESSES = 3
 """Smallest number of presses for a verdict. With fewer presses, a single bad press cannot be recognised."""
 
 BAD_PRESS_PROBABILITY = 1e-3
-"""Probability with which noise makes at least one of all presses look bad."""
+"""Probability that the noise makes at least one of all good presses look bad."""
 
 MAX_BAD_FRACTION = 0.1
-"""Largest fraction of bad presses with which a model may still fit. A single bad press is always allowed."""
+"""Largest fraction of bad presses for which a model may still fit. A single bad press is always allowed."""
 
 BAD_PRESS_MIN_CHI_SQUARED = 9.0
-"""Sum of the squared error ratios of a press below which the press is certainly not bad."""
+"""Sum of the squared errors of a press, relative to their variances, below which the press is certainly not bad."""
 
 MISFIT_FRACTION = 0.01
 """Fraction of good presses whose misfit is above the limit `misfit_p99` of the model."""
@@ -53,7 +54,7 @@ MISFIT_PROBABILITY = 2e-3
 """Probability below which a number of presses with a large misfit is not attributed to chance."""
 
 MIN_COMMON_SIGNIFICANCE = 3.0
-"""Significance above which a common shift or a common scale is reported, in standard deviations."""
+"""Significance above which a common shift or a common scale factor is reported, in standard deviations."""
 
 MAX_LISTED_PRESSES = 5
 """Largest number of presses that a note lists."""
@@ -69,14 +70,14 @@ class PressCheck:
     Attributes:
         model: Label of the model, `name/version`.
         presses: Number of presses in the file.
-        compared: Number of presses from which the values below are computed.
+        compared: Number of presses from which the errors and the tests are computed.
         position_mm: Errors of the positions; None if no position is known.
         force_percent: Errors of the forces; None if no force is known.
         agreement: Statistical tests of the errors.
-        fits: Whether noise and rig explain the errors; None if there are too few presses.
-        verdict: The result in words.
-        notes: Further findings, one sentence each.
-        errors: Errors of the single presses.
+        fits: Whether the noise and the uncertainty of the rig explain the errors; None if there are too few presses.
+        verdict: The result of the comparison in words.
+        notes: Further findings, as one sentence for each finding.
+        errors: Errors of each press.
     """
 
     model: str
@@ -91,7 +92,10 @@ class PressCheck:
     errors: PressErrors
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary of plain values for JSON. The names contain the units, and unknown values are None."""
+        """Return the result as a dictionary of values that can be written as JSON.
+
+        The names of the values contain the units. Unknown values are None.
+        """
         agreement = self.agreement
         degrees = agreement.degrees
         values = {
@@ -120,34 +124,33 @@ class PressCheck:
 def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     """Compare a model with measured presses.
 
-    A press is compared if all its charges are known, and also its position, its force, or both. The known values must
-    lie in the working area and the range of forces of the model. A few bad presses are reported and excluded if all
-    other presses agree with the model.
+    A press is compared if all charges of the press are known, and if the position, the force or both are known. A known
+    position must lie in the working area of the model, and a known force must lie in the range of forces of the model.
+    A few bad presses are reported and excluded if all other presses agree with the model.
 
     Args:
         predictor: The model.
         presses: The presses, with at least the electrodes of the model.
 
     Raises:
-        PressError: If the charges of one of the model's electrodes are missing.
+        PressError: If the presses contain no charges of one of the model's electrodes.
     """
-    # Exclude the bad presses, and test whether noise and rig explain the errors of the others. The rig is the machine
-    # that sets the position and the force of each press, with some uncertainty.
+    # Exclude the bad presses, and test whether noise and rig explain the errors of the other presses.
     metadata = predictor.metadata
     errors = press_errors(predictor, presses)
     is_bad = _bad_presses(errors)
-    rows = errors.is_compared & ~is_bad
-    count = int(rows.sum())
-    agreement = Agreement.of(errors, rows)
-    position = _position_summary(errors, rows)
-    force = _force_summary(errors, rows)
-    misfit_text = _frequent_misfits(errors, rows, metadata)  # empty if there are not too many misfits
+    is_selected = errors.is_compared & ~is_bad
+    count = int(is_selected.sum())
+    agreement = Agreement.of(errors, is_selected)
+    position = _position_summary(errors, is_selected)
+    force = _force_summary(errors, is_selected)
+    misfit_text = _misfit_statement(errors, is_selected, metadata)  # empty if there are not too many large misfits
 
-    fits = None  # too few presses
+    fits = None  # there are too few presses for a verdict
     if count >= MIN_PRESSES:
         fits = agreement.acceptable and not misfit_text
 
-    # Explain the result to the user.
+    # Collect the explanations for the user.
     notes: list[str] = []
     if fits is False:
         notes += _remedies(metadata, position, force)
@@ -170,11 +173,17 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
 
 
 def _bad_presses(errors: PressErrors) -> Booleans:
-    """Return which presses are bad, shape (n,).
+    """Find bad presses, which have improbable errors although all other presses agree with the model.
 
-    The bad presses are the presses with improbable errors, if all other presses agree with the model. No press is bad
-    if all presses agree with the model, if too many presses would have to be excluded, or if the other presses do not
-    agree with the model either. A single bad press is always allowed, even among few presses.
+    No press is considered bad in three cases: if all presses together agree with the model, if too many presses have
+    improbable errors, or if the other presses do not agree with the model either. One bad press is never too many, even
+    among few presses.
+
+    Args:
+        errors: Errors of all presses.
+
+    Returns:
+        Whether each press is bad, shape (n,).
     """
     is_compared = errors.is_compared
     no_bad_press = np.zeros_like(is_compared)
@@ -183,30 +192,33 @@ def _bad_presses(errors: PressErrors) -> Booleans:
 
     is_improbable = _improbable_presses(errors, is_compared)
     compared_count = int(is_compared.sum())
-    bad_count = int(is_improbable.sum())
+    improbable_count = int(is_improbable.sum())
     max_bad_count = max(1.0, MAX_BAD_FRACTION * compared_count)
-    has_few_bad_presses = 0 < bad_count <= max_bad_count
-    has_enough_good_presses = compared_count - bad_count >= MIN_PRESSES
-    if not (has_few_bad_presses and has_enough_good_presses):
+    are_few_improbable = 0 < improbable_count <= max_bad_count
+    are_enough_other = compared_count - improbable_count >= MIN_PRESSES
+    if not (are_few_improbable and are_enough_other):
         return no_bad_press
 
-    good_presses_agree = Agreement.of(errors, is_compared & ~is_improbable).acceptable
-    return is_improbable if good_presses_agree else no_bad_press
+    do_others_agree = Agreement.of(errors, is_compared & ~is_improbable).acceptable
+    return is_improbable if do_others_agree else no_bad_press
 
 
 def _improbable_presses(errors: PressErrors, is_compared: Booleans) -> Booleans:
-    """Return which of the compared presses have errors that noise and rig are very unlikely to cause, shape (n,).
+    """Find the compared presses with errors that noise and rig are very unlikely to cause.
 
-    The limit of the probability is divided by the number of presses (Bonferroni). If all presses are good, the
-    probability that at least one of them is improbable is then `BAD_PRESS_PROBABILITY`.
+    The limit of the probability is divided by the number of compared presses (Bonferroni correction). If all presses
+    are good, the probability that at least one press exceeds the limit is therefore about `BAD_PRESS_PROBABILITY`.
 
     Args:
         errors: Errors of all presses.
-        is_compared: Which presses are compared, shape (n,).
+        is_compared: Whether each press is compared, shape (n,).
+
+    Returns:
+        Whether each press has improbable errors, shape (n,).
     """
     max_probability = BAD_PRESS_PROBABILITY / max(1, int(is_compared.sum()))
-    # Squared errors of x, y and the force, relative to their expected variances, shape (n, 3), NaN if unknown. Their
-    # sum over one press has a chi-squared distribution. The probability is only computed if the sum is large.
+    # Squared errors of x, y and the force, relative to their expected variances, shape (n, 3); NaN where unknown. The
+    # sum over one press has a chi-squared distribution. Its probability is only computed if the sum is large.
     squared_ratio = errors.squared_ratio
     is_candidate = is_compared & (np.nansum(squared_ratio, axis=1) > BAD_PRESS_MIN_CHI_SQUARED)
     is_improbable = np.zeros_like(is_compared)
@@ -218,45 +230,56 @@ def _improbable_presses(errors: PressErrors, is_compared: Booleans) -> Booleans:
     return is_improbable
 
 
-def _position_summary(errors: PressErrors, rows: Booleans) -> ErrorSummary | None:
-    """Summarise the position errors of some presses, mm; None if no position is known."""
-    known = rows & ~np.isnan(errors.position_error_mm)
-    noise_variance = errors.noise_std[known, X] ** 2 + errors.noise_std[known, Y] ** 2
-    rig_variance = errors.rig_std[known, X] ** 2 + errors.rig_std[known, Y] ** 2
-    return ErrorSummary.of(errors.position_error_mm[known], noise_variance, rig_variance)
-
-
-def _force_summary(errors: PressErrors, rows: Booleans) -> ErrorSummary | None:
-    """Summarise the force errors of some presses, %; None if no force is known.
-
-    Args:
-        errors: Errors of all presses. The errors of the force are relative to the measured force.
-        rows: Which presses are summarised, shape (n,).
-    """
-    error_percent = 100.0 * np.abs(errors.error[:, FORCE])
-    known = rows & ~np.isnan(error_percent)
-    noise_variance = (100.0 * errors.noise_std[known, FORCE]) ** 2
-    rig_variance = (100.0 * errors.rig_std[known, FORCE]) ** 2
-    return ErrorSummary.of(error_percent[known], noise_variance, rig_variance)
-
-
-def _frequent_misfits(errors: PressErrors, rows: Booleans, metadata: ModelMetadata) -> str:
-    """Return a statement if more presses than chance explains have a misfit above the limit of the model.
-
-    The misfit is the distance of the charges from those of the nearest single contact. One per cent of good presses
-    have a misfit above the limit, by definition of the limit.
+def _position_summary(errors: PressErrors, is_selected: Booleans) -> ErrorSummary | None:
+    """Summarise the position errors of the selected presses, mm.
 
     Args:
         errors: Errors of all presses.
-        rows: Which presses are counted, shape (n,).
+        is_selected: Whether each press is selected, shape (n,).
+
+    Returns:
+        The summary; None if no selected press has a known position.
+    """
+    is_known = is_selected & ~np.isnan(errors.position_error_mm)
+    noise_variance = errors.noise_std[is_known, X] ** 2 + errors.noise_std[is_known, Y] ** 2
+    rig_variance = errors.rig_std[is_known, X] ** 2 + errors.rig_std[is_known, Y] ** 2
+    return ErrorSummary.of(errors.position_error_mm[is_known], noise_variance, rig_variance)
+
+
+def _force_summary(errors: PressErrors, is_selected: Booleans) -> ErrorSummary | None:
+    """Summarise the relative force errors of the selected presses, %.
+
+    Args:
+        errors: Errors of all presses. The errors of the force are relative to the measured force.
+        is_selected: Whether each press is selected, shape (n,).
+
+    Returns:
+        The summary; None if no selected press has a known force.
+    """
+    error_percent = 100.0 * np.abs(errors.error[:, FORCE])
+    is_known = is_selected & ~np.isnan(error_percent)
+    noise_variance = (100.0 * errors.noise_std[is_known, FORCE]) ** 2
+    rig_variance = (100.0 * errors.rig_std[is_known, FORCE]) ** 2
+    return ErrorSummary.of(error_percent[is_known], noise_variance, rig_variance)
+
+
+def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: ModelMetadata) -> str:
+    """Return a statement if so many presses have a large misfit that the number cannot be attributed to chance.
+
+    The misfit is the distance between the measured charges and the nearest charges of a single contact. A misfit is
+    large if it is above the limit of the model, which 1 % of good presses exceed.
+
+    Args:
+        errors: Errors of all presses.
+        is_selected: Whether each press is counted, shape (n,).
         metadata: Metadata of the model.
 
     Returns:
-        The statement; empty if chance explains the number.
+        The statement; empty if the number of large misfits can be attributed to chance.
     """
-    has_misfit = np.array([MISFIT in flags for flags in errors.flags], dtype=np.bool_)
-    count = int(rows.sum())
-    misfit_count = int((has_misfit & rows).sum())
+    has_large_misfit = np.array([MISFIT in flags for flags in errors.flags], dtype=np.bool_)
+    count = int(is_selected.sum())
+    misfit_count = int((has_large_misfit & is_selected).sum())
     probability_of_as_many = 1.0 - _probability_of_fewer(misfit_count, count)
     if probability_of_as_many >= MISFIT_PROBABILITY:
         return ""
@@ -265,11 +288,15 @@ def _frequent_misfits(errors: PressErrors, rows: Booleans, metadata: ModelMetada
 
 
 def _probability_of_fewer(misfit_count: int, count: int) -> float:
-    """Return the probability that fewer than `misfit_count` of `count` good presses have a misfit above the limit.
+    """Compute the probability that fewer than `misfit_count` of `count` good presses have a large misfit.
 
-    The number of such presses follows a binomial distribution with the probability p = `MISFIT_FRACTION`. With n =
-    `count`, the result is the sum of binomial(n, k) (p / (1 - p))^k (1 - p)^n over k from 0 to `misfit_count` - 1. The
-    terms are computed from their logarithms, because the binomial coefficients would overflow.
+    The number of presses with a large misfit has a binomial distribution with n = `count` and p = `MISFIT_FRACTION`.
+    The result is the sum of binomial(n, k) (p / (1 - p))^k (1 - p)^n over k from 0 to `misfit_count` - 1. The terms are
+    computed from their logarithms, because the binomial coefficients would overflow.
+
+    Args:
+        misfit_count: Number of presses with a large misfit.
+        count: Number of all presses.
     """
     log_odds = math.log(MISFIT_FRACTION / (1.0 - MISFIT_FRACTION))
     log_probability_of_none = count * math.log1p(-MISFIT_FRACTION)
@@ -290,14 +317,14 @@ def _verdict(
         count: Number of compared presses.
         position: Errors of the positions; None if no position is known.
         force: Errors of the forces; None if no force is known.
-        misfit_text: Statement about too many misfits; empty if there are not too many.
+        misfit_text: Statement that too many presses have a large misfit; empty if this is not the case.
     """
     if fits is None:
         return f"too few presses to say: {count} can be compared, {MIN_PRESSES} are needed"
     if fits:
         return "fits: noise explains the errors"
 
-    # The attribute `beyond` is the part of the errors that noise and rig do not explain.
+    # State the part of the errors that noise and rig do not explain, which is the attribute `beyond`.
     unexplained = []
     if position is not None:
         unexplained.append(f"{position.beyond:.2g} mm")
@@ -312,11 +339,12 @@ def _verdict(
 def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: ErrorSummary | None) -> Iterator[str]:
     """Yield notes about possible remedies for a model that does not fit.
 
-    The first note states how uncertain the rig would have to be to explain the errors. The next note recommends a
-    calibration or, for a calibrated model, a model that learns from the measured presses.
+    The first note states how large the uncertainty of the rig would have to be to explain the errors. The second note
+    recommends a calibration. If the model was already calibrated, the second note also mentions training with the
+    measured presses.
 
     Args:
-        metadata: Metadata of the model, which state whether it was calibrated.
+        metadata: Metadata of the model, which state whether the model was calibrated.
         position: Errors of the positions; None if no position is known.
         force: Errors of the forces; None if no force is known.
     """
@@ -341,34 +369,40 @@ def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: Err
 
 
 def _explaining_rig_std(errors: ErrorSummary) -> float:
-    """Return the standard deviation of the rig that would explain the errors, in the unit of the errors."""
+    """Return the standard deviation of the rig that would explain the errors, in the unit of the errors.
+
+    Args:
+        errors: Errors of the positions or of the forces.
+    """
     return math.sqrt(max(errors.rms**2 - errors.noise**2, 0.0))
 
 
 def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]:
-    """Yield a note for each reason why presses were excluded. The note lists the rows of these presses.
+    """Yield one note for each reason why presses were excluded from the comparison.
+
+    Each note contains the reason, and lists the lines of the presses that were excluded for this reason.
 
     Args:
-        errors: Errors of all presses, with the reasons.
+        errors: Errors of all presses, with the reason why each press was excluded.
         metadata: Metadata of the model.
     """
-    reasons = errors.exclusion_reasons
-    different_reasons = set(reasons) - {""}  # a press that is compared has an empty reason
+    reason_of_press = errors.exclusion_reasons
+    different_reasons = set(reason_of_press) - {""}  # a press that is compared has an empty reason
     for reason in sorted(different_reasons):
-        lines = [line for line, line_reason in zip(errors.lines, reasons, strict=True) if line_reason == reason]
+        lines = [line for line, line_reason in zip(errors.lines, reason_of_press, strict=True) if line_reason == reason]
         list_of_lines = row_words(lines, errors.row_noun, MAX_LISTED_PRESSES)  # such as "lines 2, 5 and 4 more"
         explanation = _explain_exclusion(reason, metadata)
-        yield f"{len(lines)} of {len(reasons)} presses do not count: {explanation} ({list_of_lines})"
+        yield f"{len(lines)} of {len(reason_of_press)} presses do not count: {explanation} ({list_of_lines})"
 
 
 def _explain_exclusion(reason: str, metadata: ModelMetadata) -> str:
-    """Return the reason for an exclusion as a part of a sentence.
+    """Return a part of a sentence that explains to the user why presses were excluded.
 
-    If a press is outside the domain of the model, the text contains the limits of the domain.
+    If the presses are outside the domain of the model, the text states the limits of the domain.
 
     Args:
-        reason: Reason why presses were excluded.
-        metadata: Metadata of the model, which contain its domain.
+        reason: Reason why presses were excluded, as in `PressErrors.exclusion_reasons`.
+        metadata: Metadata of the model, which contain the domain of the model.
     """
     if reason != NOT_TRAINED:
         return reason
@@ -382,16 +416,29 @@ def _explain_exclusion(reason: str, metadata: ModelMetadata) -> str:
 
 
 def _bad_press_notes(errors: PressErrors, is_bad: Booleans) -> Iterator[str]:
-    """Yield a note that lists the bad presses, if there are any."""
+    """Yield a note that lists the bad presses; yield nothing if there are no bad presses.
+
+    Args:
+        errors: Errors of all presses.
+        is_bad: Whether each press is bad, shape (n,).
+    """
     if is_bad.any():
-        words = row_words(np.array(errors.lines)[is_bad].tolist(), errors.row_noun, MAX_LISTED_PRESSES)
-        yield f"{words}: nothing like the other presses, left out; look at it"
+        bad_lines = np.array(errors.lines)[is_bad].tolist()
+        list_of_lines = row_words(bad_lines, errors.row_noun, MAX_LISTED_PRESSES)  # such as "lines 2, 5 and 4 more"
+        yield f"{list_of_lines}: nothing like the other presses, left out; look at it"
 
 
 def _misfit_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]:
-    """Yield a note if too many presses have a misfit above the limit. Excluded presses are also counted."""
-    all_rows = np.ones(len(errors.lines), dtype=np.bool_)
-    misfit_text = _frequent_misfits(errors, all_rows, metadata)
+    """Yield a note if too many presses have a misfit above the limit of the model.
+
+    Presses that are excluded from the comparison are also counted.
+
+    Args:
+        errors: Errors of all presses.
+        metadata: Metadata of the model.
+    """
+    all_presses = np.ones(len(errors.lines), dtype=np.bool_)
+    misfit_text = _misfit_statement(errors, all_presses, metadata)
     if misfit_text:
         yield (
             f"{misfit_text}: no single press on the model's film gives such charges (gain, tare, swapped or dead "
@@ -400,10 +447,12 @@ def _misfit_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]
 
 
 def _common_notes(agreement: Agreement) -> Iterator[str]:
-    """Yield notes about the common shift of the positions and the common scale of the forces, if significant.
+    """Yield a note about a common shift of all positions and a note about a common scale factor of all forces.
+
+    Each note is only yielded if the common error is significant.
 
     Args:
-        agreement: Tests of the errors, with the mean of the errors of x, y and the force over all presses.
+        agreement: Tests of the errors, which contain the common errors of x, y and the force.
     """
     shift_x = agreement.shift_x
     shift_y = agreement.shift_y

@@ -1,8 +1,10 @@
-"""Errors of a model on measured presses, and statistical tests whether noise and rig explain them.
+"""Errors of a model on measured presses, and statistical tests of these errors.
 
-The expected variance of an error is the sum of two variances. The model reports the variance that the noise of the
-charges causes. The other variance is the uncertainty of the position or force that the rig sets. The tests use the sum
-of the squared errors and the mean error of all presses.
+The rig is the machine that sets the position and the force of each press. The expected variance of an error is the sum
+of two variances. The first variance is caused by the noise of the charges, and is reported by the model. The second
+variance is caused by the uncertainty of the position or of the force that the rig sets. The tests decide whether the
+expected variances explain the errors. One test uses the sum of the squared errors, and the other test uses the mean
+errors.
 """
 
 import math
@@ -22,7 +24,7 @@ from isocharge.serve.prediction.predictor import Predictor
 CHARGE_UNKNOWN = "a charge is unknown"
 CONTACT_UNKNOWN = "neither place nor force is known"
 NOT_TRAINED = "not trained for"
-"""Reasons why a press is excluded from the comparison."""
+"""Reasons why a press is excluded from the comparison, as parts of a sentence."""
 
 X = 0
 Y = 1
@@ -30,30 +32,31 @@ FORCE = 2
 """Columns of the errors and standard deviations of `PressErrors`."""
 
 VALUE_COLUMNS = slice(0, 3)
-"""Columns of a `Contact` with x, y and the force."""
+"""Columns of x, y and the force in an array of contacts with one column for each attribute of `Contact`."""
 
 STD_COLUMNS = slice(3, 6)
-"""Columns of a `Contact` with the standard deviations of x, y and the force."""
+"""Columns of the standard deviations of x, y and the force in an array of contacts."""
 
 MISFIT_COLUMN = Contacts._fields.index("misfit")
-"""Column of a `Contact` with the misfit."""
+"""Column of the misfit in an array of contacts."""
 
 
 @dataclass(frozen=True)
 class PressErrors:
-    """Contacts that a model computed for n measured presses, and their errors.
+    """Contacts that a model computed for n measured presses, and the errors of these contacts.
 
     Attributes:
-        lines: Number of each press in its file.
+        lines: Number of the line of each press in its file.
         row_noun: What `lines` counts: "line" of a CSV file, "row" of a Parquet file, or "press".
-        predicted: Values of a `Contact`, shape (n, 10); NaN where a charge is unknown.
-        error: Errors of x, y (mm) and the force (relative to the measured force), shape (n, 3): predicted minus
-            measured values. The error is NaN if the measured value is unknown.
-        noise_std: Standard deviations that the model reports for the noise, in the units of `error`, shape (n, 3).
+        predicted: Values of the attributes of `Contact` for each press, shape (n, 10); NaN if a charge is unknown.
+        error: Predicted minus measured values of x (mm), y (mm) and the force (relative to the measured force), shape
+            (n, 3). The error is NaN if the measured value is unknown.
+        noise_std: Standard deviations that the noise of the charges causes, as reported by the model, in the units of
+            `error`, shape (n, 3).
         rig_std: Standard deviations of the measured values, in the units of `error`, shape (n, 3).
-        flags: Flags of each press. `outside` is the flag of `Validity`. `misfit` means that the misfit is above
-            `misfit_limit`, which 1 % of good presses exceed.
-        exclusion_reasons: Reason why each press is excluded from the comparison; empty if it is compared.
+        flags: Flags of each press. The flag `outside` has the same condition as in `Validity`. The flag `misfit` means
+            that the misfit is above `misfit_limit`, which 1 % of good presses exceed.
+        exclusion_reasons: Reason why each press is excluded from the comparison; empty for a press that is compared.
     """
 
     lines: tuple[int, ...]
@@ -77,21 +80,21 @@ class PressErrors:
 
     @property
     def squared_ratio(self) -> Array:
-        """Squared errors relative to their expected variances, shape (n, 3)."""
+        """Squared errors divided by their expected variances, shape (n, 3)."""
         return self.error**2 / self.variance
 
     @property
     def position_error_mm(self) -> Array:
-        """Distance from the measured position, shape (n,), mm; NaN where the position is unknown."""
+        """Distance between predicted and measured position, shape (n,), mm; NaN where the position is unknown."""
         return np.hypot(self.error[:, X], self.error[:, Y])
 
     def row(self, press: int) -> dict[str, Any]:
-        """Return the values of one press as a dictionary. The names contain the units.
+        """Return the values of one press as a dictionary whose keys contain the units.
 
         Args:
-            press: Index of the press, from 0.
+            press: Index of the press; the first press has the index 0.
         """
-        error = self.error[press]  # of x, y and the force, relative for the force
+        error = self.error[press]  # x and y in mm, and the force relative to the measured force
         noise_std = self.noise_std[press]
         rig_std = self.rig_std[press]
         contact_names = Contacts._fields[:N_WITHOUT_CORRELATION]
@@ -112,25 +115,25 @@ class PressErrors:
 
 
 def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
-    """Predict the contacts of measured presses from their charges, and return the errors of these contacts.
+    """Predict contacts from the charges of measured presses, and compute the errors of the predicted contacts.
 
     Args:
         predictor: The model.
         presses: The presses, with at least the electrodes of the model.
 
     Raises:
-        PressError: If the charges of one of the model's electrodes are missing.
+        PressError: If the presses contain no charges of one of the model's electrodes.
     """
     metadata = predictor.metadata
-    model_presses = presses.of_electrodes(metadata.electrodes, metadata.label)
+    model_presses = presses.of_electrodes(metadata.electrodes, metadata.label)  # charges in the order of the model
     measured = model_presses.contact  # x, y and force, shape (n, 3)
     predicted = _predicted_contacts(predictor, model_presses.charge_pC)
 
-    # Errors of the position are in mm, errors of the force are relative to the measured force.
-    scale = np.ones((len(model_presses), 3))
-    scale[:, FORCE] = measured[:, FORCE]
+    # Errors of x and y are in mm. Errors of the force are divided by the measured force.
+    unit = np.ones((len(model_presses), 3))
+    unit[:, FORCE] = measured[:, FORCE]
 
-    # Uncertainty of the measured values. That of the force is already relative.
+    # Standard deviations of the measured values. The standard deviation of the force is already relative.
     position_std_mm = model_presses.position_std_mm
     rig_std = np.column_stack([position_std_mm, position_std_mm, model_presses.force_std])
     is_unknown = np.isnan(measured)
@@ -138,8 +141,8 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
         lines=model_presses.lines,
         row_noun=model_presses.row_noun,
         predicted=predicted,
-        error=(predicted[:, VALUE_COLUMNS] - measured) / scale,
-        noise_std=np.where(is_unknown, np.nan, predicted[:, STD_COLUMNS] / scale),
+        error=(predicted[:, VALUE_COLUMNS] - measured) / unit,
+        noise_std=np.where(is_unknown, np.nan, predicted[:, STD_COLUMNS] / unit),
         rig_std=np.where(is_unknown, np.nan, rig_std),
         flags=_flags(metadata, predicted),
         exclusion_reasons=_exclusion_reasons(metadata, model_presses),
@@ -147,19 +150,23 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
 
 
 def misfit_limit(metadata: ModelMetadata) -> float:
-    """Return the misfit that 1 % of good presses exceed, from the metadata of a model."""
+    """Return the misfit that 1 % of good presses exceed.
+
+    Args:
+        metadata: Metadata of the model. If they do not contain this limit, the result is `MISFIT_LIMIT`.
+    """
     return float(metadata.errors.get("misfit_p99", MISFIT_LIMIT))
 
 
 def _predicted_contacts(predictor: Predictor, charge_pC: Array) -> Array:
-    """Predict the contacts of presses.
+    """Predict the contacts of presses of which some charges may be unknown.
 
     Args:
         predictor: The model.
         charge_pC: Charges, shape (n, electrodes), pC; NaN where unknown.
 
     Returns:
-        Values of a `Contact`, shape (n, 10). A row with an unknown charge is NaN.
+        Values of the attributes of `Contact` for each press, shape (n, 10). If a charge is unknown, the row is NaN.
     """
     predicted = np.full((len(charge_pC), len(Contacts._fields)), np.nan)
     is_complete = ~np.isnan(charge_pC).any(axis=1)
@@ -170,23 +177,23 @@ def _predicted_contacts(predictor: Predictor, charge_pC: Array) -> Array:
 def _flags(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], ...]:
     """Return the flags `outside` and `misfit` of predicted contacts.
 
-    The flag `misfit` is set above a lower limit than in `Validity`: one per cent of good presses exceed it.
+    The limit for the flag `misfit` is the result of `misfit_limit`, which is lower than the limit in `Validity`.
 
     Args:
         metadata: Metadata of the model.
-        predicted: Values of a `Contact`, shape (n, 10); NaN where a charge is unknown.
+        predicted: Values of the attributes of `Contact` for each press, shape (n, 10); NaN if a charge is unknown.
 
     Returns:
         The flags of each press.
     """
     contacts = Contacts(*predicted.astype(np.float32).T)
     batch_flags = Validity.of(metadata).batch_flags(contacts)
-    is_complete = np.asarray(~np.isnan(predicted).all(axis=1))  # a press without all charges has no contact
+    has_contact = np.asarray(~np.isnan(predicted).all(axis=1))  # a press with an unknown charge has no contact
     has_misfit = np.asarray(predicted[:, MISFIT_COLUMN] > misfit_limit(metadata))
     all_flags = []
     for press, validity_flags in enumerate(batch_flags):
         flags = []
-        if OUTSIDE in validity_flags and is_complete[press]:
+        if OUTSIDE in validity_flags and has_contact[press]:
             flags.append(OUTSIDE)
         if has_misfit[press]:
             flags.append(MISFIT)
@@ -195,13 +202,13 @@ def _flags(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], 
 
 
 def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tuple[str, ...]:
-    """Return the reason why each press is excluded; empty if the press is compared.
+    """Return the reason why each press is excluded from the comparison; empty if the press is compared.
 
-    Whether a press lies in the domain of the model is determined from the measured position and force.
+    The measured position and the measured force determine whether a press lies in the domain of the model.
 
     Args:
-        metadata: Metadata of the model, which contain its domain.
-        presses: The measured presses, with the electrodes of the model.
+        metadata: Metadata of the model, which contain the working area and the range of forces.
+        presses: The measured presses, with the charges of the model's electrodes.
     """
     x_mm, y_mm, force_N = presses.contact.T
     min_force_N, max_force_N = metadata.force_range_N
@@ -210,7 +217,7 @@ def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tup
     is_outside_forces = (force_N < min_force_N) | (force_N > max_force_N)
     is_contact_unknown = np.isnan(presses.contact).all(axis=1)
     is_charge_unknown = np.isnan(presses.charge_pC).any(axis=1)
-    # The first condition that is true gives the reason.
+    # If several conditions are true, the first condition in the list determines the reason.
     conditions = [is_charge_unknown, is_contact_unknown, is_outside_area | is_outside_forces]
     reasons = np.select(conditions, [CHARGE_UNKNOWN, CONTACT_UNKNOWN, NOT_TRAINED], default="")
     return tuple(reasons.tolist())
@@ -220,28 +227,32 @@ SIGNIFICANCE = 0.01
 """Probability that a model that fits is rejected. Each of the two tests has half of this probability."""
 
 MAX_ACCEPTED_CHI_SQUARED = 1.1
-"""Chi-squared per degree of freedom that is always accepted, because standard deviations are known to 5 % at best."""
+"""Chi-squared per degree of freedom up to which the scatter is always accepted, dimensionless.
+
+The limit is above 1, because the standard deviations are known to 5 % at best.
+"""
 
 COMMON_RATIO = 0.2
-"""Fraction of the standard deviation of a rig that may be equal in all presses, dimensionless.
+"""Error of the rig that may be equal in all presses, relative to the standard deviation of the rig, dimensionless.
 
-For example, the position of a stage has a constant offset, and the force of a load cell has an error of scale.
+For example, the positions of a stage may have a common offset, and the forces of a load cell a common scale error.
 """
 
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """Summary of the errors of the positions, mm, or of the forces, %.
+    """Summary of the errors of the positions in mm, or of the forces in %.
 
     Attributes:
         presses: Number of presses.
         rms: Root mean square of the errors.
         median: Median of the absolute errors.
         max: Largest absolute error.
-        noise: Root mean square of the errors that noise of the charges causes.
-        rig: Root mean square of the errors that the uncertainty of the rig causes.
-        explained: Root mean square of the errors that noise and rig cause together.
-        beyond: Square root of rms^2 - explained^2; 0 if the difference is negative.
+        noise: Expected root mean square of the errors that the noise of the charges causes.
+        rig: Expected root mean square of the errors that the uncertainty of the rig causes.
+        explained: Expected root mean square of the errors that noise and rig cause together.
+        beyond: Square root of rms^2 - explained^2, which is the part that noise and rig do not explain; 0 if this
+            difference is negative.
     """
 
     presses: int
@@ -255,12 +266,12 @@ class ErrorSummary:
 
     @classmethod
     def of(cls, absolute_error: Array, noise_variance: Array, rig_variance: Array) -> "ErrorSummary | None":
-        """Summarise errors, and compare their mean square with the variances that noise and rig cause.
+        """Summarise errors, and compare the mean square error with the variances that noise and rig cause.
 
         Args:
-            absolute_error: Absolute errors, shape (n,).
-            noise_variance: Variances that noise of the charges causes, shape (n,).
-            rig_variance: Variances that the uncertainty of the rig causes, shape (n,).
+            absolute_error: Absolute error of each press, shape (n,).
+            noise_variance: Variance of the error of each press that the noise of the charges causes, shape (n,).
+            rig_variance: Variance of the error of each press that the uncertainty of the rig causes, shape (n,).
 
         Returns:
             The summary; None if there are no presses.
@@ -286,12 +297,13 @@ class ErrorSummary:
 
 @dataclass(frozen=True)
 class CommonError:
-    """Error that all presses have in common. It is estimated by a weighted mean.
+    """Estimate of an error that is common to all presses, such as a shift of all positions.
 
     Attributes:
-        mean: Weighted mean, mm, or relative to the force; NaN if no error is known.
-        std: Standard error of the mean. It is increased if the errors scatter more than noise and rig explain.
-        significance: Mean divided by a standard error that allows for a constant error of the rig.
+        mean: Weighted mean of the errors, mm, or relative to the force; NaN if no error is known.
+        std: Standard error of the mean. It is larger if the errors scatter more than noise and rig explain.
+        significance: Mean divided by a standard error that includes a constant error of the rig; 0 if no error is
+            known.
     """
 
     mean: float
@@ -300,16 +312,13 @@ class CommonError:
 
     @classmethod
     def of(cls, error: Array, variance: Array) -> "CommonError":
-        """Estimate the error that all presses have in common.
+        """Estimate the error that is common to all presses.
 
-        The estimate is the mean weighted with the inverse variances.
+        The estimate is the mean of the errors, weighted with the inverse of their expected variances.
 
         Args:
-            error: Errors, shape (n,); NaN where unknown.
-            variance: Expected variances of the errors, shape (n,); NaN where unknown.
-
-        Returns:
-            The mean, its standard error, and its significance with regard to a constant error of the rig.
+            error: Error of each press, shape (n,); NaN where unknown.
+            variance: Expected variance of each error, shape (n,); NaN where unknown.
         """
         is_known = ~np.isnan(error)
         count = int(np.count_nonzero(is_known))
@@ -321,23 +330,24 @@ class CommonError:
         mean = float(weight @ known_error) / total_weight
         mean_variance = 1.0 / total_weight
 
-        # If the errors scatter more than their variances state, the standard error of the mean is larger, too.
+        # If the errors scatter more than their expected variances, the standard error of the mean is increased.
         chi_squared = float(weight @ (known_error - mean) ** 2)
         chi_squared_per_degree = chi_squared / max(count - 1, 1)
         std = math.sqrt(mean_variance * max(chi_squared_per_degree, 1.0))
-        # The significance also allows for a constant error of the rig, which is COMMON_RATIO times the standard
-        # deviation of a single press. A mean over many presses does not make this error smaller.
+
+        # For the significance, the variance of the mean includes a constant error of the rig, whose standard deviation
+        # is `COMMON_RATIO` times the standard deviation of a single press. Averaging does not reduce this error.
         std_with_rig = math.sqrt(mean_variance * (1.0 + COMMON_RATIO**2 * count))
         return cls(mean, std, significance=mean / std_with_rig)
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Statistical tests whether noise and rig explain the errors of some presses.
+    """Results of two statistical tests whether noise and rig explain the errors of the selected presses.
 
     Attributes:
-        chi_squared: Sum of the squared errors relative to their expected variances.
-        degrees: Number of known errors, which is the number of degrees of freedom.
+        chi_squared: Sum of the squared errors divided by their expected variances.
+        degrees: Number of known errors, which is the number of degrees of freedom of the sum.
         p_value: Probability that noise and rig alone cause a larger sum; NaN without presses.
         shift_x: Common error of x, mm.
         shift_y: Common error of y, mm.
@@ -354,20 +364,20 @@ class Agreement:
     common_p_value: float
 
     @classmethod
-    def of(cls, errors: PressErrors, rows: Booleans) -> "Agreement":
+    def of(cls, errors: PressErrors, is_selected: Booleans) -> "Agreement":
         """Test whether noise and rig explain the errors of the selected presses.
 
-        The first test uses the sum of all squared errors relative to their expected variances. The second test uses the
-        mean errors of x, y and the force, which all presses have in common. Both sums have a chi-squared distribution
-        if noise and rig explain the errors.
+        The statistic of the first test is the sum of all squared errors divided by their expected variances. The
+        statistic of the second test is the sum of the squared significances of the common errors of x, y and the force.
+        Both statistics have a chi-squared distribution if noise and rig explain the errors.
 
         Args:
-            errors: Errors of all presses, NaN where a measured value is unknown.
-            rows: Which presses are selected, shape (n,).
+            errors: Errors of all presses; NaN where a measured value is unknown.
+            is_selected: Whether each press is selected, shape (n,).
         """
-        error = errors.error[rows]
-        variance = errors.variance[rows]
-        chi_squared = float(np.nansum(errors.squared_ratio[rows]))
+        error = errors.error[is_selected]
+        variance = errors.variance[is_selected]
+        chi_squared = float(np.nansum(errors.squared_ratio[is_selected]))
         degrees = int(np.count_nonzero(~np.isnan(error)))
         shift_x = CommonError.of(error[:, X], variance[:, X])
         shift_y = CommonError.of(error[:, Y], variance[:, Y])
@@ -388,9 +398,10 @@ class Agreement:
     def acceptable(self) -> bool:
         """Whether noise and rig explain the errors.
 
-        The probability that good presses fail one of the two tests is at most `SIGNIFICANCE`, so each test has half of
-        it. The expected variances are not known exactly, and with many presses a small error of them is significant.
-        The scatter is therefore also accepted if its chi-squared sum is little larger than `degrees`, the expected sum.
+        Each of the two tests rejects good presses with half of the probability `SIGNIFICANCE`. The probability that one
+        of the tests rejects good presses is therefore at most `SIGNIFICANCE`. The expected variances are not known
+        exactly, and for many presses even a small error of these variances would be significant. The scatter is
+        therefore also accepted if `chi_squared` exceeds its expected value `degrees` by only a few percent.
         """
         max_p_value = 0.5 * SIGNIFICANCE
         max_accepted_chi_squared = MAX_ACCEPTED_CHI_SQUARED * self.degrees
@@ -400,7 +411,12 @@ class Agreement:
 
 
 def _p_value(chi_squared: float, degrees: int) -> float:
-    """Return the probability that a chi-squared variable exceeds a value; NaN without degrees of freedom."""
+    """Return the probability that a chi-squared variable exceeds a value; NaN without degrees of freedom.
+
+    Args:
+        chi_squared: The value, not negative.
+        degrees: Degrees of freedom of the variable, 0 or more.
+    """
     return chi_squared_survival(chi_squared, degrees) if degrees else math.nan
 
 
@@ -410,8 +426,8 @@ def chi_squared_survival(statistic: float, degrees: int) -> float:
     The probability is computed as a finite sum (Abramowitz and Stegun 1964, 26.4.4 and 26.4.5).
 
     Args:
-        statistic: Sum of squares, not negative. The probability is 0 for an infinite sum.
-        degrees: Degrees of freedom, 1 or more.
+        statistic: The value, not negative. If it is infinite, the probability is 0.
+        degrees: Degrees of freedom of the variable, 1 or more.
     """
     x = 0.5 * statistic
     if x == 0.0:
@@ -428,7 +444,7 @@ def chi_squared_survival(statistic: float, degrees: int) -> float:
     if is_odd:
         smallest_log_term += 0.5 * math.log(4.0 * x / math.pi)
 
-    # Each term is the previous term times x / s. Logarithms are added, because the factors overflow.
+    # Each term is the previous term times x / s. Logarithms are added, because products of the factors may overflow.
     term_count = degrees // 2
     s = smallest_s + np.arange(1, term_count)
     log_ratio_to_smallest = np.concatenate([[0.0], np.cumsum(np.log(x / s))])

@@ -1,8 +1,8 @@
 """Reading of charges from a file, and writing of contacts as CSV or as prediction records.
 
-The header of the file contains the names of the electrodes in any order, and may have further columns. Each row
-contains touch charges in pC. No tare is subtracted. If the charges of a row do not exceed the noise, the row has no
-contact.
+The header of a file of charges contains the names of the electrodes in any order, and may contain names of other
+columns. Each row contains touch charges in pC. No tare is subtracted from the charges. If the charges of a row do not
+exceed the noise, no contact is reported for the row.
 """
 
 import csv
@@ -24,7 +24,7 @@ from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import NO_CONTACT, PredictionRecord
 
 BLOCK_ROWS = 4096
-"""Number of rows that are converted at a time. It limits the memory."""
+"""Number of rows that are converted at the same time, which limits the memory."""
 
 MAX_CHARGE_ROWS = 10_000_000
 """Largest number of rows of a file of charges."""
@@ -36,13 +36,13 @@ def read_charges(
     where: str,
     warn: Callable[[str], None] = lambda _: None,
 ) -> Array:
-    """Read a CSV text of charges.
+    """Read the charges from the lines of a CSV text.
 
     Args:
         lines: Lines of the text. Lines may end in CRLF. Blank lines and lines that begin with # are ignored.
-        electrodes: Names of the columns that are read. The text may have more columns.
-        where: Name of the file, for messages.
-        warn: Function that is called with a sentence if columns are ignored.
+        electrodes: Names of the columns that are read. The text may contain other columns.
+        where: Name of the file, for error messages.
+        warn: Function that is called with a warning in words if the text contains other columns.
 
     Returns:
         Charges in the order of `electrodes`, shape (n, electrodes), pC.
@@ -56,12 +56,12 @@ def read_charges(
 
 
 def read_charge_file(path: Path, electrodes: tuple[str, ...], warn: Callable[[str], None] = lambda _: None) -> Array:
-    """Read a file of charges.
+    """Read the charges from a CSV or Parquet file.
 
     Args:
         path: The file. It is read as Parquet if its name ends in `.parquet`, and as CSV otherwise.
-        electrodes: Names of the columns that are read. The file may have more columns.
-        warn: Function that is called with a sentence if columns are ignored.
+        electrodes: Names of the columns that are read. The file may contain other columns.
+        warn: Function that is called with a warning in words if the file contains other columns.
 
     Returns:
         Charges in the order of `electrodes`, shape (n, electrodes), pC.
@@ -76,19 +76,22 @@ def read_charge_file(path: Path, electrodes: tuple[str, ...], warn: Callable[[st
 
 
 def _expected_header(electrodes: tuple[str, ...]) -> str:
-    """Return a description of the expected header, for error messages."""
+    """Return a description of the header that a file of charges must have, for error messages."""
     return f"a header with one column for each of the electrodes {electrodes} and charges in pC"
 
 
 def _charges(table: NumberTable, electrodes: tuple[str, ...], warn: Callable[[str], None]) -> Array:
-    """Read the charges of a table, and return them in the order of the electrodes, shape (n, electrodes), pC.
+    """Read the charges of all electrodes from an open table.
 
     Args:
-        table: The table, whose columns have the names of the electrodes.
+        table: The table. Its header must contain the names of the electrodes.
         electrodes: Names of the electrodes.
-        warn: Function that is called with a message about columns that are ignored.
+        warn: Function that is called with a warning in words if the table contains other columns.
+
+    Returns:
+        Charges in the order of `electrodes`, shape (n, electrodes), pC.
     """
-    charge_rule = replace(CHARGE_RULE, may_be_empty=False)
+    charge_rule = replace(CHARGE_RULE, may_be_empty=False)  # a model needs the charges of all electrodes
     column_rules = table.choose_columns(dict.fromkeys(electrodes, charge_rule))  # the same rule for each electrode
     ignored_names = [name for name in table.header if name not in electrodes]
     if ignored_names:
@@ -102,14 +105,15 @@ def write_contacts(
 ) -> None:
     """Write contacts as CSV with one row for each press.
 
-    The columns are the attributes of `Contact` up to the misfit. Numbers have six decimals.
+    The columns are the attributes of `Contact` without the correlations. Numbers have six decimals.
 
     Args:
         contacts: The contacts of n presses.
         out: Text file to which the rows are written.
-        validity: Domain of the model. If given, a column `flags` is added, with the flags separated by blanks.
-        charge_pC: The charges of the presses, shape (n, electrodes), pC. If given together with `validity`, a row
-            whose charges do not exceed the noise has a force of 0, and its other cells are empty.
+        validity: Domain of the model. If it is given, a column `flags` is added, in which the flags of a press are
+            separated by blanks.
+        charge_pC: Charges of the presses, shape (n, electrodes), pC. If the charges and `validity` are given, a press
+            whose charges do not exceed the noise has the force 0, and its other cells are empty.
     """
     is_touch = np.ones(len(contacts.x_mm), dtype=bool)
     if validity is not None and charge_pC is not None:
@@ -120,7 +124,7 @@ def write_contacts(
     header = names if validity is None else (*names, "flags")
     writer.writerow(header)
 
-    # The rows are converted in blocks, so that the texts of a large table need not be in memory at once.
+    # The rows are converted in blocks, so that the texts of a large table are not all in memory at the same time.
     rows = np.column_stack(contacts)
     for start in range(0, len(rows), BLOCK_ROWS):
         block = slice(start, start + BLOCK_ROWS)
@@ -128,23 +132,26 @@ def write_contacts(
 
 
 def _contact_rows(contact_values: Singles, is_touch: Booleans, validity: Validity | None) -> Iterator[tuple[str, ...]]:
-    """Yield the cells of a CSV row for each press. Without a touch, the force is 0 and the other cells are empty.
+    """Yield the cells of a CSV row for each press.
+
+    If a press is not a touch, its force is 0, and its other cells are empty.
 
     Args:
-        contact_values: Values of a `Contact` for each press, shape (n, 10). The correlations are not written.
-        is_touch: Whether something touches in each press, shape (n,).
-        validity: Domain of the model. If given, the last cell contains the flags, which are separated by blanks.
+        contact_values: Values of the attributes of `Contact` for each press, shape (n, 10). The correlations are not
+            written.
+        is_touch: Whether each press is a touch, shape (n,).
+        validity: Domain of the model. If it is given, the last cell contains the flags, separated by blanks.
     """
     names = Contacts._fields[:N_WITHOUT_CORRELATION]
-    no_contact = tuple("0.000000" if name == "force_N" else "" for name in names)
-    values_of_press = contact_values[:, :N_WITHOUT_CORRELATION].tolist()
-    flags_of_press: list[tuple[str, ...]] = [()] * len(contact_values)
+    cells_without_contact = tuple("0.000000" if name == "force_N" else "" for name in names)
+    values_of_presses = contact_values[:, :N_WITHOUT_CORRELATION].tolist()
+    flags_of_presses: list[tuple[str, ...]] = [()] * len(contact_values)
     if validity is not None:
-        flags_of_press = validity.batch_flags(Contacts(*contact_values.T))
-    for values, is_touched, flags in zip(values_of_press, is_touch.tolist(), flags_of_press, strict=True):
-        cells = no_contact
+        flags_of_presses = validity.batch_flags(Contacts(*contact_values.T))
+    for values, has_contact, flags in zip(values_of_presses, is_touch.tolist(), flags_of_presses, strict=True):
+        cells = cells_without_contact
         flag_text = ""
-        if is_touched:
+        if has_contact:
             cells = tuple(f"{value:.6f}" for value in values)
             flag_text = " ".join(flags)
         if validity is not None:
@@ -153,20 +160,24 @@ def _contact_rows(contact_values: Singles, is_touch: Booleans, validity: Validit
 
 
 def blocks(rows: Array) -> Iterator[Array]:
-    """Yield blocks of `BLOCK_ROWS` rows.
+    """Yield successive blocks of `BLOCK_ROWS` rows of an array. The last block may have fewer rows.
 
-    The blocks limit the memory, because rows that are converted to Python numbers need five times as much memory as an
-    array.
+    The caller converts only one block at a time to Python numbers, because Python numbers need five times as much
+    memory as an array.
+
+    Args:
+        rows: Array of shape (n, ...).
     """
     for start in range(0, len(rows), BLOCK_ROWS):
         yield rows[start : start + BLOCK_ROWS]
 
 
 def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
-    """Yield a record for each row of charges.
+    """Yield a prediction record for each row of charges.
 
-    A table has no times, counters and raw charges, so these fields are None. If the charges of a row do not exceed the
-    noise of the model, nothing touches the film. The record of such a row has a force of 0 and no position.
+    A table contains no times, no counters and no raw charges. The fields of the records for times, counters and raw
+    charges are therefore None. If the charges of a row do not exceed the noise of the model, the record has the force 0
+    and no position.
 
     Args:
         charge_pC: Charges, shape (n, electrodes), pC.
@@ -178,13 +189,13 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
     metadata = predictor.metadata
     for block in blocks(charge_pC):
         contacts = predictor.predict_batch(block)
-        flags = predictor.validity.batch_flags(contacts)
-        block_is_touch = predictor.validity.is_touch(block)
+        flags_of_rows = predictor.validity.batch_flags(contacts)
+        is_touch_of_rows = predictor.validity.is_touch(block)
         for row, charges in enumerate(block.tolist()):
-            is_touch = bool(block_is_touch[row])
+            is_touch = bool(is_touch_of_rows[row])
             contact_fields = NO_CONTACT
             if is_touch:
-                # `contacts` has one column for each attribute of a contact.
+                # `contacts` contains one array over the rows for each attribute of `Contact`.
                 contact = Contact(*(float(column[row]) for column in contacts))
                 contact_fields = contact.fields()
             yield PredictionRecord(
@@ -196,7 +207,7 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
                 charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
                 charge_raw_pC=None,
                 tare_pC=None,
-                flags=flags[row] if is_touch else (),
+                flags=flags_of_rows[row] if is_touch else (),
                 latency_us=None,
                 model=metadata.label,
                 frame_id=metadata.frame_id,

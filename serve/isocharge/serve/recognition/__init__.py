@@ -1,8 +1,8 @@
-"""Recognition of the format of a board from its bytes alone.
+"""Recognition of the format in which a board sends frames, from the received bytes alone.
 
-The format comprises framing, checksum, fields, columns, counter and clock.
+The format consists of the framing, the checksum, and the meanings of the fields or columns.
 
-The result is a table for the section `[frames]` of a device file. Nothing about the board is known in advance. If
-several descriptions fit, the description with the smallest score is chosen. The score is the number of bits that a
-description needs to encode the bytes.
+The result is a table for the section `[frames]` of a device file. No information about the board is needed. If several
+descriptions of the format fit the bytes, the description with the lowest score is chosen. The score is the number of
+bits that are needed to encode the bytes with the help of a description.
 """

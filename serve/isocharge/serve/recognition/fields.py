@@ -1,10 +1,10 @@
 """Recognition of the fields of a frame: sync bytes, frame counter, clock and channels.
 
-Every division of the bytes into fields has a score in bits. The score is the sum of two numbers: the bits that are
-needed to encode the values of a frame after the previous frame, and the `Weights` of the fields. The division with the
-lowest score is chosen. With these weights, simple divisions have lower scores than complicated ones. For example, a
-division is simple if its channels are adjacent and have the same type.
-`tests/benchmarks/fit_recognition.py` fits the weights on random boards.
+Every division of the bytes of a frame into fields has a score in bits. The score is the sum of two numbers. The first
+number is the number of bits that are needed to encode the values of a frame if the previous frame is known. The second
+number is the sum of the `Weights` of the fields. The division with the lowest score is chosen. Because of the weights,
+simple divisions have lower scores than complicated divisions. For example, a division is simple if all channels are
+adjacent and have the same type. The script `tests/benchmarks/fit_recognition.py` fits the weights to random boards.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,19 +19,22 @@ from isocharge.serve.frames.frame_field import ByteOrder
 from isocharge.serve.recognition.framing import Bytes, usual_bytes
 
 COUNTING_SHARE = 0.9
-"""Smallest share of regular steps of a counter or a clock. Frames may be lost, and counters may restart."""
+"""Smallest share of the steps of a counter or clock that must be regular.
+
+The share is less than 1, because frames may be lost and counters may restart.
+"""
 
 STEADY_SPREAD = 0.7
 """Largest deviation of a regular step of a clock from the median step, relative to the median step."""
 
 CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
-    rate_Hz: ("t_us", 1e6 / rate_Hz)
-    for rate_Hz in (100.0, 1e4, 1e5, 1024.0, 32768.0, 31250.0, 500e3, 2e6, 4e6, 8e6, 16e6)
+    tick_rate_Hz: ("t_us", 1e6 / tick_rate_Hz)
+    for tick_rate_Hz in (100.0, 1e4, 1e5, 1024.0, 32768.0, 31250.0, 500e3, 2e6, 4e6, 8e6, 16e6)
 }
 """Name of the field, and value of one tick in the unit of that name, by the tick rate of a clock, Hz."""
 
 CLOCK_RATE_TOLERANCE = 0.06
-"""Largest relative deviation of a tick rate from a common tick rate. It is large, because frames arrive in bursts."""
+"""Largest relative deviation of a tick rate from a usual tick rate. It is large, because frames arrive in bursts."""
 
 PLAUSIBLE_MAGNITUDES = (1e-7, 1e8)
 """Smallest and largest typical magnitude of a floating-point channel."""
@@ -40,42 +43,44 @@ TYPES = ("u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "f32", "f64")
 """Types of numbers, as in device files."""
 
 
-def steady_step(step: Array) -> float:
+def steady_step(steps: Array) -> float:
     """Return the mean of the regular steps of a counter or clock; 0 if too few steps are regular.
 
-    A step is regular if it is close to the median step. Lost frames cause other steps.
+    A step is regular if it is close to the median step. For example, a step across a lost frame is not regular.
 
     Args:
-        step: Differences of the values of consecutive frames, shape (n,).
+        steps: Differences of the values of consecutive frames, shape (n,).
     """
-    median_step = np.median(step)
-    is_regular = np.abs(step - median_step) <= STEADY_SPREAD * median_step
-    regular_steps = step[is_regular]
-    if len(regular_steps) < COUNTING_SHARE * len(step):
+    median_step = np.median(steps)
+    is_regular = np.abs(steps - median_step) <= STEADY_SPREAD * median_step
+    regular_steps = steps[is_regular]
+    if len(regular_steps) < COUNTING_SHARE * len(steps):
         return 0.0
     return float(regular_steps.mean())
 
 
-def clock_of(step: Array, rate_Hz: float) -> tuple[str, float] | None:
-    """Return the name of a clock field, such as `t_us`, and the duration of one tick in the unit of the name, here us.
+def clock_of(steps: Array, frame_rate_Hz: float) -> tuple[str, float] | None:
+    """Identify a clock by its tick rate, which must be close to one of the usual tick rates of boards.
 
     Args:
-        step: Differences of the values of consecutive frames, shape (n,).
-        rate_Hz: Number of frames per second, Hz.
+        steps: Differences of the values of consecutive frames, shape (n,).
+        frame_rate_Hz: Number of frames per second, Hz.
 
     Returns:
-        The name and the duration of a tick; None if the values do not come from a clock.
+        The name of the field, which is `t_s`, `t_ms` or `t_us`, and the duration of one tick in the unit of this name.
+        None if the values are probably not those of a clock.
     """
-    tick_rate_Hz = steady_step(step) * rate_Hz
-    for common_rate_Hz, clock in CLOCKS.items():
-        if abs(tick_rate_Hz / common_rate_Hz - 1.0) < CLOCK_RATE_TOLERANCE:
-            return clock
+    ticks_per_frame = steady_step(steps)
+    tick_rate_Hz = ticks_per_frame * frame_rate_Hz
+    for usual_tick_rate_Hz, name_and_tick_duration in CLOCKS.items():
+        if abs(tick_rate_Hz / usual_tick_rate_Hz - 1.0) < CLOCK_RATE_TOLERANCE:
+            return name_and_tick_duration
     return None
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Contributions of the parts of a frame to the score, bits.
+    """Contributions of the parts of a frame to the score of a division, in bits.
 
     Attributes:
         row: Contribution of a row of adjacent channels of one type.
@@ -99,11 +104,11 @@ class Part(NamedTuple):
         role: Meaning of the part.
         kind: Type of the number, as in device files.
         size: Number of bytes.
-        score: Contribution to the score without that of a new row, bits.
+        score: Contribution to the score, without the contribution of a row that the part begins, bits.
         is_constant: Whether the part is a channel with a constant value. Such a channel does not begin a row.
         name: Name of the field in a device file; empty for channels.
         scale: Value of one tick of a clock, in the unit of its name.
-        row: Type that the channels of a row have in common; empty for other parts.
+        row: Type that the channels of a row have in common; empty for a part that is not a channel.
     """
 
     role: Literal["pad", "seq", "clock", "channel"]
@@ -117,23 +122,27 @@ class Part(NamedTuple):
 
 
 @np.errstate(all="ignore")
-def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) -> list[list[Part]]:
-    """Return the possible parts that begin at each byte of a frame.
+def parts_of(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights: Weights) -> list[list[Part]]:
+    """List the parts of a frame that may begin at each byte.
 
-    For each byte, the first entry is a part of one byte without a meaning. The other entries are numbers of the types
-    `TYPES` that may begin at this byte. A number may continue in the next frame, because the first byte of the frames
-    is not known yet.
+    For each byte, the first entry is padding, which is a single byte without a meaning. The other entries are numbers
+    of the types `TYPES` that may begin at this byte. A number may extend into the second frame of a row, because it is
+    not yet known at which byte the frames begin.
 
     Args:
-        rows: Bytes of the frames, each followed by the next frame, shape (n, 2 * length). The frames may begin at any
-            position.
+        rows: Bytes of each frame and of the next frame, shape (n, 2 * length). The frames may begin at any position of
+            a row.
         order: Byte order of the numbers.
-        rate_Hz: Number of frames per second, Hz, from which the tick rate of a clock follows.
+        frame_rate_Hz: Number of frames per second, Hz, from which the tick rate of a clock follows.
         weights: Contributions to the score.
+
+    Returns:
+        For each of the `length` bytes, a list of parts.
     """
     usual, is_constant = usual_bytes(rows)
     is_zero = is_constant & (usual == 0)
-    length = rows.shape[1] // 2  # a row has the bytes of two frames
+    row_length = rows.shape[1]
+    length = row_length // 2  # a row has the bytes of two frames
     byte_step = 1 if order == "little" else -1  # reverses big-endian numbers, so that the lowest byte comes first
     parts_at: list[list[Part]] = []
     for position in range(length):
@@ -141,32 +150,33 @@ def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) ->
         parts = [Part("pad", "pad", 1, pad_score)]
         for kind in TYPES:  # such as "u16": the number is the size in bits
             size = int(kind[1:]) // 8  # in bytes
-            span = slice(position, position + size)
-            if span.stop <= 2 * length:
-                number_bytes = rows[:, span][:, ::byte_step]
-                number_is_constant = is_constant[span][::byte_step]
-                number_is_zero = is_zero[span][::byte_step]
-                parts += _number_parts(number_bytes, number_is_constant, number_is_zero, kind, rate_Hz, weights)
+            end = position + size
+            if end <= row_length:
+                number_bytes = rows[:, position:end][:, ::byte_step]
+                byte_is_constant = is_constant[position:end][::byte_step]
+                byte_is_zero = is_zero[position:end][::byte_step]
+                parts += _number_parts(number_bytes, byte_is_constant, byte_is_zero, kind, frame_rate_Hz, weights)
         parts_at.append(parts)
     return parts_at
 
 
 def _number_parts(
-    number_bytes: Bytes, is_constant: Booleans, is_zero: Booleans, kind: str, rate_Hz: float, weights: Weights
+    number_bytes: Bytes, is_constant: Booleans, is_zero: Booleans, kind: str, frame_rate_Hz: float, weights: Weights
 ) -> Iterator[Part]:
-    """Yield the possible meanings of bytes that are read as a number of one type.
+    """Yield the parts of a frame that some bytes may be if they contain a number of a given type.
 
-    The meanings are frame counter or clock, and channel.
+    Every number may be a channel. A number may also be the frame counter or a clock if its steps are regular. Nothing
+    is yielded for floating-point numbers that are implausibly small or large.
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
         is_constant: Whether each byte is constant, shape (size,).
         is_zero: Whether each byte is always 0, shape (size,).
-        kind: Type of the number.
-        rate_Hz: Number of frames per second, Hz.
+        kind: Type of the number, such as "u16", "i16" or "f32".
+        frame_rate_Hz: Number of frames per second, Hz.
         weights: Contributions to the score.
     """
-    size = len(is_constant)
+    size = len(is_constant)  # bytes
     if is_constant.all():
         yield Part("channel", kind, size, weights.constant, is_constant=True, row=kind)
         return
@@ -174,62 +184,70 @@ def _number_parts(
     is_unsigned = kind[0] == "u"
     is_signed = kind[0] == "i"
     values = _values(number_bytes, kind)
-    step = np.diff(values)
-    counter_step = step
+    steps = np.diff(values)
+    counter_steps = steps
     magnitude = float(np.median(np.abs(values)))
     unit = 1.0  # smallest step that the number can represent
     if is_float:
         min_magnitude, max_magnitude = PLAUSIBLE_MAGNITUDES
         if not min_magnitude < magnitude < max_magnitude:
             return
-        zero_byte_count = np.argmin(is_zero)  # low bytes that are always 0 carry no digits
+        # The share `weights.fraction` of the bytes contains digits. Low bytes that are always 0 contain no digits.
+        zero_byte_count = np.argmin(is_zero)
         unit = magnitude * 256.0 ** (zero_byte_count - weights.fraction * size)
     if is_unsigned:
         half_range = 1 << (8 * size - 1)
-        counter_step = (step + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
-        magnitude = float(np.median(np.abs(values - half_range)))
+        counter_steps = (steps + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
+        magnitude = float(np.median(np.abs(values - half_range)))  # distance from the middle of the range
 
+    # A counter is an unsigned integer of 1, 2 or 4 bytes. A clock is unsigned or floating-point, with 2, 4 or 8 bytes.
     can_be_counter = is_unsigned and size != 3
     can_be_clock = not is_signed and size not in (1, 3)
-    if can_be_counter and steady_step(counter_step) == 1.0:
+    if can_be_counter and steady_step(counter_steps) == 1.0:
         yield Part("seq", kind, size, 0.0, name="seq")
     elif can_be_clock:
-        clock = clock_of(counter_step, rate_Hz)
+        clock = clock_of(counter_steps, frame_rate_Hz)
         if clock is not None:
-            name, scale = clock
-            clock_score = _bits(counter_step - np.median(counter_step), unit, size)
-            yield Part("clock", kind, size, clock_score, name=name, scale=scale)
-    channel_score = weights.channel + _bits(np.append(step, magnitude), unit, size)
+            name, tick_duration = clock
+            clock_score = _bits(counter_steps - np.median(counter_steps), unit, size)
+            yield Part("clock", kind, size, clock_score, name=name, scale=tick_duration)
+
+    # The magnitude is counted as one more step. The score of a type is therefore lower if the values in this type are
+    # close to 0 or, for an unsigned type, close to the middle of its range.
+    channel_score = weights.channel + _bits(np.append(steps, magnitude), unit, size)
     yield Part("channel", kind, size, channel_score, row=kind)
 
 
 def split_frame(
-    parts_at: Sequence[Sequence[Part]], syncs: Iterable[int], weights: Weights
+    parts_at: Sequence[Sequence[Part]], sync_lengths: Iterable[int], weights: Weights
 ) -> tuple[float, int, tuple[Part, ...]]:
-    """Divide a frame into the parts with the lowest sum of scores.
+    """Divide a frame into parts such that the sum of the scores of the parts is as low as possible.
 
     The division is found by dynamic programming, from the last byte to the first.
 
     Args:
-        parts_at: Possible parts that begin at each byte before the checksum.
-        syncs: Possible lengths of the sync, bytes. The shortest one with the lowest score is chosen.
+        parts_at: Parts that may begin at each byte before the checksum.
+        sync_lengths: Possible lengths of the sync pattern, bytes. If several lengths have the lowest score, the
+            shortest of them is chosen.
         weights: Contributions to the score.
 
     Returns:
-        The score in bits, the length of the sync in bytes, and the parts after the sync.
+        The score in bits, the length of the sync pattern in bytes, and the parts after the sync pattern.
     """
 
     @cache
     def best_division(position: int, row: str) -> tuple[float, tuple[Part, ...]]:
-        """Find the best division of the bytes from a position to the end, and return its score and its parts.
+        """Find the division with the lowest score for the bytes from a position to the end.
 
-        The best division has the lowest score. The score is infinite if no division ends exactly at the last byte. A
-        row of channels does not begin with a part that is constant.
+        Adjacent channels of one type form a row. A channel that begins a row adds `weights.row` to the score. A channel
+        with a constant value cannot begin a row.
 
         Args:
             position: Position of the first byte.
-            row: Type of the channel before this byte; empty if the part before it is no channel. A channel of the same
-                type continues a row of channels; any other channel begins a row, which adds to the score.
+            row: Type of the channel that ends just before this byte; empty if no channel ends there.
+
+        Returns:
+            The score and the parts of the division. The score is infinite if no division ends exactly at the last byte.
         """
         if position == len(parts_at):
             return 0.0, ()
@@ -251,45 +269,54 @@ def split_frame(
                 best_parts = (part, *rest_parts)
         return best_score, best_parts
 
-    scored_syncs = []
-    for sync_length in syncs:
+    scored_sync_lengths = []
+    for sync_length in sync_lengths:
         score, _ = best_division(sync_length, "")
         if sync_length == 1:  # a sync of a single byte is rare
             score += weights.constant
-        scored_syncs.append((score, sync_length))
-    lowest_score, best_sync_length = min(scored_syncs)
+        scored_sync_lengths.append((score, sync_length))
+    lowest_score, best_sync_length = min(scored_sync_lengths)
     _, best_parts = best_division(best_sync_length, "")
     return lowest_score, best_sync_length, best_parts
 
 
 def _values(number_bytes: Bytes, kind: str) -> Array:
-    """Return the values of a number in all frames, shape (n,).
+    """Decode one number in all frames, and return its values, shape (n,).
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
         kind: Type of the number: "f" for floating-point, "u" for unsigned or "i" for signed, and the size in bits.
     """
     size = number_bytes.shape[1]
-    if kind[0] == "f":
-        return np.ascontiguousarray(number_bytes).view(f"<f{size}")[:, 0].astype(float)
+    is_float = kind[0] == "f"
+    is_unsigned = kind[0] == "u"
+    if is_float:
+        little_endian_type = f"<f{size}"
+        floats = np.ascontiguousarray(number_bytes).view(little_endian_type)  # shape (n, 1)
+        return floats[:, 0].astype(float)
+
     byte_weights = 256.0 ** np.arange(size)
     unsigned: Array = number_bytes @ byte_weights
-    if kind[0] == "u":
+    if is_unsigned:
         return unsigned
+
+    # In two's complement, the upper half of the unsigned values stands for the negative values.
     value_count = 256.0**size
-    is_negative = unsigned >= value_count / 2  # two's complement
+    is_negative = unsigned >= value_count / 2
     signed: Array = unsigned - value_count * is_negative
     return signed
 
 
-def _bits(step: Array, unit: float, size: int) -> float:
-    """Return the mean number of bits that encode a step of a number, at most the size of the number.
+def _bits(steps: Array, unit: float, size: int) -> float:
+    """Return the mean number of bits that are needed to encode one step of a number.
+
+    The number of bits of each step is limited to the number of bits of the number itself.
 
     Args:
-        step: Differences of the values of consecutive frames, shape (n,).
+        steps: Differences of the values of consecutive frames, shape (n,).
         unit: Smallest step that the number can represent.
         size: Size of the number, bytes.
     """
-    step_bits = np.log2(1.0 + np.abs(step) / unit)
+    step_bits = np.log2(1.0 + np.abs(steps) / unit)
     limited_bits = np.fmin(step_bits, 8 * size)  # also replaces NaN by the size
     return float(limited_bits.mean())

@@ -1,18 +1,19 @@
-"""Recognition of the framing: the beginning and the length of frames, and their checksum.
+"""Recognition of where the frames in a stream begin, how long they are, and which checksum they have.
 
-A stream with byte stuffing is split at its delimiter. In other streams, some bytes are the same in every frame. Such
-bytes therefore repeat after the length of a frame. The repetitions of each pair of bytes cover a part of the stream.
-The pair that covers the largest part is chosen. The position of this pair in the frame is determined later.
+A stream with byte stuffing is split at its delimiters. In a stream without byte stuffing, some bytes are usually the
+same in every frame. These bytes repeat at a distance of one frame length. For each pair of bytes, the frames that would
+begin at its repetitions cover a part of the stream. The pair of bytes that covers the largest part is chosen. The
+position of the chosen pair within a frame is determined later.
 
-Named checksums are tried with every possible first byte. For cyclic redundancy checks without a name, only the
-polynomials have to be tried. The initial value, the final value and all constant bytes contribute the same constant in
-all frames of one length.
+Checksums with a name are tried with every possible first byte. For cyclic redundancy checks without a name, only the
+polynomials have to be tried. The reason is that the initial value, the final value and all constant bytes change the
+check by the same constant in all frames of one length.
 """
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from itertools import chain, islice
+from itertools import chain
 from math import gcd
 from typing import Any, NamedTuple
 
@@ -39,13 +40,13 @@ MAX_EXAMINED_BYTES = 1 << 16
 """Largest number of bytes of a stream that are examined."""
 
 STUFFED_SHARE = 0.9
-"""Smallest share of the pieces between delimiters that must have one length, dimensionless."""
+"""Smallest share of the pieces between delimiters that must have the same length, dimensionless."""
 
 COVERED_SHARE = 0.4
 """Smallest share of a stream that frames of one length must cover, dimensionless."""
 
 SINGLE_BYTE_PENALTY = 0.05
-"""Share of a stream by which a single byte must cover more than a pair of bytes.
+"""Share of a stream by which a single byte must cover more than a pair of bytes, in order to be chosen.
 
 A pair of bytes rarely repeats by chance, but a single byte often does.
 """
@@ -54,11 +55,16 @@ MAX_FRAME_LENGTHS = 3
 """Number of frame lengths that are tried."""
 
 CONSTANT_SHARE = 0.98
-"""Smallest share of frames in which a constant byte has its value, because some frames may be damaged."""
+"""Smallest share of the frames that have the same byte at a position, if this byte counts as constant.
+
+The share is less than 1, because some frames may be damaged.
+"""
 
 
 class Windows(NamedTuple):
-    """Frames of one length in a stream.
+    """Frames of one length in a stream, each as a window of bytes.
+
+    A window has the length of a frame. All windows begin at the same byte of their frames, which need not be the first.
 
     Attributes:
         framing: Kind of framing, one of `isocharge.serve.frames.frame_layout.Framing`.
@@ -73,9 +79,10 @@ class Windows(NamedTuple):
     length: int
 
     def rows(self) -> Bytes:
-        """Return the bytes of each window and the same number of bytes after it, shape (frames, 2 * length).
+        """Return the bytes of each window and as many bytes after it, shape (frames, 2 * length).
 
-        The position at which a frame begins is unknown, but it is the same in every window.
+        The position at which a frame begins is unknown, but it is the same in every window. Windows near the end of the
+        stream are left out.
         """
         row_length = 2 * self.length
         starts = self.starts[self.starts + row_length <= len(self.stream)]
@@ -84,7 +91,7 @@ class Windows(NamedTuple):
 
 
 def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
-    """Return the most frequent byte at each position, and whether nearly all frames have this byte.
+    """Return the most frequent byte at each position of a frame, and whether nearly all frames have this byte there.
 
     Args:
         rows: Bytes of the frames, shape (n, length).
@@ -98,7 +105,7 @@ def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
 
 
 def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Windows]:
-    """Yield every possible division of a stream into frames, in the order of decreasing certainty.
+    """Yield all possible divisions of a stream into frames, beginning with the most certain division.
 
     Args:
         chunks: The bytes of the stream.
@@ -106,9 +113,11 @@ def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Window
     """
     data = b"".join(chunks)[:MAX_EXAMINED_BYTES]
     if are_datagrams:
-        common_divisor = gcd(*map(len, chunks))
-        for length in range(MIN_FRAME_BYTES, min(common_divisor, MAX_FRAME_BYTES) + 1):
-            if common_divisor % length == 0:
+        # The length of a frame divides the length of every datagram, so it divides their greatest common divisor.
+        greatest_divisor = gcd(*map(len, chunks))
+        max_length = min(greatest_divisor, MAX_FRAME_BYTES)
+        for length in range(MIN_FRAME_BYTES, max_length + 1):
+            if greatest_divisor % length == 0:
                 yield _adjacent_frames(DATAGRAM, data, length)
     for name, stuffing in STUFFINGS.items():
         yield from _stuffed_frames(name, stuffing, data)
@@ -116,23 +125,25 @@ def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Window
 
 
 def _adjacent_frames(framing: str, data: bytes, length: int) -> Windows:
-    """Return the windows of a stream that contains only whole frames of one length."""
-    return Windows(framing, np.frombuffer(data, np.uint8), np.arange(0, len(data), length), length)
+    """Return the division of a stream that consists of whole frames of one length."""
+    stream = np.frombuffer(data, np.uint8)
+    starts = np.arange(0, len(data), length)
+    return Windows(framing, stream, starts, length)
 
 
 def _stuffed_frames(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Windows]:
-    """Yield the division of a stream at the delimiters of a byte stuffing, if the pieces are frames of one length.
+    """Yield the division of a stream at the delimiters of a byte stuffing, if most pieces are frames of one length.
 
     Args:
-        name: Name of the stuffing.
-        stuffing: The stuffing.
+        name: Name of the byte stuffing.
+        stuffing: Delimiter and functions of the byte stuffing.
         data: Bytes of the stream.
     """
     whole_pieces = data.split(stuffing.delimiter)[1:-1]  # the first and the last piece may be incomplete
-    pieces = [piece for piece in whole_pieces if piece]
+    pieces = [piece for piece in whole_pieces if piece]  # two adjacent delimiters have an empty piece between them
     decoded_pieces = []
     for piece in pieces:
-        with suppress(ValueError):
+        with suppress(ValueError):  # for a piece that no encoder produces
             decoded_pieces.append(stuffing.decode(piece))
     length, count = _most_common_length(decoded_pieces)
     has_frame_length = MIN_FRAME_BYTES <= length <= MAX_FRAME_BYTES
@@ -148,18 +159,20 @@ def _stuffed_frames(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Wind
 
 
 def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
-    """Return the most frequent length of the pieces, and how often it occurs."""
+    """Return the most frequent length of the pieces, and the number of pieces with this length."""
     if not pieces:
         return 0, 0
     return Counter(map(len, pieces)).most_common(1)[0]
 
 
 def _synchronised_frames(stream: Bytes) -> Iterator[Windows]:
-    """Yield the divisions of a stream at bytes that repeat after the length of a frame.
+    """Yield divisions of a stream into frames that begin at a repeated byte or a repeated pair of bytes.
 
-    For each length, the pair of bytes or the single byte is chosen whose repetitions cover the largest share of the
-    stream. The lengths with the largest shares are yielded. If the shares are about equal, the shorter length comes
-    first.
+    A byte or a pair of bytes that is the same in every frame repeats at a distance of one frame length. The frames that
+    would begin at its repetitions cover a share of the stream. For each length of a frame, the pair or the single byte
+    that covers the largest share is chosen. The share of a single byte is reduced by a penalty, because single bytes
+    often repeat by chance. Only the `MAX_FRAME_LENGTHS` lengths with the largest shares are used. If the shares of two
+    lengths are about equal, the shorter length comes first.
 
     Args:
         stream: Bytes of the stream, shape (n,).
@@ -168,47 +181,51 @@ def _synchronised_frames(stream: Bytes) -> Iterator[Windows]:
     byte_pairs = 256 * single_bytes[:-1] + single_bytes[1:]
 
     # For each length of a frame, the largest share of the stream that is covered, and where its frames begin.
-    best_coverage: dict[int, float] = {}
+    best_share: dict[int, float] = {}
     best_starts: dict[int, NDArray[np.int64]] = {}
     for codes, penalty in ((byte_pairs, 0.0), (single_bytes, SINGLE_BYTE_PENALTY)):
         for length, starts in _frequent_distances(codes):
-            coverage = len(starts) * length / len(stream) - penalty
-            required_coverage = best_coverage.get(length, COVERED_SHARE - penalty)
-            if coverage > required_coverage:
-                best_coverage[length] = coverage
+            share = len(starts) * length / len(stream) - penalty
+            share_to_exceed = best_share.get(length, COVERED_SHARE - penalty)
+            if share > share_to_exceed:
+                best_share[length] = share
                 best_starts[length] = starts
 
-    def sorting_key(length: int) -> tuple[float, int]:
-        """Return a key that sorts by decreasing coverage in steps of 10 %, and then by increasing length."""
-        return -round(best_coverage[length], 1), length
+    def largest_share_first(length: int) -> tuple[float, int]:
+        """Return the key for sorting lengths by decreasing share, rounded to 10 %, and then by increasing length."""
+        return -round(best_share[length], 1), length
 
-    best_lengths = sorted(best_coverage, key=sorting_key)[:MAX_FRAME_LENGTHS]
+    best_lengths = sorted(best_share, key=largest_share_first)[:MAX_FRAME_LENGTHS]
     for length in best_lengths:
         yield Windows(SYNC, stream, best_starts[length], length)
 
 
 def _frequent_distances(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Yield the frequent distances from a code to its next occurrence, and the positions of the code.
+    """Yield each frequent distance between successive occurrences of a code, with the positions of these occurrences.
+
+    A distance is frequent if frames of this length at these positions would cover a large share of the stream. Only
+    distances that can be the length of a frame are yielded.
 
     Args:
         codes: Code at each position of the stream, shape (n,). A code is a byte, or a pair of bytes as a number.
     """
-    # A stable sort puts equal codes side by side, in the order of their positions.
+    # A stable sort puts the positions of equal codes side by side, in ascending order.
     sorted_positions = np.argsort(codes, kind="stable")
     all_positions = sorted_positions[:-1]
-    all_distances = np.diff(sorted_positions)
-    has_equal_code = np.diff(codes[sorted_positions]) == 0
-    has_frame_length = (all_distances >= MIN_FRAME_BYTES) & (all_distances <= MAX_FRAME_BYTES)
-    positions = all_positions[has_equal_code & has_frame_length]
-    distances = all_distances[has_equal_code & has_frame_length]
+    distances_to_next = np.diff(sorted_positions)
+    next_code_is_equal = np.diff(codes[sorted_positions]) == 0
+    has_frame_length = (distances_to_next >= MIN_FRAME_BYTES) & (distances_to_next <= MAX_FRAME_BYTES)
+    positions = all_positions[next_code_is_equal & has_frame_length]
+    distances = distances_to_next[next_code_is_equal & has_frame_length]
 
-    # Count the pairs of code and distance. Each pair is encoded as one number, code * distance_count + distance.
+    # Count how often each pair of code and distance occurs. Each pair is encoded as one number.
     distance_count = MAX_FRAME_BYTES + 1
-    keys = codes[positions] * distance_count + distances
-    for key, count in zip(*np.unique(keys, return_counts=True), strict=True):
-        distance = int(key) % distance_count
+    code_distance_pairs = codes[positions] * distance_count + distances
+    different_pairs, pair_counts = np.unique(code_distance_pairs, return_counts=True)
+    for pair, count in zip(different_pairs, pair_counts, strict=True):
+        distance = int(pair) % distance_count  # decodes the distance
         if count * distance >= COVERED_SHARE * len(codes):
-            yield distance, positions[keys == key]
+            yield distance, positions[code_distance_pairs == pair]
 
 
 CRC_POLYNOMIALS = {
@@ -221,7 +238,10 @@ CRC_POLYNOMIALS = {
 
 
 def _crcs_of_size(size: int) -> list[Crc]:
-    """Return the checks of a size in bytes with both bit orders. Their initial and final values are 0."""
+    """Return the cyclic redundancy checks of a given size in bytes that are tried without a name.
+
+    Each check is returned with both bit orders. The initial value and the final value of all checks are 0.
+    """
     bit_count = 8 * size
     polynomials = CRC_POLYNOMIALS[size]
     return [Crc(bit_count, polynomial, 0, reflected, 0) for polynomial in polynomials for reflected in (False, True)]
@@ -240,10 +260,10 @@ N_FIRST_FRAMES = 4
 """Number of frames for which each checksum is computed first."""
 
 MIN_FITTING_FIRST_FRAMES = 2
-"""Smallest number of these first frames whose checksum must fit, before it is computed for the other frames."""
+"""Smallest number of the `N_FIRST_FRAMES` frames that a checksum must fit before it is computed for other frames."""
 
 FITTING_SHARE = 0.75
-"""Smallest share of frames whose checksum must fit, because some frames may be damaged."""
+"""Smallest share of the frames that a checksum must fit. It is less than 1, because some frames may be damaged."""
 
 MAX_FIRST_COVERED_BYTE = 16
 """Largest position of the first byte that a checksum covers."""
@@ -254,12 +274,12 @@ ORDERS: tuple[ByteOrder, ...] = ("little", "big")
 
 
 class Check(NamedTuple):
-    """A checksum that fits.
+    """A checksum that fits the frames.
 
     Attributes:
-        size: Number of bytes; 0 if the frames have no checksum.
-        order: Byte order.
-        keys: Keys of the checksum in a device file.
+        size: Number of bytes of the checksum; 0 if the frames have no checksum.
+        order: Byte order of the checksum.
+        keys: Keys that describe the checksum in a device file.
     """
 
     size: int
@@ -268,40 +288,45 @@ class Check(NamedTuple):
 
 
 def find_checks(rows: Bytes) -> Iterator[Check]:
-    """Yield the checksums that fit the frames, from the widest to the narrowest.
+    """Yield the checksums that fit the frames, from the widest to the narrowest checksum.
 
-    The checksum is at the end of a frame. It covers the other bytes of the frame, but may leave out constant bytes at
-    the beginning, such as a sync pattern. For each size and byte order, at most one checksum is yielded.
+    The checksum is at the end of each frame. The checksum covers the other bytes of the frame, except that it may leave
+    out constant bytes at the beginning, such as a sync pattern. For each size and byte order, at most one checksum is
+    yielded.
 
     Args:
         rows: Bytes of the frames, shape (n, length).
     """
-    different_rows = np.unique(rows, axis=0)
+    different_rows = np.unique(rows, axis=0)  # sorted
 
     # The frames are drawn at random, because neighbours in the sorted array differ in a few bits only.
     drawn = np.random.default_rng(0).permutation(len(different_rows))[:MAX_CHECKED_FRAMES]
     checked_rows = different_rows[drawn]
     if len(checked_rows) < MIN_CHECKED_FRAMES:
         return
+    frames = [row.tobytes() for row in checked_rows]
     _usual, is_constant = usual_bytes(checked_rows)
     length = len(is_constant)
-    frames = [row.tobytes() for row in checked_rows]
-    # Number of constant bytes at the beginning: the position of the first False
-    leading_constant_count = int(np.argmin([*is_constant[:MAX_FIRST_COVERED_BYTE], False]))
-    for size in UNNAMED_CRCS:
+    leading_constant_count = int(np.argmin([*is_constant[:MAX_FIRST_COVERED_BYTE], False]))  # position of first False
+    for size in UNNAMED_CRCS:  # in bytes, from the widest to the narrowest
         is_too_wide = size + 2 > length  # at least two bytes must remain
-        if is_too_wide or is_constant[-size:].all():
+        if is_too_wide or is_constant[-size:].all():  # a checksum differs from frame to frame
             continue
-        last_begin = min(leading_constant_count, length - size - 1)
-        for order in ORDERS[:size]:  # a single byte has no byte order
-            named_checks = _named_checks(frames, size, order, range(last_begin + 1))
+        last_begin = min(leading_constant_count, length - size - 1)  # the checksum covers at least one byte
+        begins = range(last_begin + 1)  # possible positions of the first covered byte
+        orders = ORDERS if size > 1 else ORDERS[:1]  # a single byte has no byte order
+        for order in orders:
+            named_checks = _named_checks(frames, size, order, begins)
             unnamed_checks = _unnamed_checks(frames, size, order)
-            all_checks = chain(named_checks, unnamed_checks)
-            yield from islice(all_checks, 1)  # the first check that fits
+            first_check = next(chain(named_checks, unnamed_checks), None)
+            if first_check is not None:
+                yield first_check
 
 
 def _named_checks(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> Iterator[Check]:
-    """Yield the named checksums that fit, and the position of the first byte that each of them covers.
+    """Yield the checksums with a name that fit most of the frames.
+
+    If a checksum fits with several positions of its first covered byte, it is yielded once for each of these positions.
 
     Args:
         frames: The frames, which are of one length.
@@ -313,16 +338,16 @@ def _named_checks(frames: list[bytes], size: int, order: ByteOrder, begins: rang
     for begin in begins:
         for name in names:
             if _fits(CHECKSUMS[name].compute, frames, begin, size, order):
-                keys: dict[str, Any] = {"checksum": name}
+                keys: dict[str, Any] = {"checksum": name}  # keys of the checksum in a device file
                 if begin > 0:
                     keys["checksum_from"] = begin
                 yield Check(size, order, keys)
 
 
 def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size: int, order: ByteOrder) -> bool:
-    """Return whether most frames end with their checksum.
+    """Return whether most frames end with the checksum of their other bytes.
 
-    If it fits too few of the first frames, the other frames are not examined, which saves time.
+    To save time, only the first frames are examined if the checksum fits too few of them.
 
     Args:
         compute: Function that computes the checksum of bytes.
@@ -333,8 +358,14 @@ def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size
     """
 
     def count_fitting(some_frames: list[bytes]) -> int:
-        """Return the number of frames whose computed checksum is the checksum that was sent."""
-        return sum(compute(frame[begin:-size]) == int.from_bytes(frame[-size:], order) for frame in some_frames)
+        """Return the number of frames whose computed checksum is equal to the checksum at their end."""
+        count = 0
+        for frame in some_frames:
+            computed_checksum = compute(frame[begin:-size])
+            sent_checksum = int.from_bytes(frame[-size:], order)
+            if computed_checksum == sent_checksum:
+                count += 1
+        return count
 
     if count_fitting(frames[:N_FIRST_FRAMES]) < MIN_FITTING_FIRST_FRAMES:
         return False
@@ -342,28 +373,31 @@ def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size
 
 
 def _unnamed_checks(frames: list[bytes], size: int, order: ByteOrder) -> Iterator[Check]:
-    """Yield the cyclic redundancy checks that fit, described by their parameters.
+    """Yield the cyclic redundancy checks without a name that fit most of the frames.
 
-    With the right polynomial, the computed and the sent value differ by the same constant in all frames. The constant
-    is stored as the final value of the check.
+    All checks are computed with the initial value 0 and the final value 0. For frames of one length, any other initial
+    and final values change the check only by an exclusive or with a constant. With the right polynomial, the computed
+    check and the sent check therefore differ by the same constant in all frames. This constant is stored as the final
+    value of the check.
 
     Args:
         frames: The frames, which are of one length.
         size: Number of bytes of the checksum.
         order: Byte order of the checksum.
     """
+    digit_count = 2 * size  # hexadecimal digits of a number of this size
     for crc in UNNAMED_CRCS[size]:
-        differences: Counter[int] = Counter()
+        difference_counts: Counter[int] = Counter()
         for frame in frames:
-            computed = crc(frame[:-size])
-            sent = int.from_bytes(frame[-size:], order)
-            differences[computed ^ sent] += 1
-        final, count = differences.most_common(1)[0]
+            computed_value = crc(frame[:-size])
+            sent_value = int.from_bytes(frame[-size:], order)
+            difference_counts[computed_value ^ sent_value] += 1
+        most_frequent_difference, count = difference_counts.most_common(1)[0]
         if count >= FITTING_SHARE * len(frames):
             parameters = {
                 "width": crc.width,
                 "reflected": crc.reflected,
-                "polynomial": f"{crc.polynomial:0{2 * size}X}",
-                "final": f"{final:0{2 * size}X}",
+                "polynomial": f"{crc.polynomial:0{digit_count}X}",
+                "final": f"{most_frequent_difference:0{digit_count}X}",
             }
             yield Check(size, order, {"checksum": parameters})

@@ -1,4 +1,4 @@
-"""Recognition of the format of a board: the binary frames of isocharge, lines of text, or frames of fixed length."""
+"""Recognition of whether a board sends the binary frames of isocharge, lines of text or frames of fixed length."""
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
@@ -29,58 +29,62 @@ MAX_EXAMINED_FRAMES = 300
 """Largest number of frames that are examined."""
 
 MAX_FRAME_STARTS = 24
-"""Number of constant bytes that are tried as the first byte of a frame."""
+"""Largest number of constant bytes that are tried as the first byte of a frame."""
 
 MAX_SYNC_BYTES = 6
-"""Longest sync pattern, bytes. Further constant bytes may be constant by chance."""
+"""Length of the longest sync pattern, bytes. Further bytes after the pattern may be constant only by chance."""
 
 WEIGHTS = Weights()
-"""Weights that were fitted on random boards."""
+"""Weights that were fitted to random boards."""
 
 
 def described_frames(
     chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False, weights: Weights = WEIGHTS
 ) -> dict[str, Any] | None:
-    """Return the section `[frames]` of a device file for frames of fixed length; None if there are no such frames.
+    """Return the section `[frames]` that describes frames of fixed length; None if no such frames are recognised.
+
+    All kinds of framing are tried, beginning with the most certain kind. The first kind of framing with which the
+    frames can be described is used. If several descriptions have this framing, the description with the lowest score is
+    returned.
 
     Args:
-        chunks: The bytes as they arrived.
-        seconds: Time in which they arrived, s, from which the unit of a clock follows.
+        chunks: Received bytes, divided as they arrived.
+        seconds: Time in which the bytes arrived, s. The unit of a clock is derived from this time.
         are_datagrams: Whether each chunk is a datagram.
         weights: Contributions to the score.
     """
-    byte_count = sum(map(len, chunks))
-    examined_share = min(1.0, MAX_EXAMINED_BYTES / max(1, byte_count))
+    byte_count = sum(len(chunk) for chunk in chunks)
+    examined_share = min(1.0, MAX_EXAMINED_BYTES / max(1, byte_count))  # 1 if there are no bytes
     examined_seconds = seconds * examined_share
-    all_windows = framings(chunks, are_datagrams=are_datagrams)
-    for _, windows_of_framing in groupby(all_windows, key=lambda windows: windows.framing):
-        scored_tables: list[tuple[float, dict[str, Any]]] = []
+    possible_windows = framings(chunks, are_datagrams=are_datagrams)  # windows of one framing follow each other
+    for _, windows_of_framing in groupby(possible_windows, key=lambda windows: windows.framing):
+        scored_sections: list[tuple[float, dict[str, Any]]] = []
         for windows in windows_of_framing:
-            scored_tables += _scored_tables(windows, examined_seconds, weights)
-        if scored_tables:
-            _, best_table = min(scored_tables, key=lambda score_and_table: score_and_table[0])
-            return best_table
+            scored_sections += _scored_sections(windows, examined_seconds, weights)
+        if scored_sections:
+            _, best_section = min(scored_sections, key=lambda score_and_section: score_and_section[0])
+            return best_section
     return None
 
 
 def _sync_lengths(may_be_sync: Booleans, start: int) -> Sequence[int]:
-    """Return the possible lengths of the sync of a frame, bytes.
+    """Return the possible lengths of the sync pattern of a frame, in bytes.
 
     Args:
-        may_be_sync: Whether each byte may belong to a sync, shape (length,).
+        may_be_sync: Whether each byte of a window may belong to a sync pattern, shape (length,).
         start: Position of the first byte of the frame.
     """
     may_be_sync_from_start = np.roll(may_be_sync, -start)[:MAX_SYNC_BYTES]
-    longest_sync = int(np.argmin([*may_be_sync_from_start, False]))  # the position of the first False
-    return range(1, longest_sync + 1)
+    max_length = int(np.argmin([*may_be_sync_from_start, False]))  # the position of the first False
+    return range(1, max_length + 1)
 
 
-def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterator[tuple[float, dict[str, Any]]]:
-    """Yield the possible descriptions of the frames with their scores.
+def _scored_sections(windows: Windows, seconds: float, weights: Weights) -> Iterator[tuple[float, dict[str, Any]]]:
+    """Yield all descriptions of the frames, each as a score and a section `[frames]` of a device file.
 
-    For each first byte of the frames, each checksum and each byte order, at most one description is yielded.
-    Descriptions without a checksum are tried only if no checksum fits. The score is in bits for each byte of the
-    stream, including the bytes outside of all frames, so that frames of different lengths can be compared.
+    At most one description is yielded for each combination of a first byte, a checksum and a byte order. Descriptions
+    without a checksum are tried only if no checksum fits. The score is the number of bits per byte of the stream,
+    including the bytes outside of all frames. Scores of frames with different lengths can therefore be compared.
 
     Args:
         windows: Frames of one length in the stream.
@@ -88,34 +92,37 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
         weights: Contributions to the score.
     """
     length = windows.length
-    rows = windows.rows()[:MAX_EXAMINED_FRAMES]
-    if len(rows) < MIN_FRAMES - 1:
+    rows = windows.rows()[:MAX_EXAMINED_FRAMES]  # each row contains a frame and the bytes of the next frame
+    if len(rows) < MIN_FRAMES - 1:  # the last frame has no row, because no frame follows it
         return
 
     # A frame with a sync pattern may begin at any constant byte of a window. Other windows begin with the frame.
     has_sync = windows.framing == SYNC
     usual, is_constant = usual_bytes(rows[:, :length])
     may_be_sync = is_constant & (usual != 0)  # zeros are mostly the high bytes of numbers
-    starts = np.flatnonzero(may_be_sync)[:MAX_FRAME_STARTS].tolist() if has_sync else [0]
+    starts = [0]
+    if has_sync:
+        starts = np.flatnonzero(may_be_sync)[:MAX_FRAME_STARTS].tolist()
 
     # Pairs of a first byte and a checksum. If no checksum fits, frames without a checksum are tried.
     starts_and_checks = [(start, check) for start in starts for check in find_checks(rows[:, start : start + length])]
     has_check = bool(starts_and_checks)
 
     covered_share = min(1.0, len(windows.starts) * length / len(windows.stream))
-    rate_Hz = len(windows.stream) / length / seconds
+    frame_rate_Hz = len(windows.stream) / length / seconds  # as if all bytes of the stream belonged to frames
     for order in ORDERS:
-        parts_at = parts_of(rows, order, rate_Hz, weights)
+        parts_at = parts_of(rows, order, frame_rate_Hz, weights)  # possible parts at each byte of a window
         if not has_check:
             starts_and_checks = [(start, Check(0, order, {})) for start in starts]
         for start, check in starts_and_checks:
-            frame_parts = parts_at[start:] + parts_at[:start]  # from the first byte of the frame
-            parts_before_check = frame_parts[: length - check.size]
+            parts_from_start = parts_at[start:] + parts_at[:start]  # from the first byte of the frame
+            parts_before_check = parts_from_start[: length - check.size]
             sync_lengths = _sync_lengths(may_be_sync, start) if has_sync else [0]
             score, sync_length, parts = split_frame(parts_before_check, sync_lengths, weights)
             has_channel = any(part.role == "channel" for part in parts)
             if has_channel:
                 sync = np.roll(usual, -start)[:sync_length].tobytes()
+                # Each byte outside of all frames contributes `weights.noise` bits.
                 bits_per_byte = covered_share * score / length + (1.0 - covered_share) * weights.noise
                 yield bits_per_byte, _frames_section(windows, sync, check, order, parts)
 
@@ -123,48 +130,52 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
 def _frames_section(
     windows: Windows, sync: bytes, check: Check, order: ByteOrder, parts: Sequence[Part]
 ) -> dict[str, Any]:
-    """Return the section `[frames]` of a device file for a description of the frames.
+    """Convert a description of the frames to the section `[frames]` of a device file.
 
     Args:
         windows: Frames of one length in the stream.
-        sync: The sync pattern; empty if there is none.
-        check: The checksum, whose size is 0 if there is none.
+        sync: The sync pattern; empty if the frames have no sync pattern.
+        check: The checksum, whose size is 0 if the frames have no checksum.
         order: Byte order of the numbers.
-        parts: Parts of a frame between sync and checksum.
+        parts: Parts of a frame between the sync pattern and the checksum.
     """
-    table: dict[str, Any] = {"format": "described"}
-    if windows.framing == SYNC:
-        table["sync"] = sync.hex(" ").upper()
+    section: dict[str, Any] = {"format": "described"}
+    if windows.framing == SYNC:  # the default framing, which needs no key
+        section["sync"] = sync.hex(" ").upper()
     else:
-        table["framing"] = windows.framing
-    table["length"] = windows.length
-    table["byte_order"] = order
-    table |= check.keys
-    if check.size > 1 and check.order != order:
-        table["checksum_order"] = check.order
-    table["fields"] = _field_tables(parts)
-    return table
+        section["framing"] = windows.framing
+    section["length"] = windows.length
+    section["byte_order"] = order
+    section |= check.keys
+    if check.size > 1 and check.order != order:  # a checksum of one byte has no byte order
+        section["checksum_order"] = check.order
+    section["fields"] = _field_tables(parts)
+    return section
 
 
 def _field_tables(parts: Sequence[Part]) -> list[dict[str, Any]]:
-    """Return the list `fields` of a device file for the parts of a frame.
+    """Convert the parts of a frame to the list `fields` of a device file.
 
-    A second counter or clock becomes padding, and adjacent padding is joined.
+    Channels are called ch1, ch2, and so on. A second counter or a second clock becomes padding, because a device file
+    can describe only one counter and one clock. Adjacent padding is joined.
     """
     fields: list[dict[str, Any]] = []
     roles: list[str] = []
     for part in parts:
         roles.append(part.role)
         role_count = roles.count(part.role)  # number of parts with this role so far, including this part
+        is_counter_or_clock = part.role in ("seq", "clock")
         if part.role == "channel":
             fields.append({"name": f"ch{role_count}", "type": part.kind})
-        elif part.role != "pad" and role_count == 1:
+        elif is_counter_or_clock and role_count == 1:
             field: dict[str, Any] = {"name": part.name, "type": part.kind}
             if part.scale != 1.0:
                 field["scale"] = part.scale
             fields.append(field)
         elif fields and fields[-1]["type"] == PADDING:
-            fields[-1]["count"] = fields[-1].get("count", 1) + part.size
+            previous_padding = fields[-1]
+            previous_count = previous_padding.get("count", 1)  # padding without a count is one byte
+            previous_padding["count"] = previous_count + part.size
         else:
             padding: dict[str, Any] = {"type": PADDING}
             if part.size > 1:
@@ -174,56 +185,69 @@ def _field_tables(parts: Sequence[Part]) -> list[dict[str, Any]]:
 
 
 CLEAR_SHARE = 0.4
-"""Smallest share of bytes in intact frames with which no other format is tried. Echoes may lie between the frames."""
+"""Smallest share of the bytes that must lie in intact frames if no other format is to be tried.
+
+The share is much less than 1, because the other bytes may be echoes of requests.
+"""
 
 
 def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False) -> dict[str, Any] | None:
-    """Return the section `[frames]` of a device file; None if no format is recognised.
+    """Recognise the format of a board, and return the section `[frames]` of a device file that describes it.
+
+    The binary frames of isocharge, lines of text, and frames of fixed length are tried in this order.
 
     Args:
-        chunks: The bytes as they arrived.
-        seconds: Time in which they arrived, s.
+        chunks: Received bytes, divided as they arrived.
+        seconds: Time in which the bytes arrived, s.
         are_datagrams: Whether each chunk is a datagram.
+
+    Returns:
+        The section as a dictionary; None if no format is recognised.
     """
     binary_frames, binary_share = _parse_all(BinaryParser(), chunks)
     if len(binary_frames) >= MIN_FRAMES and binary_share > CLEAR_SHARE:
         return {"format": "binary"}
 
-    # If most of the bytes are not lines of one layout, the board may send binary frames that resemble text in places.
-    text_table = None
+    text_section = None
     text_parser = TextParser()
     all_text_frames, text_share = _parse_all(text_parser, chunks)
+    # Earlier frames have another number of values if a header later names one of the columns as counter or clock.
     text_frames = [frame for frame in all_text_frames if len(frame.values) == len(all_text_frames[-1].values)]
     if text_parser.layout is not None and len(text_frames) >= MIN_FRAMES:
-        rate_Hz = len(text_frames) / seconds
-        text_table = {"format": "text"} | _text_keys(text_parser.layout, text_frames, rate_Hz)
+        frame_rate_Hz = len(text_frames) / seconds
+        text_section = {"format": "text"} | _text_keys(text_parser.layout, text_frames, frame_rate_Hz)
         if text_share >= CLEAR_SHARE:
-            return text_table
-    return described_frames(chunks, seconds, are_datagrams=are_datagrams) or text_table
+            return text_section
+
+    # If most of the bytes are not lines of one layout, the board may send binary frames that resemble text in places.
+    described_section = described_frames(chunks, seconds, are_datagrams=are_datagrams)
+    return described_section or text_section
 
 
 def _parse_all(parser: Parser, chunks: Sequence[bytes]) -> tuple[list[Frame], float]:
-    """Return the frames that a parser finds, and the share of the bytes that lie in these frames."""
+    """Parse all chunks, and return the frames and the share of the bytes that the parser did not drop."""
     frames = [frame for chunk in chunks for frame in parser.feed(chunk)]
     byte_count = sum(len(chunk) for chunk in chunks)
-    return frames, 1.0 - parser.counts.bytes_dropped / max(1, byte_count)
+    dropped_share = parser.counts.bytes_dropped / max(1, byte_count)
+    return frames, 1.0 - dropped_share
 
 
-def _text_keys(layout: Layout, frames: Sequence[Frame], rate_Hz: float) -> dict[str, Any]:
+def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) -> dict[str, Any]:
     """Return the keys that a device file for lines of text needs.
 
-    If the columns have no names and one of them is a counter or a clock, all columns get names. The header of a CSV
-    stream is copied to the device file, because a program that starts later does not receive the header.
+    The key `columns` lists the names of all columns. The keys `seq`, `t_us`, `t_ms` and `t_s` state the name that the
+    board uses for its counter or its clock.
 
     Args:
         layout: Layout of the lines.
-        frames: Frames of these lines.
-        rate_Hz: Number of frames per second, Hz.
+        frames: Frames that the lines contain.
+        frame_rate_Hz: Number of frames per second, Hz.
     """
     last_frame = frames[-1]
-    meanings = _meanings(frames, rate_Hz)
+    meanings = _meanings(frames, frame_rate_Hz)  # by the position of the value in a frame
 
-    # The header of a CSV names all columns. All names are copied, except the names of counter and clock.
+    # The header of a CSV is copied, because a program that starts later does not receive it. Only the names of the
+    # counter and the clock are replaced.
     if layout.notation is Notation.csv and layout.names:
         columns = list(layout.names)
         for position, meaning in meanings.items():
@@ -231,9 +255,13 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], rate_Hz: float) -> dict[
             columns[column] = meaning
         return {"columns": columns}
 
-    # If each line contains the names, or no column is a counter or a clock, the names of the columns are not needed.
-    if last_frame.names or not meanings:
+    # If each line contains the names, the key `columns` is not needed.
+    if last_frame.names:
         return {meaning: last_frame.names[position] for position, meaning in meanings.items()}
+
+    # If no column is a counter or a clock, the columns need no names.
+    if not meanings:
+        return {}
 
     column_names = []
     channel_count = 0
@@ -247,26 +275,31 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], rate_Hz: float) -> dict[
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _meanings(frames: Sequence[Frame], rate_Hz: float) -> dict[int, str]:
-    """Find the columns that count frames or time, and return their names by their positions.
+def _meanings(frames: Sequence[Frame], frame_rate_Hz: float) -> dict[int, str]:
+    """Find out which values of the frames are a frame counter and a clock.
+
+    If the parser has already recognised a counter, no other counter is searched for. The same applies to the clock.
 
     Args:
         frames: Frames with the same number of values.
-        rate_Hz: Number of frames per second, Hz.
+        frame_rate_Hz: Number of frames per second, Hz.
 
     Returns:
-        `seq`, `t_us`, `t_ms` or `t_s` for each position of such a column.
+        The meaning of a value by its position in a frame: `seq` for a counter, and `t_us`, `t_ms` or `t_s` for a clock.
     """
     meanings: dict[int, str] = {}
     has_counter = frames[-1].seq is not None
     has_clock = frames[-1].t_us is not None
-    steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, columns)
-    for position, column_steps in enumerate(steps.T):
-        clock_name, clock_scale = clock_of(column_steps, rate_Hz) or ("", 0.0)  # no clock has an empty name
-        if not has_counter and steady_step(column_steps) == 1.0:
+    steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, values)
+    for position, value_steps in enumerate(steps.T):
+        if not has_counter and steady_step(value_steps) == 1.0:
             meanings[position] = SEQ
             has_counter = True
-        elif not has_clock and clock_scale == 1.0:  # a device file for lines of text cannot state another scale
-            meanings[position] = clock_name
-            has_clock = True
+            continue
+        clock = clock_of(value_steps, frame_rate_Hz)
+        if clock is not None and not has_clock:
+            clock_name, tick_duration = clock
+            if tick_duration == 1.0:  # a device file for lines of text cannot state another duration
+                meanings[position] = clock_name
+                has_clock = True
     return meanings

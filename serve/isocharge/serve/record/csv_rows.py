@@ -1,4 +1,4 @@
-"""Records as CSV: one column for each number, such as `charge_pC.A` or `tracked.vx_mm_s`."""
+"""Conversion of records to CSV, with one column for each number, such as `charge_pC.A` or `tracked.vx_mm_s`."""
 
 import csv
 import io
@@ -10,7 +10,9 @@ from isocharge.serve.record.record import DECIMALS, PredictionRecord, selected_f
 
 
 def csv_header(electrodes: Sequence[str], *, with_tracking: bool = False, with_film: bool = False) -> str:
-    """Return the header of the rows that `csv_row` returns.
+    """Return the header that belongs to the rows of `csv_row`.
+
+    A field with several numbers has one column for each number, such as `charge_pC.A` for the electrode A.
 
     Args:
         electrodes: Names of the electrodes.
@@ -19,44 +21,46 @@ def csv_header(electrodes: Sequence[str], *, with_tracking: bool = False, with_f
     """
     columns: list[str] = []
     for field in selected_fields(with_tracking=with_tracking, with_film=with_film):
-        parts = _part_names(field, electrodes)
-        if parts is None:
+        part_names = _part_names(field, electrodes)
+        if part_names is None:  # the field has one column
             columns.append(field.name)
         else:
-            columns += [f"{field.name}.{part}" for part in parts]
+            columns += [f"{field.name}.{part_name}" for part_name in part_names]
     return _line(columns)
 
 
 def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
-    """Return a record as a row of a CSV file.
+    """Convert a record to a row of a CSV file.
 
     Numbers have six decimals, flags are separated by blanks, and the cells of unknown values are empty.
 
     Args:
-        record: The record.
+        record: Record to convert.
         electrodes: Names of the electrodes, in the order of the header.
     """
     fields = selected_fields(with_tracking=record.tracking is not None, with_film=record.film is not None)
     cells: list[str] = []
     for field in fields:
         value = getattr(record, field.name)
-        parts = _part_names(field, electrodes)
-        if parts is None:
+        part_names = _part_names(field, electrodes)
+        if part_names is None:  # the field has one column
             cells.append(_cell(value))
-        elif value is None:
-            cells += [""] * len(parts)
-        elif field.kind == "charges":
-            cells += [_cell(value[part]) for part in parts]
-        else:
-            cells += [_cell(getattr(value, part)) for part in parts]
+        elif value is None:  # the cells of all parts are empty
+            cells += [""] * len(part_names)
+        elif field.kind == "charges":  # a dictionary of the charges by electrode
+            cells += [_cell(value[electrode]) for electrode in electrodes]
+        else:  # an object, whose parts are attributes
+            cells += [_cell(getattr(value, part_name)) for part_name in part_names]
     return _line(cells)
 
 
 def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str] | None:
-    """Return the names of the parts of a field that has several columns.
+    """Return the names of the parts of a field, if the field has several columns.
+
+    The parts are the charges of the electrodes, or the fields of an object.
 
     Args:
-        field: The field.
+        field: Field of a record.
         electrodes: Names of the electrodes.
 
     Returns:
@@ -70,18 +74,24 @@ def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str] | None
 
 
 def _line(cells: Iterable[str]) -> str:
-    """Return cells separated by commas, quoted where necessary."""
+    """Join cells with commas, and put cells in quotation marks where CSV requires it."""
     line = io.StringIO()
     csv.writer(line).writerow(cells)
     return line.getvalue().removesuffix("\r\n")
 
 
 def _cell(value: Any) -> str:
-    """Return the text of one cell: empty for None, words separated by blanks, and numbers with six decimals."""
+    """Convert a value to the text of a cell.
+
+    None becomes an empty text, a tuple of words becomes the words separated by blanks, and a number that is not an
+    integer gets six decimals.
+    """
     if value is None:
         return ""
     if isinstance(value, tuple):
         return " ".join(value)
     if isinstance(value, bool):
         return str(value).lower()
-    return f"{value:.{DECIMALS}f}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.{DECIMALS}f}"
+    return str(value)

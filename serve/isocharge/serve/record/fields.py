@@ -1,4 +1,4 @@
-"""Description of the fields of a record, read from the annotations of its struct."""
+"""Descriptions of the fields of a record, which are read from the annotations of the class that declares them."""
 
 from collections.abc import Iterator
 from types import NoneType, UnionType
@@ -7,13 +7,13 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from msgspec import Struct
 
 Kind = Literal["number", "integer", "boolean", "text", "words", "charges", "object"]
-"""Kind of value: `words` is a list of texts, `charges` has a number for each electrode, `object` has fields."""
+"""Kind of a value. `words` is a list of texts, `charges` has a number for each electrode, and `object` has fields."""
 
 KINDS: dict[Any, Kind] = {float: "number", int: "integer", bool: "boolean", str: "text"}
 
 
 class Meaning(NamedTuple):
-    """Annotation of a field with the meaning of its value.
+    """Annotation that describes the value of a field.
 
     Attributes:
         text: Description of the value, a sentence.
@@ -35,10 +35,10 @@ class Field(NamedTuple):
         name: Key in JSON.
         kind: Kind of the value.
         meaning: Meaning of the value.
-        may_be_null: Whether the value may be unknown.
+        may_be_null: Whether the value may be null, because it is unknown.
         parts: Fields of the value, if its kind is `object`.
-        group: Name of the nested struct that the field belongs to. A record without that struct has no such field.
-            Empty for a field that every record has.
+        group: Name of the attribute with the nested struct to which the field belongs. A record has the field only if
+            it has this struct. Empty for a field that every record has.
     """
 
     name: str
@@ -55,15 +55,22 @@ def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
 
 
 def _flat_fields(struct: type[Struct]) -> Iterator[Field]:
-    """Yield the fields of a struct. The fields of a nested struct with `is_flattened` take the place of the struct."""
-    hints = get_type_hints(struct, include_extras=True)
+    """Yield the fields of a struct, in the order of their declaration.
+
+    If a nested struct is marked as `is_flattened`, its fields are yielded instead of the struct. Any other nested
+    struct is yielded as one field of the kind `object`, whose parts are the fields of the struct. In both cases, the
+    name of the attribute with the nested struct becomes the group of the yielded fields. A record has the fields of a
+    group only if it has the nested struct.
+    """
+    annotations = get_type_hints(struct, include_extras=True)  # with the metadata of `Annotated`
     for name in struct.__struct_fields__:
-        declared_type, meaning = _type_and_meaning(hints[name], f"{struct.__name__}.{name}")
+        declared_type, meaning = _type_and_meaning(annotations[name], f"{struct.__name__}.{name}")
         value_type, may_be_null = _without_none(declared_type)
+        is_struct = isinstance(value_type, type) and issubclass(value_type, Struct)
         if meaning.is_flattened:
-            for field in _flat_fields(value_type):
-                yield field._replace(group=name)
-        elif isinstance(value_type, type) and issubclass(value_type, Struct):
+            for nested_field in _flat_fields(value_type):
+                yield nested_field._replace(group=name)
+        elif is_struct:
             yield Field(name, "object", meaning, may_be_null, fields_of(value_type), group=name)
         else:
             yield Field(name, _kind(value_type), meaning, may_be_null)
@@ -74,7 +81,7 @@ def _type_and_meaning(annotation: Any, where: str) -> tuple[Any, Meaning]:
 
     Args:
         annotation: Annotation of a field.
-        where: Name of the field, for the error message.
+        where: Name of the struct and of the field, for the error message.
 
     Raises:
         TypeError: If the annotation has another form.
@@ -87,21 +94,30 @@ def _type_and_meaning(annotation: Any, where: str) -> tuple[Any, Meaning]:
     raise TypeError(f"{where}: expected Annotated[type, Meaning(...)]")
 
 
-def _without_none(declared: Any) -> tuple[Any, bool]:
-    """Return a type without its alternative None, and whether it had this alternative."""
-    if get_origin(declared) not in (Union, UnionType):
-        return declared, False
-    other_types = [alternative for alternative in get_args(declared) if alternative is not NoneType]
-    (value_type,) = other_types  # a field has exactly one other type
+def _without_none(declared_type: Any) -> tuple[Any, bool]:
+    """Remove the alternative None from a type, and return whether the type had this alternative.
+
+    For example, the results for the type `float | None` are `float` and True.
+    """
+    is_union = get_origin(declared_type) in (Union, UnionType)  # either class, depending on how the type is written
+    if not is_union:
+        return declared_type, False
+    alternatives = get_args(declared_type)
+    (value_type,) = [alternative for alternative in alternatives if alternative is not NoneType]  # exactly one
     return value_type, True
 
 
 def _kind(value_type: Any) -> Kind:
-    """Return the kind of values of a type; raise TypeError for a type that no field of a record has."""
+    """Return the kind of the values of a type.
+
+    Raises:
+        TypeError: If fields of a record cannot have this type.
+    """
     if value_type in KINDS:
         return KINDS[value_type]
-    if get_origin(value_type) is dict:
+    generic_type = get_origin(value_type)  # for example dict for dict[str, float]
+    if generic_type is dict:
         return "charges"
-    if get_origin(value_type) is tuple:
+    if generic_type is tuple:
         return "words"
     raise TypeError(f"{value_type}: a record has no fields of this type")

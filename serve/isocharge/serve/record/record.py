@@ -1,8 +1,8 @@
-"""The prediction record, which contains one reading of a sensor and the contact that a model computed from it.
+"""The prediction record, which contains a reading of a sensor and the contact that a model computed from this reading.
 
 The fields are declared only here. JSON, CSV, the JSON Schema, the samples of the live page and the table in the
-documentation are derived from the declaration. An unknown value is None, which is `null` in JSON. For example, a CSV
-file of charges has no time of the device, and a film without a contact has no position.
+documentation are derived from this declaration. An unknown value is None in Python and `null` in JSON. For example, the
+position is unknown if nothing touches the film, and the device clock is unknown if the charges come from a CSV file.
 """
 
 import json
@@ -22,7 +22,10 @@ Charges = dict[str, float | None]
 
 
 class TrackedContact(Struct, frozen=True):
-    """A contact that is estimated from all frames so far. The correlations are those of the latest frame."""
+    """A contact that is estimated from all frames so far.
+
+    The tracked contact has no correlations. The correlations in the record belong to the contact of the latest frame.
+    """
 
     x_mm: Annotated[float, Meaning("Position x.", "mm")]
     y_mm: Annotated[float, Meaning("Position y.", "mm")]
@@ -50,7 +53,10 @@ class TrackedContact(Struct, frozen=True):
 
 
 class OtherContact(Struct, frozen=True):
-    """Another contact that explains the charges equally well. The charges do not show which of the two is real."""
+    """Another contact that has the same charges as the tracked contact.
+
+    The charges alone do not show which of the two contacts is real.
+    """
 
     x_mm: Annotated[float, Meaning("Position x.", "mm", is_shown_live=True)]
     y_mm: Annotated[float, Meaning("Position y.", "mm", is_shown_live=True)]
@@ -59,7 +65,7 @@ class OtherContact(Struct, frozen=True):
 
 
 class FollowedFilm(Struct, frozen=True):
-    """The film as estimated from all touches so far."""
+    """Parameters of the film that are estimated from all touches so far."""
 
     pretension_MPa: Annotated[float, Meaning("Pretension for which the model answered.", "MPa")]
     pretension_std_MPa: Annotated[float, Meaning("Standard deviation of the pretension.", "MPa")]
@@ -90,7 +96,8 @@ NO_TRACKING = Tracking()
 class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     """One reading of a sensor and the contact that a model computed from the reading.
 
-    The meanings and units of the fields are in their annotations; `serve/docs/record.md` shows them as a table.
+    The annotations of the fields state their meanings and units. The page `serve/docs/record.md` contains a table of
+    all fields.
     """
 
     timestamp: Annotated[
@@ -148,27 +155,27 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
 
     @property
     def tracked(self) -> TrackedContact | None:
-        """The tracked contact; None if contacts are not tracked, or nothing touches."""
+        """The tracked contact; None if contacts are not tracked or if nothing touches the film."""
         return None if self.tracking is None else self.tracking.tracked
 
     @property
     def event(self) -> str | None:
-        """Event that begins with this record; None if contacts are not tracked, or no event begins."""
+        """Event that begins with this record; None if contacts are not tracked or if no event begins."""
         return None if self.tracking is None else self.tracking.event
 
     @property
     def other(self) -> OtherContact | None:
-        """Another contact with the same charges; None if there is none."""
+        """Another contact with the same charges; None if no such contact is known."""
         return None if self.tracking is None else self.tracking.other
 
     @property
     def field_names(self) -> tuple[str, ...]:
-        """Names of the fields with which this record is written, in their order."""
+        """Names of the fields that are written for this record, in their order."""
         return field_names(with_tracking=self.tracking is not None, with_film=self.film is not None)
 
     @property
     def json_values(self) -> dict[str, Any]:
-        """The values of the record by name, as they are written to JSON. Numbers are rounded to six decimals."""
+        """Values of the fields by name, as they are written to JSON. Numbers are rounded to six decimals."""
         values = structs.asdict(self)
         if self.tracking is not None:
             values |= structs.asdict(self.tracking)
@@ -177,7 +184,7 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     def to_json(self) -> str:
         """Return the record as one line of strictly valid JSON, in which numbers are rounded to six decimals.
 
-        The text is computed once for each record.
+        The text is computed only once and then stored in the record.
 
         Raises:
             ValueError: If a number is not finite.
@@ -186,6 +193,7 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
 
     @cached_property
     def _json(self) -> str:
+        """The record as one line of JSON."""
         return _ENCODE(self.json_values)
 
 
@@ -235,6 +243,7 @@ _NAMES = {
     for with_tracking in (False, True)
     for with_film in (False, True)
 }
+"""Names of the fields of a record, by whether it has the fields of the tracking and those of the film follower."""
 
 
 def field_names(*, with_tracking: bool = False, with_film: bool = False) -> tuple[str, ...]:
@@ -254,18 +263,19 @@ _ENCODE = json.JSONEncoder(allow_nan=False).encode
 
 
 def _json_value(value: Any) -> Any:
-    """Return the value of a field for JSON. Numbers are rounded to six decimals, and a struct becomes a dictionary.
+    """Convert the value of a field for JSON. Numbers are rounded to six decimals, and a struct becomes a dictionary.
 
-    The class is compared by identity, because the function is called 20 times for each record.
+    The function compares the class of the value, which is faster than calling `isinstance`. The speed matters, because
+    the function is called for every field of every record.
 
     Args:
-        value: A number, text, boolean, tuple of texts or None; the charges by electrode; or a struct.
+        value: A number, text, boolean, tuple of texts, None, dictionary of charges by electrode, or struct.
     """
     value_class = value.__class__
     if value_class is float:
         return round(value, DECIMALS)
     if value_class in _UNCHANGED:
         return value
-    if value_class is dict:
+    if value_class is dict:  # the charges by electrode; the charge of an electrode may be None
         return {name: charge if charge is None else round(charge, DECIMALS) for name, charge in value.items()}
-    return {name: _json_value(getattr(value, name)) for name in value.__struct_fields__}
+    return {name: _json_value(getattr(value, name)) for name in value.__struct_fields__}  # the value is a struct

@@ -17,34 +17,41 @@ TYPES = {
     "charges": "object: a number for each electrode",
     "object": "object",
 }
-"""Words for the kinds of values."""
+"""Description of each kind of value in the table."""
 
 GROUPS = {"tracking": "with `[track]`", "film": "with `[follow]`"}
 """Condition under which a record has the fields of a group."""
 
 
 def record_table() -> str:
-    """Return the table of all fields of a record. The fields of a nested object follow this object."""
+    """Return a table of all fields of a record in Markdown.
+
+    The row of a field that is an object is followed by the rows of the fields of this object.
+    """
     header = ["| field | type | unit | meaning | present |", "|---|---|---|---|---|"]
     return "\n".join([*header, *_rows(RECORD_FIELDS)]) + "\n"
 
 
 def _rows(fields: Iterable[Field], prefix: str = "", group: str = "") -> Iterator[str]:
-    """Yield a row of the table for each field. If a field contains further fields, their rows follow.
+    """Yield a row of the table for each field. If a field is an object, the rows of its fields follow its own row.
 
     Args:
-        fields: The fields.
-        prefix: Text before the names of the fields: the name of the object that contains the fields, and a point.
-        group: Group of the object that contains the fields.
+        fields: Fields of the record or of an object.
+        prefix: Text before the names of the fields, which is the name of the object that contains the fields, and a
+            point. Empty for the fields of the record itself.
+        group: Group of the object that contains the fields. A group consists of fields that a record has only under a
+            condition; see `GROUPS`. Empty if there is no such object or group.
     """
     for field in fields:
-        present = GROUPS.get(field.group or group, "always")
+        full_name = f"{prefix}{field.name}"
+        field_group = field.group or group  # a field without a group is in the group of its object
+        condition = GROUPS.get(field_group, "always")
         value_type = TYPES[field.kind]
         if field.may_be_null:
             value_type += " or null"
-        cells = (f"`{prefix}{field.name}`", value_type, field.meaning.unit, field.meaning.text, present)
+        cells = (f"`{full_name}`", value_type, field.meaning.unit, field.meaning.text, condition)
         yield f"| {' | '.join(cells)} |"
-        yield from _rows(field.parts, f"{prefix}{field.name}.", field.group or group)
+        yield from _rows(field.parts, f"{full_name}.", field_group)
 
 
 if __name__ == "__main__":

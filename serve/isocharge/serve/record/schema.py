@@ -1,10 +1,10 @@
 """JSON Schema of the records of a sensor.
 
-The schema describes the fields twice. The viewers Foxglove and Lichtblick read the top-level key `properties`, and
-expect a single `type` for each field. A number that may be null is therefore declared as "number" in `properties`.
-Validators of draft 7 of JSON Schema follow the top-level `$ref` to `definitions/record` and ignore all other top-level
-keys. In this definition, null is allowed for every field that may be null. Viewers therefore list all fields, and
-validators accept all records.
+The schema describes the fields twice, once for viewers and once for validators. The viewers Foxglove and Lichtblick
+read the top-level key `properties`, and expect a single `type` for each field. A number that may be null is therefore
+declared as "number" in `properties`. Validators of draft 7 of JSON Schema follow the top-level `$ref` to
+`definitions/record` and ignore all other top-level keys. The definition `record` allows null for every field that may
+be null. With both descriptions, viewers list all fields, and validators accept all records.
 """
 
 from collections.abc import Sequence
@@ -28,9 +28,12 @@ JSON_TYPES: dict[Kind, str] = {
 
 
 def record_schema(electrodes: Sequence[str]) -> dict[str, Any]:
-    """Return the schema of the records of a sensor with these electrodes.
+    """Return the JSON Schema of the records of a sensor.
 
-    Further fields are allowed, because a later version may add some.
+    The schema allows further fields, because a later version may add fields to the record.
+
+    Args:
+        electrodes: Names of the electrodes of the sensor.
     """
     return {
         "$schema": "http://json-schema.org/draft-07/schema#",
@@ -42,7 +45,7 @@ def record_schema(electrodes: Sequence[str]) -> dict[str, Any]:
 
 
 def _object(electrodes: Sequence[str], *, allows_null: bool) -> dict[str, Any]:
-    """Return the schema of the record, in which the fields that every record has are required.
+    """Return the schema of a record as an object. The schema requires the fields that every record has.
 
     Args:
         electrodes: Names of the electrodes.
@@ -57,22 +60,23 @@ def _property(field: Field, electrodes: Sequence[str], *, allows_null: bool) -> 
     """Return the schema of one field.
 
     Args:
-        field: The field.
+        field: Field of the record.
         electrodes: Names of the electrodes.
-        allows_null: Whether the field may be null if it may be unknown, and whether numbers in objects may be null.
+        allows_null: Whether null is allowed for a field that may be unknown, and for the numbers in objects.
     """
-    json_type: str | list[str] = JSON_TYPES[field.kind]
+    json_type = JSON_TYPES[field.kind]
     number_in_object: dict[str, Any] = {"type": "number"}
     if allows_null:
         number_in_object = {"type": ["number", "null"]}
-        if field.may_be_null:
-            json_type = [JSON_TYPES[field.kind], "null"]
+
     schema: dict[str, Any] = {"type": json_type}
-    if field.kind == "words":
+    if allows_null and field.may_be_null:
+        schema["type"] = [json_type, "null"]
+    if field.kind == "words":  # a list of texts
         schema["items"] = {"type": "string"}
-    if field.kind == "charges":
+    if field.kind == "charges":  # an object with a number for each electrode
         schema["properties"] = dict.fromkeys(electrodes, number_in_object)
-    if field.kind == "object":
+    if field.kind == "object":  # an object whose parts are all numbers
         part_names = [part.name for part in field.parts]
         schema["properties"] = dict.fromkeys(part_names, number_in_object)
     schema["description"] = field.meaning.text

@@ -1,4 +1,4 @@
-"""The signal chain: stages that turn the numbers of a board into touch charges.
+"""The signal chain, whose stages convert the values of a board to touch charges.
 
 May import: flags.
 """

@@ -1,19 +1,20 @@
-"""The signal chain, which computes touch charges from the numbers of a board and detects touches.
+"""The signal chain, which computes touch charges from the values of a board and detects touches.
 
-`Chain` contains the settings of all stages. `SignalChain` has the requested stages in the following order.
+`Chain` contains the settings of all stages. `SignalChain` contains the requested stages in the following order.
 
-- `Gain` converts the unit of the device to pC, with the offset, the sign and the gain of each channel.
+- `Gain` converts values of the device to charges in pC, with the offset, the sign and the gain of each channel.
 - `Limit` marks frames with a charge at the limit of the converter.
 - `HumStage` estimates and subtracts mains hum.
 - `TareStage` measures the mean and the noise of quiet frames, and subtracts the mean from all later frames.
-- `LeakStage` corrects the leak of the amplifiers, and estimates their inflow. If the settings have a memory,
-  `MemoryStage` replaces this stage, and also corrects creep, the thermoelastic step and the warmth of the film.
+- `LeakStage` corrects the leak of the amplifiers, and estimates the inflow, a slow current into each amplifier. If the
+  settings describe the memory of the film, `MemoryStage` replaces `LeakStage`, and also corrects creep, the
+  thermoelastic step and the warmth of the film.
 - `TouchStage` detects touches with hysteresis.
-- `PressFlags` flags saturated presses, and charges below zero.
-- `Warming` estimates the common charge of a warming film with the model, and subtracts it.
+- `PressFlags` sets the flags for saturated presses and for charges below zero.
+- `Warming` estimates the charge that a warming of the film adds to all electrodes, and subtracts this charge.
 
-If a value of a frame cannot be a charge, the stages skip the frame. The time since the frame before it is then counted
-with the next frame.
+If a value of a frame cannot be a charge, the stages skip the frame. The time step of the next frame then begins at the
+last valid frame.
 """
 
 import math
@@ -49,7 +50,7 @@ LARGEST_PC = 1e9
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """The settings of all stages, in the order of the stages. None switches a stage off.
+    """The settings of all stages, in the order of the stages. The value None switches a stage off.
 
     Attributes:
         gain_pC: Charge per unit of the device, with sign, shape (electrodes,), pC.
@@ -62,9 +63,9 @@ class Chain:
         memory: Memory of the film, which changes the charges of a held press.
         touch: Thresholds of a touch. If None, every frame with a tare is in contact.
         thermal: Settings of the estimate of warming.
-        pyro: Charge that warming adds to each electrode, relative to the mean magnitude over all electrodes, shape
-            (electrodes,), dimensionless; 1.0 if all electrodes are equal.
-        largest: Largest value of a valid reading, in the unit of the device.
+        warming_ratios: Charge that warming adds to each electrode, relative to the mean magnitude over all electrodes,
+            shape (electrodes,), dimensionless; 1.0 if all electrodes are equal.
+        largest: Largest magnitude of a valid value, in the unit of the device.
     """
 
     gain_pC: Array | None = None
@@ -77,7 +78,7 @@ class Chain:
     memory: MemoryRule | None = None
     touch: TouchRule | None = field(default_factory=TouchRule)
     thermal: ThermalRule | None = None
-    pyro: Array | float = 1.0
+    warming_ratios: Array | float = 1.0
     largest: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -86,13 +87,13 @@ class Chain:
 
 
 class Reading(NamedTuple):
-    """One frame after the chain.
+    """Result of the signal chain for one frame.
 
     Attributes:
         raw_pC: Charges as the device sent them, shape (electrodes,), pC.
         charge_pC: Touch charges, shape (electrodes,), pC; None while there is no tare, and for an invalid frame.
         tare: The tare that was subtracted.
-        contact: Whether something touches.
+        contact: Whether something touches the film.
         flags: Flags that the frame had before the signal chain, followed by the flags of the signal chain.
         charge_scale_std: Relative standard deviation that all touch charges have in common, because the memory of the
             film is not known exactly.
@@ -109,7 +110,7 @@ class Reading(NamedTuple):
 class SignalChain:
     """The stages of one sensor with their state.
 
-    An object belongs to one thread. The same frames give the same readings.
+    An object must be used in one thread only. The same sequence of frames always gives the same readings.
 
     Attributes:
         stages: The stages that the settings request, in their order.
@@ -118,12 +119,14 @@ class SignalChain:
     def __init__(self, settings: Chain, n_electrode: int, misfit: Misfit | None = None) -> None:
         """Build the stages in the order in which they process a frame.
 
-        Stages without settings are left out, except gain, tare and touch, which are always present.
+        A stage without settings is left out, except for four stages that are always present: gain, tare, touch and the
+        flags of a press.
 
         Args:
             settings: Settings of all stages.
             n_electrode: Number of electrodes.
-            misfit: Misfit of the current model. Only the warming stage needs it.
+            misfit: Function that returns how badly charges fit a single contact, according to the current model. Only
+                the warming stage needs this function.
 
         Raises:
             ValueError: If there is a warming stage and no misfit is given.
@@ -139,9 +142,10 @@ class SignalChain:
         self._tare_stage = TareStage(settings.tare, n_electrode)
         stages.append(self._tare_stage)
 
-        # The offset stage is the last stage that stores the charge at rest. Warming is subtracted there.
+        # The offset stage is the last stage that stores the charge at rest. The warming stage adds the charge of the
+        # warming to this charge.
         offset_stage: OffsetStage = self._tare_stage
-        warmth_s = None
+        warmth_s = None  # time constant with which the film follows the temperature of the air, s
         if settings.memory is not None:
             warmth_s = settings.memory.warmth_s
             offset_stage = MemoryStage(settings.memory, settings.leak, settings.tau_s)
@@ -150,13 +154,15 @@ class SignalChain:
             offset_stage = LeakStage(settings.leak, settings.tau_s)
             stages.append(offset_stage)
 
+        # The touch stage notifies the earlier stages when a touch begins.
         earlier_stages = stages.copy()  # a copy, because further stages are appended below
         self._touch_stage = TouchStage(settings.touch, earlier_stages)
         stages += [self._touch_stage, PressFlags()]
         if settings.thermal is not None:
             if misfit is None:
                 raise ValueError("the warming stage needs the misfit of a model, got None")
-            stages.append(Warming(settings.thermal, misfit, offset_stage, ratios=settings.pyro, warmth_s=warmth_s))
+            warming_ratios = settings.warming_ratios
+            stages.append(Warming(settings.thermal, misfit, offset_stage, ratios=warming_ratios, warmth_s=warmth_s))
         self.stages = stages
 
     def advance(
@@ -164,17 +170,20 @@ class SignalChain:
     ) -> Reading:
         """Process the next frame with all stages, and return its touch charges and its flags.
 
+        A frame with a value that cannot be a charge is flagged, and does not change the state of the stages.
+
         Args:
             values: Values as the device sent them, in the unit of the device, shape (electrodes,).
             t_s: Time on the clock of the device, s.
             dt_s: Time since the previous frame, s.
-            limited: Whether the device reports that an amplifier is at its limit.
+            limited: Whether the device itself reports that an amplifier is at its limit.
             flags: Flags that the frame already has. The stages add further flags.
 
         Raises:
             TareError: If the film is touched during the whole search for a tare.
         """
-        is_valid = math.hypot(*values.tolist()) <= self._settings.largest  # false for NaN
+        magnitude = math.hypot(*values.tolist())  # at least the largest absolute value; NaN if a value is NaN
+        is_valid = magnitude <= self._settings.largest  # false for NaN
         if not is_valid:
             self._invalid_s += dt_s
             with np.errstate(over="ignore"):  # a value may be the largest number that a double holds
@@ -186,7 +195,7 @@ class SignalChain:
         frame = ChainFrame(values, t_s, step_s, limited, self._touch_stage.is_contact, list(flags))
         for stage in self.stages:
             stage.step(frame)
-            if frame.is_finished:
+            if frame.is_finished:  # there is no tare yet, so there are no touch charges
                 return Reading(frame.raw_pC, None, None, contact=False, flags=tuple(frame.flags))
         return Reading(
             frame.raw_pC,

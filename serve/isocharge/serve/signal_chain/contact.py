@@ -1,8 +1,8 @@
 """Detection of a touch by the total charge. The detection has a hysteresis.
 
-A touch begins when the total charge rises out of the noise. A touch ends when the total charge falls below a share of
-the peak of this press. With an absolute threshold, a touch would never end after the charge at rest has drifted above
-the threshold.
+A touch begins when the total charge exceeds a threshold that is derived from the noise. A touch ends when the total
+charge falls below a given share of the largest total charge of this touch. With an absolute threshold, a touch would
+never end after the charge at rest has drifted above the threshold.
 """
 
 import math
@@ -15,10 +15,11 @@ from isocharge.serve.signal_chain.rule import Rule, Setting
 
 
 class TouchRule(Rule, frozen=True, kw_only=True):
-    """Thresholds of a touch; the section `[touch]` of a device file.
+    """Thresholds for the detection of a touch, from the section `[touch]` of a device file.
 
-    With the reference noise, the touch threshold is 20 pC. A press of 0.05 N on a film of 25 um gives 340 pC in total.
-    A press whose force falls from 2 N to 0.05 N keeps 8 % of its peak, so it is not released.
+    With the reference noise, the touch threshold is 20 pC. A press of 0.05 N on a film with a thickness of 25 um gives
+    a total charge of 340 pC. If the force of a press falls from 2 N to 0.05 N, the total charge falls to 8 % of its
+    peak, so the touch does not end.
 
     Attributes:
         sigmas: First part of the touch threshold, in standard deviations of the total charge at rest.
@@ -64,32 +65,36 @@ def update_contact(
 ) -> Touch:
     """Return the state of the touch detection after the next frame.
 
-    A touch begins when the total charge exceeds the base by the touch threshold. A touch ends when the total charge
-    falls below the release threshold. This threshold is a share of the peak of the press, but at least half of the
-    touch threshold.
+    A touch begins when the total charge exceeds the base by the touch threshold. The base is the smallest total charge
+    since the last release. A touch ends when the total charge falls below the release threshold. The release threshold
+    is a share of the peak of the press plus the uncertainty of the total charge, but at least half of the touch
+    threshold.
 
     Args:
         rule: The thresholds.
         touch: State after the previous frame.
         total_pC: Total touch charge of this frame, pC. A press makes it positive.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
-        decay: Factor by which the base decays since the previous frame. It is below 1 if the charge at rest decays.
+        decay: Factor by which the base has decayed since the previous frame. It is below 1 if the charge at rest
+            decays.
         scale_std: Relative standard deviation that all charges have in common, because the memory of the film is not
             known exactly.
     """
-    touch_threshold_pC = rule.floor_pC + rule.sigmas * math.sqrt(float(np.dot(noise_pC, noise_pC)))
+    total_noise_pC = math.sqrt(float(np.dot(noise_pC, noise_pC)))  # standard deviation of the total charge at rest
+    touch_threshold_pC = rule.floor_pC + rule.sigmas * total_noise_pC
     if touch.contact:
         two_frame_peak_pC = min(total_pC, touch.last_pC)  # a spike of a single frame is not a peak
         peak_pC = max(touch.peak_pC, two_frame_peak_pC)
         uncertainty_pC = SCALE_STD_FACTOR * scale_std * total_pC
         release_threshold_pC = max(rule.release_share * peak_pC + uncertainty_pC, 0.5 * touch_threshold_pC)
         if total_pC < release_threshold_pC:
-            return Touch(last_pC=total_pC, base_pC=total_pC)
+            return Touch(last_pC=total_pC, base_pC=total_pC)  # after a release, the base begins at the present charge
         return Touch(contact=True, peak_pC=peak_pC, last_pC=total_pC)
 
     # Nothing touched in the previous frame.
     base_pC = decay * touch.base_pC
     if total_pC > base_pC + touch_threshold_pC:
-        return Touch(contact=True, peak_pC=min(total_pC, touch.last_pC), last_pC=total_pC)
+        two_frame_peak_pC = min(total_pC, touch.last_pC)
+        return Touch(contact=True, peak_pC=two_frame_peak_pC, last_pC=total_pC)
     is_negative = total_pC < -touch_threshold_pC
     return Touch(last_pC=total_pC, base_pC=min(base_pC, total_pC), is_negative=is_negative)

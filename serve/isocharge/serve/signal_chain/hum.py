@@ -1,12 +1,12 @@
 """Removal of mains hum by an adaptive notch filter.
 
-A fixed notch filter rings after every touch. For example, a step of 850 pC through a notch of 1 Hz takes a second to
-settle. Therefore the hum itself is estimated and subtracted (Widrow et al., "Adaptive noise cancelling", 1975;
-normalised least mean squares). The hum in each channel is a sine wave of known frequency. Its amplitude and its phase
-change slowly.
+A fixed notch filter rings after every touch. For example, the output of a notch filter with a width of 1 Hz takes a
+second to settle after a step of 850 pC. This filter therefore estimates the hum itself, and subtracts it (Widrow et
+al., "Adaptive noise cancelling", 1975; normalised least mean squares). The hum in each channel is a sine wave of known
+frequency, whose amplitude and phase change slowly.
 
-The estimate is updated with the differences of consecutive frames, because a touch changes these differences only
-briefly. Each difference is clipped. The filter does not delay the signal.
+The estimate of the hum is updated with the differences of consecutive frames, because a touch changes these differences
+only briefly. Each difference is clipped. The filter does not delay the signal.
 """
 
 import cmath
@@ -23,7 +23,7 @@ MIN_SQUARED_STEP = 0.02
 
 
 class HumRule(Rule, frozen=True, kw_only=True):
-    """Settings of the estimate of hum; the section `[hum]` of a device file.
+    """Settings of the estimate of hum, from the section `[hum]` of a device file.
 
     Attributes:
         frequency_Hz: Frequency of the mains, 50 or 60 Hz.
@@ -41,31 +41,39 @@ class Hum(NamedTuple):
 
     Attributes:
         phasor_pC: Amplitude and phase in each channel, shape (electrodes,), complex, pC.
-        turn: Unit phasor of the mains at this frame.
+        unit_phasor: Phasor of magnitude 1 that turns with the mains frequency, at this frame.
         raw_pC: Charges of this frame, shape (electrodes,), pC; None before the first frame.
     """
 
     phasor_pC: Complexes
-    turn: complex = 1.0 + 0.0j
+    unit_phasor: complex = 1.0 + 0.0j
     raw_pC: Array | None = None
 
     @classmethod
     def start(cls, electrodes: int) -> "Hum":
-        """Return the state before the first frame."""
+        """Return the state before the first frame, in which the hum is zero."""
         return cls(np.zeros(electrodes, dtype=complex))
 
 
 def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) -> tuple[Hum, Array]:
-    """Subtract the hum from a frame, and update the estimate.
+    """Subtract the hum from a frame, and update the estimate of the hum.
 
-    The hum of a channel is the real part of a product of two complex numbers. The first is the phasor of the channel,
-    which has the amplitude and the phase of the hum. The second is a unit phasor that turns with the mains frequency.
-    The phasor of the channel is estimated from the differences between consecutive frames, which contain little of the
-    touch charge.
+    The hum of a channel is the real part of a product of two complex numbers. The first number is the phasor of the
+    channel, whose magnitude and angle are the amplitude and the phase of the hum. The second number is a unit phasor,
+    exp(2 pi i f t), that turns with the mains frequency f. The phasor of the channel is estimated from the differences
+    between consecutive frames, which contain little of the touch charge.
+
+    The estimate follows the method of normalised least mean squares (Widrow et al. 1975). Let z be the change of the
+    unit phasor between two frames. The phasor of the channel is then changed by
+
+        gain * error * conjugate(z) / |z|^2,
+
+    where the error is the change of the charge minus the expected change of the hum. With a gain of 1, the updated hum
+    would explain the whole error.
 
     Args:
         rule: Settings of the estimate of hum.
-        hum: State after the previous frame.
+        hum: State of the estimate after the previous frame.
         raw_pC: Charges of the frame, shape (electrodes,), pC.
         t_s: Time on the clock of the device, s.
         dt_s: Time since the previous frame, s.
@@ -73,16 +81,19 @@ def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) 
     Returns:
         The state after this frame, and the charges without hum, shape (electrodes,), pC.
     """
-    turn = cmath.exp(2j * math.pi * rule.frequency_Hz * t_s)  # the unit phasor at this frame
-    turn_step = turn - hum.turn
-    squared_step = turn_step.real * turn_step.real + turn_step.imag * turn_step.imag
-    phasor_pC = hum.phasor_pC
+    unit_phasor = cmath.exp(2j * math.pi * rule.frequency_Hz * t_s)
+    phasor_step = unit_phasor - hum.unit_phasor
+    squared_step = phasor_step.real * phasor_step.real + phasor_step.imag * phasor_step.imag
+    channel_phasor_pC = hum.phasor_pC
+
+    # The estimate needs a previous frame. If the unit phasor has hardly changed, the change contains little hum.
     if hum.raw_pC is not None and squared_step > MIN_SQUARED_STEP:
-        # One step of normalised least mean squares: compare the change of the charges with the change of the hum.
-        expected_change_pC = (phasor_pC * turn_step).real
+        expected_change_pC = (channel_phasor_pC * phasor_step).real
         error_pC = raw_pC - hum.raw_pC - expected_change_pC
-        clipped_pC = np.minimum(np.maximum(error_pC, -rule.limit_pC), rule.limit_pC)
+        # Clipping limits the influence of a touch, which may change the charges by more than the hum.
+        clipped_error_pC = np.minimum(np.maximum(error_pC, -rule.limit_pC), rule.limit_pC)
         gain = min(1.0, 2.0 * dt_s / rule.settle_s)
-        phasor_pC = phasor_pC + clipped_pC * (gain / squared_step * turn_step.conjugate())
-    hum_pC = (phasor_pC * turn).real
-    return Hum(phasor_pC, turn, raw_pC), raw_pC - hum_pC
+        correction_per_error = gain / squared_step * phasor_step.conjugate()
+        channel_phasor_pC = channel_phasor_pC + clipped_error_pC * correction_per_error
+    hum_pC = (channel_phasor_pC * unit_phasor).real
+    return Hum(channel_phasor_pC, unit_phasor, raw_pC), raw_pC - hum_pC

@@ -6,15 +6,16 @@ frame by frame,
     q[n] = q[n-1] + i[n] - b dt,        i[n] = v[n] - a v[n-1],        a = exp(-dt / tau),
 
 where i is the innovation and b is the inflow (pC/s), the current that flows in because of offset, bias and slow
-warming. The inflow is estimated from the innovation. An estimate from the output v would diverge. The inflow is
-estimated only out of contact, where the innovation consists of b dt and noise.
+warming. The inflow is estimated from the innovation, because an estimate from the output v would diverge. The inflow is
+estimated only while nothing touches the film. The innovation then consists of noise and of b dt, the contribution of
+the inflow.
 
-Frames of a touch must not change the estimated inflow, so there are three rules. Each innovation is clipped. During a
-touch, the inflow that was estimated `look_back_s` before the touch is used. After a release, the estimate pauses for
-`hold_off_s`.
+Frames of a touch must not change the estimated inflow. Therefore, three rules are applied. Each innovation is clipped.
+During a touch, the correction uses the inflow that was estimated `look_back_s` before the touch. After a release, the
+estimate of the inflow pauses for the time `hold_off_s`.
 
-While nothing touches the film, the computed touch charge decays exponentially to zero. Any charge at that time is an
-error, or comes from a slow warming of the film.
+While nothing touches the film, the computed touch charge decays exponentially to zero, because any charge at this time
+is an error or comes from a slow warming of the film.
 """
 
 import math
@@ -27,7 +28,7 @@ from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
 
 
 class LeakRule(Rule, frozen=True, kw_only=True):
-    """Settings for estimating the inflow. These settings are a part of the section `[leak]` of a device file.
+    """Settings for the estimate of the inflow, which are a part of the section `[leak]` of a device file.
 
     Attributes:
         learn: Whether the inflow b is estimated.
@@ -73,7 +74,7 @@ class Leak(NamedTuple):
 
     @classmethod
     def start(cls, output_pC: Array) -> "Leak":
-        """Return the state at the first frame after the tare."""
+        """Return the state at the first frame after the tare, in which the touch charge and the inflow are zero."""
         zeros = np.zeros_like(output_pC)
         return cls(zeros, output_pC, zeros, zeros, zeros)
 
@@ -83,8 +84,13 @@ def undo_leak(
 ) -> Leak:
     """Compute the touch charge of the next frame, and return the state after this frame.
 
-    The output of an amplifier decays with its time constant. The innovation is the difference between the output and
-    the decayed previous output. It consists of the inflow, noise and new touch charge.
+    The output v of an amplifier decays with its time constant tau. The innovation i of frame n is the difference
+    between the output and the decayed previous output,
+
+        i[n] = v[n] - exp(-dt / tau) v[n-1].
+
+    The innovation consists of the inflow b dt (a slow current into the amplifier), noise and new touch charge. The
+    touch charge is therefore q[n] = q[n-1] + i[n] - b dt.
 
     Args:
         rule: Settings of the estimate of the inflow.
@@ -95,26 +101,28 @@ def undo_leak(
         dt_s: Time since the previous frame, s.
         contact: Whether something touched in the previous frame.
     """
-    # The output that would remain without new charge has decayed with the time constant of the amplifier.
-    decayed_output_pC = np.exp(-dt_s / tau_s) * leak.output_pC
+    decayed_output_pC = np.exp(-dt_s / tau_s) * leak.output_pC  # output that would remain without new charge
     innovation_pC = output_pC - decayed_output_pC
     surplus_pC = innovation_pC - leak.inflow_pC_per_s * dt_s
     charge_pC = leak.charge_pC + surplus_pC
     if contact:
         return in_touch(leak, charge_pC, output_pC, rule.hold_off_s)
 
-    # Out of contact the charge decays to zero, and the inflow is learned after a pause.
+    # Out of contact, any charge is an error. The charge therefore decays to zero.
     decayed_charge_pC = charge_pC * math.exp(-dt_s / rule.relax_s)
     after = leak._replace(charge_pC=decayed_charge_pC, output_pC=output_pC)
-    if after.hold_s > 0.0 or not rule.learn:
+
+    # The estimate of the inflow pauses for some time after a release.
+    is_paused = after.hold_s > 0.0
+    if is_paused or not rule.learn:
         return after._replace(hold_s=after.hold_s - dt_s)
     return learn_inflow(rule, after, surplus_pC, noise_pC, dt_s)
 
 
 def in_touch(leak: Leak, charge_pC: Array, output_pC: Array, hold_off_s: float) -> Leak:
-    """Return the state after a frame in contact.
+    """Return the state of the leak compensation after a frame in contact.
 
-    During a contact, the inflow is not estimated. The last reliable estimate is used instead.
+    During a contact, the inflow is not estimated. The last trusted estimate is used instead.
 
     Args:
         leak: State after the previous frame.
@@ -136,11 +144,15 @@ def in_touch(leak: Leak, charge_pC: Array, output_pC: Array, hold_off_s: float) 
 
 
 def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array, dt_s: float) -> Leak:
-    """Return the state with a corrected inflow.
+    """Use a frame out of contact to update the estimated inflow, which is the slow current into each amplifier.
 
-    The inflow follows the mean of the surplus over `settle_s`. Large surpluses are clipped, because touches cause large
-    surpluses. The beginning of an undetected touch may have changed the latest inflow. Every `look_back_s`, the inflow
-    is therefore stored as the candidate, and the previous candidate becomes the trusted inflow.
+    The surplus is the part of the new charge that the estimated inflow does not explain. The surplus is divided by an
+    averaging time and added to the inflow, so the inflow follows the mean over this time. Large surpluses are clipped,
+    because touches cause large surpluses.
+
+    The beginning of an undetected touch may have changed the latest inflow. During a touch, the older trusted inflow is
+    therefore used. After each time interval `look_back_s`, the inflow is stored as the candidate, and the previous
+    candidate becomes the trusted inflow.
 
     Args:
         rule: Settings of the estimate of the inflow.
@@ -152,13 +164,18 @@ def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array,
     Returns:
         The state with the new inflow, candidate and trusted inflow.
     """
-    # The surplus of noise alone is the difference of two frames, whose standard deviation is sqrt(2) times larger.
+    # Without a touch, the surplus is the difference of the noise of two frames. The standard deviation of this
+    # difference is sqrt(2) times that of one frame.
     limit_pC = np.maximum(rule.clip_pC, rule.clip_sigmas * math.sqrt(2.0) * noise_pC)
-    clipped_pC = np.minimum(np.maximum(surplus_pC, -limit_pC), limit_pC)
-    learned_s = leak.learned_s + dt_s
-    averaging_s = max(min(rule.settle_s, learned_s), dt_s)  # the correction is at most the whole surplus
-    inflow_pC_per_s = leak.inflow_pC_per_s + clipped_pC / averaging_s
+    clipped_surplus_pC = np.minimum(np.maximum(surplus_pC, -limit_pC), limit_pC)
 
+    # Until `settle_s` has passed, the surplus is averaged over the time for which the inflow has been learned. The
+    # averaging time is at least `dt_s`, so that the corrected inflow explains at most the whole surplus.
+    learned_s = leak.learned_s + dt_s
+    averaging_s = max(min(rule.settle_s, learned_s), dt_s)
+    inflow_pC_per_s = leak.inflow_pC_per_s + clipped_surplus_pC / averaging_s
+
+    # Replace the trusted inflow and the candidate if the candidate is old enough.
     trusted_pC_per_s = leak.trusted_pC_per_s
     candidate_pC_per_s = leak.candidate_pC_per_s
     candidate_age_s = leak.candidate_age_s + dt_s

@@ -4,26 +4,27 @@ After a step of the touch charge q, the charge of the film changes by the size o
 
     h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / warmth_s).
 
-The film creeps with the logarithm of time. A charge has its nominal value one second after the step. Stretching cools
-the film, and the pyroelectric charge of this cooling vanishes when the film has reached its temperature again. The
-logarithm is approximated by a sum of exponentials with one time constant in each decade (a Prony series, whose ripple
-is 2 % of `creep`). The charge of the film is then
+The creep of the film is proportional to the logarithm of time, and is zero one second after the step. Stretching cools
+the film. The pyroelectric charge of this cooling disappears when the film has returned to the temperature of the air.
+The logarithm is approximated by a Prony series, which is a sum of exponentials with one time constant in each decade.
+The ripple of the Prony series is 2 % of `creep`. The charge of the film is then
 
     y[n] = h(0) q[n] - sum_j w_j r_j[n] + d[n],     r_j[n] = e r_j[n-1] + (1 - e) q[n-1],     e = exp(-dt / tau_j)
 
 where y is the output of the amplifier after the correction of the leak (`isocharge.serve.signal_chain.leak`), r_j is
 the touch charge smoothed with the time constant tau_j, and d is the warmth, the pyroelectric charge of each electrode.
-The equation is solved for q in each frame. The slope of d decays with the time constant warmth_s, because the film
-follows the temperature of the air with this time constant. One product with a matrix advances the state (r_j, d, slope
-of d, q).
+In each frame, this equation is solved for the touch charge q. The slope of the warmth d decays with the time constant
+warmth_s, because the film follows the temperature of the air with this time constant. The state consists of the
+smoothed touch charges r_j, the warmth d, the slope of the warmth, and the touch charge q. Multiplication by a matrix
+advances the state from one frame to the next.
 
-Out of contact, q is 0, so that y gives d. A fading-memory filter (g = 1 - f^2, h = (1 - f)^2; Brookner 1998, chapter 1)
-estimates d and its slope. During a touch, d and its slope are predicted from their values `look_back_s` before the
-touch.
+While nothing touches the film, the touch charge q is 0, and the equation gives the warmth d. A fading-memory filter
+estimates the warmth and the slope of the warmth (Brookner 1998, chapter 1). During a touch, the warmth and its slope
+are predicted from the values that they had `look_back_s` before the touch.
 
-After a release, a charge remains because of the errors of `creep` and `thermoelastic`. A Kalman filter estimates a
-scale factor for each of these two settings from the remaining charge. The noise of this measurement includes the change
-that warmth may have caused since the touch began.
+After a release, a charge remains if the settings `creep` and `thermoelastic` have errors. From the remaining charge, a
+Kalman filter estimates a scale factor for `creep` and a scale factor for `thermoelastic`. The variance of the remaining
+charge includes the possible change of the warmth since the beginning of the touch.
 """
 
 import math
@@ -85,12 +86,12 @@ MIN_CREEP_PC = 1e-9
 
 
 class MemoryRule(Rule, frozen=True, kw_only=True):
-    """Memory of the film, which changes the charges of a held press; the section `[memory]` of a device file.
+    """Memory of the film, which changes the charge of a held press, from the section `[memory]` of a device file.
 
     Attributes:
         creep: Share of a charge that is lost in each decade of time.
-        thermoelastic: Share by which the charges of a touch are larger at first, before the film has reached its
-            temperature again.
+        thermoelastic: Share by which the charges of a touch are larger at first, before the film has returned to the
+            temperature of the air.
         warmth_s: Time constant with which the film follows the temperature of the air, s.
         known: Relative standard deviation of `creep` and `thermoelastic`. A larger value increases the reported
             standard deviations of contacts.
@@ -119,8 +120,8 @@ class Memory(NamedTuple):
         trusted_s: Age of the trusted values, s.
         candidate_s: Age of the candidate, s.
         unseen_s: Time for which d could not be observed, s.
-        learn_s: Remaining time in which the scale factors are updated, s. While it is above `LEARN_S`, something
-            touches or a finger is leaving the film.
+        learn_s: Remaining time in which the scale factors are updated, s. While this time is above `LEARN_S`, something
+            touches the film or is leaving the film.
     """
 
     film: Film
@@ -148,12 +149,13 @@ class Memory(NamedTuple):
             rule: Memory of the film.
             output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.
         """
-        rows_pC = np.zeros((len(INITIAL_PROPAGATION), output_pC.size))
-        scale_variance = rule.known**2
+        rows_pC = np.zeros((len(INITIAL_PROPAGATION), output_pC.size))  # shape (rows, electrodes)
+        scale_variance = rule.known**2  # `known` is a relative standard deviation
         variances = ScaleVariances(creep=scale_variance, step=scale_variance, covariance=0.0)
         film = Film.with_memory(rule.creep, rule.thermoelastic, variances)
+        # Without warmth and memory, the output is the touch charge multiplied by the response to a step.
         leak = Leak.start(output_pC)._replace(charge_pC=output_pC / film.step_response)
-        warmth_pC = rows_pC[WARMTH_ROWS]
+        warmth_pC = rows_pC[WARMTH_ROWS]  # the warmth and its slope, which are 0
         return cls(
             film,
             leak,
@@ -178,9 +180,9 @@ def undo_memory(
 ) -> Memory:
     """Compute the touch charge of the next frame, and return the state after this frame.
 
-    The touch charge is `leak.charge_pC` of the state. During a touch, the other parts of the state are only predicted.
-    Out of contact, the warmth and its slope, the inflow of the amplifiers, and the scale factors of the film are
-    updated.
+    The touch charge is the field `leak.charge_pC` of the returned state. During a touch, the other parts of the state
+    are only predicted. Out of contact, the warmth and its slope, the inflow of the amplifiers, and the scale factors of
+    the film are updated.
 
     Args:
         rule: Memory of the film.
@@ -266,31 +268,44 @@ def undo_memory(
 def _observe_warmth(
     rule: MemoryRule, rows_pC: Array, residual_pC: Array, dt_s: float, *, is_slope_updated: bool
 ) -> Array:
-    """Return the state after the warmth has been updated with a frame out of contact.
+    """Use a frame out of contact to update the warmth, which is the charge due to a change of the temperature.
 
-    Out of contact, the whole charge of the film that the predicted state does not explain is warmth. A fading-memory
-    filter updates the warmth and its slope.
+    The residual is the part of the charge of the film that the predicted state does not explain. Out of contact, the
+    warmth explains the whole residual. A fading-memory filter (Brookner 1998, chapter 1) updates the warmth and its
+    slope:
+
+        warmth += (1 - f^2) residual,    slope += (1 - f)^2 residual / dt,    f = exp(-dt / settle_s).
 
     Args:
-        rule: Memory of the film.
-        rows_pC: Predicted state, shape (rows, electrodes).
+        rule: Memory of the film, with the time constant `settle_s` of the filter.
+        rows_pC: Predicted state, shape (rows, electrodes). One row is the warmth, pC, and one row is its slope, pC/s.
         residual_pC: Charge of the film minus its prediction, shape (electrodes,), pC.
         dt_s: Time since the previous frame, s.
         is_slope_updated: Whether the slope is updated, too.
+
+    Returns:
+        The updated state, shape (rows, electrodes).
     """
     fading = math.exp(-dt_s / rule.settle_s)
+    warmth_gain = 1.0 - fading * fading
     updated_rows_pC = rows_pC.copy()
-    updated_rows_pC[WARMTH_ROW] += (1.0 - fading * fading) * residual_pC
+    updated_rows_pC[WARMTH_ROW] += warmth_gain * residual_pC
     if is_slope_updated:
-        updated_rows_pC[SLOPE_ROW] += ((1.0 - fading) ** 2 / max(dt_s, MIN_STEP_S)) * residual_pC
+        slope_gain_per_s = (1.0 - fading) ** 2 / max(dt_s, MIN_STEP_S)  # no division by zero
+        updated_rows_pC[SLOPE_ROW] += slope_gain_per_s * residual_pC
     return updated_rows_pC
 
 
 def _is_inflow_observable(rule: LeakRule, leak: Leak, rows_pC: Array) -> bool:
     """Return whether the inflow may be updated with a frame out of contact.
 
-    A steep warmth could be mistaken for inflow. The inflow is nevertheless updated until it has been averaged over
-    `settle_s` for the first time.
+    A fast change of the warmth could be mistaken for inflow. The inflow is nevertheless updated until it has been
+    averaged over `settle_s` for the first time.
+
+    Args:
+        rule: Settings of the estimate of the inflow, with the averaging time `settle_s`.
+        leak: State of the leak compensation.
+        rows_pC: State of the film's memory, shape (rows, electrodes). One row is the slope of the warmth, pC/s.
     """
     is_first_average = leak.learned_s < rule.settle_s
     steepest_pC_per_s = max(map(abs, rows_pC[SLOPE_ROW].tolist()))
@@ -298,9 +313,9 @@ def _is_inflow_observable(rule: LeakRule, leak: Leak, rows_pC: Array) -> bool:
 
 
 def _replace_trusted_warmth(memory: Memory, look_back_s: float) -> Memory:
-    """Return the state whose trusted warmth is the candidate, if the candidate is old enough.
+    """If the candidate for the trusted warmth is old enough, return a state in which it has become the trusted warmth.
 
-    The present warmth is then the next candidate.
+    The present warmth then becomes the next candidate. If the candidate is not old enough, return the state unchanged.
 
     Args:
         memory: State of this frame.
@@ -317,10 +332,12 @@ def _replace_trusted_warmth(memory: Memory, look_back_s: float) -> Memory:
 
 
 class RemainingCharge(NamedTuple):
-    """Charge that remains after a release, as a scalar measurement of the errors of creep and thermoelastic step.
+    """Charge that remains after a release, reduced to one number.
+
+    The charge is a measurement of the errors of creep and thermoelastic step.
 
     The charges of all electrodes form a vector, which is projected onto the direction of the predicted charges. The
-    predicted charges are the sum of the charges of creep and thermoelastic step.
+    predicted charge of an electrode is the sum of the charges of creep and thermoelastic step.
 
     Attributes:
         creep_pC: Projection of the predicted charge of creep.
@@ -338,6 +355,10 @@ class RemainingCharge(NamedTuple):
 def _remaining_charge(memory: Memory, creep_pC: Array, step_pC: Array) -> RemainingCharge | None:
     """Project the charge that remains after a release onto the direction of the predicted charges.
 
+    After a release, a part of the charge of the film remains because of creep and the thermoelastic step. The charges
+    of all electrodes form a vector. The sum of the predicted charges of creep and thermoelastic step defines the
+    direction. The projection onto this direction reduces each vector to one number.
+
     Args:
         memory: State of this frame.
         creep_pC: Predicted charge of creep, shape (electrodes,), pC.
@@ -347,20 +368,22 @@ def _remaining_charge(memory: Memory, creep_pC: Array, step_pC: Array) -> Remain
         The measurement; None if the predicted charges are too small to define a direction.
     """
     predicted_pC = creep_pC + step_pC
-    size_pC = math.sqrt(float(predicted_pC @ predicted_pC))
-    if size_pC < MIN_CREEP_PC:
+    norm_pC = math.sqrt(float(predicted_pC @ predicted_pC))
+    if norm_pC < MIN_CREEP_PC:
         return None
 
+    # The remaining charge was estimated as warmth. Subtract the warmth that the values before the touch predict.
     expected_warmth_pC, _expected_slope = memory.expected_pC
     remaining_pC = memory.rows_pC[WARMTH_ROW] - expected_warmth_pC
 
-    # The warmth may have changed during the touch, when it could not be observed.
-    warmth_pC2 = WARMTH_CHANGE_PC**2 * len(predicted_pC) * memory.unseen_s
-    creep_law_pC2 = (CREEP_LAW_DEVIATION * size_pC) ** 2
+    # The warmth may have changed during the touch, when it could not be observed. Its variance grows with this time.
+    electrode_count = len(predicted_pC)
+    warmth_pC2 = WARMTH_CHANGE_PC**2 * electrode_count * memory.unseen_s
+    creep_law_pC2 = (CREEP_LAW_DEVIATION * norm_pC) ** 2
     return RemainingCharge(
-        creep_pC=float(creep_pC @ predicted_pC) / size_pC,
-        step_pC=float(step_pC @ predicted_pC) / size_pC,
-        charge_pC=float(remaining_pC @ predicted_pC) / size_pC,
+        creep_pC=float(creep_pC @ predicted_pC) / norm_pC,
+        step_pC=float(step_pC @ predicted_pC) / norm_pC,
+        charge_pC=float(remaining_pC @ predicted_pC) / norm_pC,
         variance_pC2=warmth_pC2 + creep_law_pC2,
     )
 
@@ -368,36 +391,40 @@ def _remaining_charge(memory: Memory, creep_pC: Array, step_pC: Array) -> Remain
 def _learn_film(memory: Memory, dt_s: float) -> Memory:
     """Update the scale factors of creep and thermoelastic step with the charge that remains after a release.
 
-    The two scale factors are updated with one measurement by a Kalman filter. All frames after a release together count
-    as one measurement. The variance of each frame is therefore multiplied by the number of frames in `LEARN_S`.
+    The measurement is the deviation of the remaining charge from its prediction, along one direction. The deviation is
+    modelled as the sum of the predicted charges of creep and of the step, each multiplied by the error of its scale
+    factor. A Kalman filter updates the two scale factors with this scalar measurement. All frames after a release
+    together count as one measurement. The variance of each frame is therefore multiplied by the number of frames in
+    `LEARN_S`.
 
     Args:
         memory: State of this frame.
         dt_s: Time since the previous frame, s.
 
     Returns:
-        The state with the updated film. If creep cannot explain the remaining charge, the film is not updated until
-        the next release.
+        The state with the updated film. If errors of creep and step cannot explain the remaining charge, the film is
+        not updated until the next release.
     """
-    # Compare the charges that creep and step are predicted to leave, shape (electrodes,), with the remaining charge.
+    # Predict the charges that creep and step leave, shape (electrodes,), and compare them with the remaining charge.
     film = memory.film
-    unit_creep_pC, unit_step_pC = SCALE_RESPONSE.dot(memory.rows_pC)
+    unit_creep_pC, unit_step_pC = SCALE_RESPONSE.dot(memory.rows_pC)  # charges of a film with creep = 1 and step = 1
     creep_pC = film.creep * unit_creep_pC
     step_pC = film.thermoelastic * unit_step_pC
     measured = _remaining_charge(memory, creep_pC, step_pC)
     if measured is None:
         return memory
 
-    # Covariance of each scale factor with the measurement, and variance of the predicted measurement.
+    # Covariance of each scale factor with the measurement, and variance of the measurement due to both scale factors.
     variances = film.variances
     creep_covariance = variances.creep * measured.creep_pC + variances.covariance * measured.step_pC
     step_covariance = variances.covariance * measured.creep_pC + variances.step * measured.step_pC
     prior_pC2 = measured.creep_pC * creep_covariance + measured.step_pC * step_covariance
     is_explained = measured.charge_pC**2 <= OUTLIER_SIGMAS**2 * (prior_pC2 + measured.variance_pC2)
     if not is_explained:
-        return memory._replace(learn_s=0.0)
+        return memory._replace(learn_s=0.0)  # no further update after this release
 
-    # The Kalman update. The scale factors are relative to the properties of `film`, so that they are 1 at first.
+    # Kalman update of the scale factors and of their variances. The scale factors are relative to the present
+    # properties of the film, so they are 1 before the update.
     total_pC2 = prior_pC2 + measured.variance_pC2 * LEARN_S / max(dt_s, MIN_STEP_S)
     creep_scale = 1.0 + creep_covariance / total_pC2 * measured.charge_pC
     step_scale = 1.0 + step_covariance / total_pC2 * measured.charge_pC
@@ -407,7 +434,7 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
         covariance=variances.covariance - creep_covariance * step_covariance / total_pC2,
     )
 
-    # The charge that the scale factors explain in addition is removed from the warmth.
+    # The updated scale factors explain a part of the charge that was attributed to the warmth.
     rows_pC = memory.rows_pC.copy()
     rows_pC[WARMTH_ROW] -= (creep_scale - 1.0) * creep_pC + (step_scale - 1.0) * step_pC
     updated_film = Film.with_memory(film.creep * creep_scale, film.thermoelastic * step_scale, updated_variances)
@@ -417,25 +444,28 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
 def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
     """Return the state at the first frame of a touch.
 
-    Before its detection, the touch may have changed the latest estimate of the warmth. The warmth is therefore
-    predicted from the trusted estimate, whose age is at least `look_back_s`.
+    The warmth is the charge of each electrode due to a change of temperature. The touch may have changed the latest
+    estimate of the warmth before the touch was detected. The warmth is therefore predicted from the trusted estimate,
+    whose age is at least `look_back_s`.
 
     Args:
         rule: Memory of the film.
-        memory: State of this frame.
+        memory: State of this frame, in which the touch is not yet taken into account.
     """
     film = memory.film
     age_s = memory.trusted_s
-    rows_pC = memory.rows_pC.copy()
-    warmth_propagation = state_propagation(rule.warmth_s, age_s)[WARMTH_ROWS, WARMTH_ROWS]
+    rows_pC = memory.rows_pC.copy()  # the state, shape (rows, electrodes)
+    propagation = state_propagation(rule.warmth_s, age_s)  # matrix that advances the state by a time
+    warmth_propagation = propagation[WARMTH_ROWS, WARMTH_ROWS]  # its part for the warmth and the slope of the warmth
     rows_pC[WARMTH_ROWS] = warmth_propagation.dot(memory.trusted_pC)
 
     # The touch charge explains the part of the film's charge that the other rows do not explain.
-    rows_pC[CHARGE_ROW] = 0.0
+    rows_pC[CHARGE_ROW] = 0.0  # leave the touch charge out of the product below
     charge_pC = (memory.film_pC - film.response.dot(rows_pC)) / film.step_response
     rows_pC[CHARGE_ROW] = charge_pC
 
-    # Shortly after a previous touch, the warmth has not been observed since that touch began.
+    # The warmth is only observed out of contact. Shortly after a previous touch, it has not been observed since that
+    # touch began.
     unseen_s = age_s
     if memory.is_recently_touched:
         unseen_s = max(memory.unseen_s, age_s)
@@ -443,7 +473,7 @@ def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
         leak=memory.leak._replace(charge_pC=charge_pC),
         rows_pC=rows_pC,
         unseen_s=unseen_s,
-        learn_s=LEARN_S + RELEASE_S,
+        learn_s=LEARN_S + RELEASE_S,  # after the release, wait for `RELEASE_S`, then learn for `LEARN_S`
     )
 
 
@@ -452,13 +482,17 @@ def add_warmth(
 ) -> Memory:
     """Return the state after a part of the touch charge has been assigned to the warmth.
 
-    The charge of the film directly after the change is the same. If the scale factors must not be updated after this
-    touch, the time for which the warmth could not be observed is set to infinity. The measurement after the release
-    then has an infinite variance and no influence.
+    The charge of the film is h q + d, where h is the response to a step, q is the touch charge and d is the warmth, the
+    charge due to a change of temperature. The charge of the film stays the same if the touch charge is decreased by c
+    and the warmth is increased by h c.
+
+    If the scale factors of creep and thermoelastic step must not be updated after this touch, the time for which the
+    warmth could not be observed is set to infinity. The measurement after the release then has an infinite variance and
+    no influence.
 
     Args:
         memory: The state.
-        change_pC: Part of the touch charge, shape (electrodes,), pC.
+        change_pC: Part c of the touch charge, shape (electrodes,), pC.
         rate_pC_per_s: Change of the slope of the warmth, shape (electrodes,), pC/s.
         is_learned: Whether the scale factors of the film may be updated after this touch. Set it to False if the warmth
             is uncertain.
@@ -469,26 +503,30 @@ def add_warmth(
     rows_pC[WARMTH_ROW] += step_response * change_pC
     rows_pC[SLOPE_ROW] += step_response * rate_pC_per_s
     rows_pC[CHARGE_ROW] = charge_pC
-    return memory._replace(
-        leak=memory.leak._replace(charge_pC=charge_pC),
-        rows_pC=rows_pC,
-        unseen_s=memory.unseen_s if is_learned else math.inf,
-    )
+    unseen_s = memory.unseen_s if is_learned else math.inf
+    return memory._replace(leak=memory.leak._replace(charge_pC=charge_pC), rows_pC=rows_pC, unseen_s=unseen_s)
 
 
 def charge_scale_std(memory: Memory) -> float:
     """Return the relative standard deviation that all touch charges have in common, dimensionless.
 
     Errors of the scale factors of creep and of the thermoelastic step change the touch charge in proportion to the
-    charges of creep and step. The variance of the touch charge follows from the variances of the two scale factors.
+    charges of creep and step. Let c and s be the charges of creep and of the thermoelastic step, relative to the touch
+    charge. The relative variance of the touch charge is then
+
+        c^2 var(creep) + s^2 var(step) + 2 c s cov(creep, step).
+
     Without a touch, the result is 0.
+
+    Args:
+        memory: State after a frame.
     """
     film = memory.film
     total_rows_pC = memory.rows_pC.sum(axis=1)  # summed over the electrodes, shape (rows,)
     touch_pC = float(total_rows_pC[CHARGE_ROW])
     if touch_pC <= 0.0:
         return 0.0
-    unit_creep_pC, unit_step_pC = SCALE_RESPONSE.dot(total_rows_pC).tolist()
+    unit_creep_pC, unit_step_pC = SCALE_RESPONSE.dot(total_rows_pC).tolist()  # charges of a film with creep = step = 1
     creep_share = film.creep * unit_creep_pC / touch_pC
     step_share = film.thermoelastic * unit_step_pC / touch_pC
     variances = film.variances
@@ -497,4 +535,4 @@ def charge_scale_std(memory: Memory) -> float:
         + step_share * step_share * variances.step
         + 2.0 * creep_share * step_share * variances.covariance
     )
-    return math.sqrt(max(variance, 0.0))
+    return math.sqrt(max(variance, 0.0))  # rounding errors may make a small variance negative

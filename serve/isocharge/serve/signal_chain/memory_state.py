@@ -1,6 +1,6 @@
-"""State of the memory of a film (see `memory`).
+"""State that describes the memory of a film, which is used by the module `memory`.
 
-The module defines the rows of the state, the properties of a film, and the propagation of the state in time.
+This module defines the rows of the state, the properties of a film, and the propagation of the state in time.
 """
 
 from functools import lru_cache
@@ -74,6 +74,8 @@ class Film(NamedTuple):
             thermoelastic: Share by which the charges of a touch are larger at first.
             variances: Variances of the scale factors of creep and step.
         """
+        # The charge of the film is the sum of the warmth, the touch charge, and the charges of creep and of the
+        # thermoelastic step.
         response = creep * CREEP_RESPONSE + thermoelastic * STEP_RESPONSE
         response[WARMTH_ROW] = 1.0
         response[CHARGE_ROW] += 1.0
@@ -83,18 +85,22 @@ class Film(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _relaxation(warmth_s: float) -> tuple[Array, Array]:
-    """Return the time constants and the steady state, from which the propagation over any time is computed.
+    """Return the time constants and the steady state from which `state_propagation` computes its matrix.
+
+    The rows of the state are the creep terms, the thermoelastic term, the warmth (charge due to a change of
+    temperature), its slope, and the touch charge.
 
     Args:
         warmth_s: Time constant with which the film follows the temperature of the air, s.
 
     Returns:
-        Time constant of each row of the state, shape (rows, 1), s. Propagation over a very long time, shape (rows,
-        rows). After such a time, the creep terms and the thermoelastic term equal the touch charge. The slope of
-        the warmth has decayed to zero, and has changed the warmth by `warmth_s` multiplied by the slope.
+        Two arrays. The first array is the time constant of each row, shape (rows, 1), s. The second array is the matrix
+        that propagates the state over a very long time, shape (rows, rows). After such a time, the creep terms and the
+        thermoelastic term equal the touch charge. The slope of the warmth has decayed to zero, and has changed the
+        warmth by `warmth_s` multiplied by the slope.
     """
     steady_state = np.zeros_like(INITIAL_PROPAGATION)
-    steady_state[:WARMTH_ROW, CHARGE_ROW] = 1.0
+    steady_state[:WARMTH_ROW, CHARGE_ROW] = 1.0  # the creep terms and the thermoelastic term follow the touch charge
     steady_state[WARMTH_ROW, WARMTH_ROW] = 1.0
     steady_state[WARMTH_ROW, SLOPE_ROW] = warmth_s
     # The rows after the creep terms (thermoelastic term, warmth, slope and charge) have the time constant of the air.
@@ -105,6 +111,11 @@ def _relaxation(warmth_s: float) -> tuple[Array, Array]:
 @lru_cache(maxsize=256)
 def state_propagation(warmth_s: float, dt_s: float) -> Array:
     """Return the matrix that advances the state by a time, shape (rows, rows).
+
+    Let I be the matrix for the time 0, S the matrix for a very long time, and tau the time constant of a row. The
+    matrix for the time dt is then
+
+        S + exp(-dt / tau) (I - S).
 
     Args:
         warmth_s: Time constant with which the film follows the temperature of the air, s.

@@ -1,4 +1,4 @@
-"""Base class of the settings of a stage, and types of settings with bounds.
+"""Base class of the settings of a stage, and types of bounded numbers for these settings.
 
 The settings of a stage are a section of a device file.
 """
@@ -10,7 +10,7 @@ from msgspec import Meta
 from isocharge.common.structs import Settings
 
 LARGEST = 1_000_000_000
-"""Largest setting, in its unit."""
+"""Largest value of a setting, in the unit of the setting."""
 
 Setting = Annotated[float, Meta(ge=0, le=LARGEST)]
 """Number from 0 to `LARGEST`."""

@@ -1,4 +1,4 @@
-"""The interface of a stage of the signal chain, and the frame that passes the stages."""
+"""The interface of a stage of the signal chain, and the frame that passes through the stages."""
 
 import math
 from abc import ABC, abstractmethod
@@ -24,12 +24,13 @@ class ChainFrame:
         raw_pC: Charges as the device sent them, shape (electrodes,), pC.
         charge_pC: Charges after the stages that have processed the frame, shape (electrodes,), pC.
         tare: The tare that was subtracted; None while there is none.
-        is_finished: Whether the later stages skip the frame, because there is no tare.
+        is_finished: Whether the later stages skip the frame, because there is no tare yet.
         charge_scale_std: Relative standard deviation that all charges have in common, because the film's memory is not
             known exactly.
         touch: State of the touch detection after this frame. The touch stage sets it.
         base_relax_s: Time constant with which the charge out of contact decays to zero, s.
-        is_base_held: Whether a finger that is leaving the film keeps the charge out of contact from decaying.
+        is_base_held: Whether a finger is touching or leaving the film. A positive base of the touch detection then does
+            not decay.
         is_saturated: Whether an amplifier was at its limit at any time in this press.
     """
 
@@ -71,7 +72,7 @@ class Stage(ABC):
         """Discard the state that depends on the tare, because the film is tared again."""
 
     def begin_touch(self, frame: ChainFrame) -> None:  # noqa: B027  # most stages do nothing
-        """Adapt to a touch that begins with this frame. The touch stage calls this method of all earlier stages."""
+        """Change the state and the frame for a touch that begins with this frame. The touch stage calls this method."""
 
 
 class OffsetStage(Stage):

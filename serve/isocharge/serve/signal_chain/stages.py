@@ -1,8 +1,8 @@
-"""The stages of the signal chain, each with its settings and its state.
+"""The stages of the signal chain. Each stage stores its settings and its state.
 
-The computations are pure functions in one module for each stage (`hum`, `tare`, `leak`, `memory`, `contact`,
-`thermal`). The classes here store the state between frames, and write the results that other stages need into the
-frame.
+The computations of the stages are pure functions in the modules `hum`, `tare`, `leak`, `memory`, `contact` and
+`thermal`. The classes of this module store the state between frames, and write the results that other stages need into
+the frame.
 """
 
 import math
@@ -28,7 +28,7 @@ from isocharge.serve.signal_chain.thermal import NO_DRIFT, Misfit, ThermalRule, 
 
 
 class Gain(Stage):
-    """Converts the unit of the device to pC, with offset, sign and gain of each channel."""
+    """Converts values of the device to charges in pC, with the offset, the sign and the gain of each channel."""
 
     def __init__(self, gain_pC: Array | None, zero: Array | None) -> None:
         """Set the conversion.
@@ -55,7 +55,7 @@ class Gain(Stage):
         return values if self._zero is None else values + self._zero
 
     def step(self, frame: ChainFrame) -> None:
-        """Set the raw charges of a frame."""
+        """Convert the values of a frame to charges."""
         frame.raw_pC = self.convert(frame.values)
         frame.charge_pC = frame.raw_pC
 
@@ -68,7 +68,7 @@ class Limit(Stage):
         self._limit_pC = limit_pC
 
     def step(self, frame: ChainFrame) -> None:
-        """Mark a frame with a charge at the limit."""
+        """Mark the frame if the magnitude of one of its charges is at the limit of the converter or above."""
         if bool((np.abs(frame.raw_pC) >= self._limit_pC).any()):
             frame.is_at_limit = True
 
@@ -77,7 +77,12 @@ class HumStage(Stage):
     """Subtracts mains hum."""
 
     def __init__(self, rule: HumRule, n_electrode: int) -> None:
-        """Begin without any hum."""
+        """Store the settings, and begin with an estimate of zero hum.
+
+        Args:
+            rule: Settings of the estimate of hum.
+            n_electrode: Number of electrodes.
+        """
         self._rule = rule
         self._hum = Hum.start(n_electrode)
 
@@ -86,7 +91,7 @@ class HumStage(Stage):
         self._hum, frame.charge_pC = remove_hum(self._rule, self._hum, frame.charge_pC, frame.t_s, frame.dt_s)
 
     def reset(self) -> None:
-        """Keep the estimate of the hum, but do not compare the next frame with an earlier frame."""
+        """Keep the estimate of the hum, but compute no difference between the next frame and the latest frame."""
         self._hum = self._hum._replace(raw_pC=None)
 
 
@@ -108,11 +113,16 @@ class TareStage(OffsetStage):
 
     @property
     def tare(self) -> Tare | None:
-        """The tare that is subtracted; None while there is none."""
+        """The tare that is subtracted from each frame; None before a tare has been measured."""
         return self._tare
 
     def step(self, frame: ChainFrame) -> None:
-        """Subtract the tare. While there is no tare, search for a tare.
+        """Subtract the tare, which is the charge at rest. While there is no tare, search for a tare.
+
+        The later stages skip a frame without a tare.
+
+        Args:
+            frame: The frame, which is changed in place.
 
         Raises:
             TareError: If the film is touched during the whole search for a tare.
@@ -124,13 +134,13 @@ class TareStage(OffsetStage):
         self._search(frame.charge_pC)
         frame.is_finished = True
         frame.flags.append(TARE)
-        if frame.is_at_limit:
+        if frame.is_at_limit:  # the later stage that sets this flag is skipped
             frame.flags.append(SATURATED)
 
     def reset(self) -> None:
         """Measure the tare again from the next quiet frames.
 
-        Unlike the first search, this search does not end with an error.
+        Unlike the first search for a tare, the new search does not end with an error.
         """
         self._tare = None
         self._waiting_pC = self._waiting_pC[:0]
@@ -143,9 +153,10 @@ class TareStage(OffsetStage):
         self._tare = self._tare._replace(charge_pC=self._tare.charge_pC + change.charge_pC)
 
     def _search(self, charge_pC: Array) -> None:
-        """Measure the tare if there are enough frames and they are quiet.
+        """Add a frame to the waiting frames, and measure the tare if the waiting frames are enough and quiet.
 
-        The tare is subtracted from the frames after this frame.
+        The tare is subtracted from the frames after this frame. If the settings contain no conditions for a tare, the
+        tare is 0.
 
         Args:
             charge_pC: Charges of this frame, shape (electrodes,), pC.
@@ -156,26 +167,35 @@ class TareStage(OffsetStage):
             return
         latest_pC = np.vstack([self._waiting_pC, charge_pC])
         self._waiting_pC = latest_pC[-self._rule.frames :]  # at most as many frames as a tare needs
-        if self._gives_up:
+        if self._gives_up:  # only then does the search end with an error after too many frames
             self._searched_frames += 1
         self._tare = look_for_tare(self._rule, self._waiting_pC, self._searched_frames)
         if self._tare is not None:
-            self._waiting_pC = self._waiting_pC[:0]
+            self._waiting_pC = self._waiting_pC[:0]  # no frame is waiting any more
 
 
 class LeakStage(OffsetStage):
     """Corrects the leak of the charge amplifiers, and estimates their inflow."""
 
     def __init__(self, rule: LeakRule, tau_s: Array) -> None:
-        """Set the time constant of each amplifier, shape (electrodes,), s."""
+        """Store the settings. The state begins at the first frame after the tare.
+
+        Args:
+            rule: Settings of the estimate of the inflow.
+            tau_s: Time constant of each amplifier, shape (electrodes,), s.
+        """
         self._rule = rule
         self._tau_s = tau_s
         self._leak: Leak | None = None
 
     def step(self, frame: ChainFrame) -> None:
-        """Replace the output of the amplifiers by the touch charge."""
+        """Replace the output of the amplifiers by the touch charge.
+
+        Args:
+            frame: The frame, which is changed in place. Its charges are the output above the tare.
+        """
         output_pC = frame.charge_pC
-        if self._leak is None:
+        if self._leak is None:  # the first frame after the tare
             self._leak = Leak.start(output_pC)
         else:
             self._leak = undo_leak(
@@ -188,10 +208,10 @@ class LeakStage(OffsetStage):
                 contact=frame.was_contact,
             )
         frame.charge_pC = self._leak.charge_pC
-        frame.base_relax_s = self._rule.relax_s
+        frame.base_relax_s = self._rule.relax_s  # out of contact, the charge decays to zero with this time constant
 
     def reset(self) -> None:
-        """Begin again at the first frame after the tare."""
+        """Discard the state. A new state begins at the first frame after the next tare."""
         self._leak = None
 
     def add_warming(self, change: WarmingChange) -> None:
@@ -204,7 +224,7 @@ class MemoryStage(OffsetStage):
     """Corrects creep, the thermoelastic step and the leak of the amplifiers together."""
 
     def __init__(self, rule: MemoryRule, leak_rule: LeakRule, tau_s: Array | None) -> None:
-        """Set the properties of the film and of the amplifiers.
+        """Store the settings. The state begins at the first frame after the tare.
 
         Args:
             rule: Memory of the film.
@@ -217,10 +237,14 @@ class MemoryStage(OffsetStage):
         self._memory: Memory | None = None
 
     def step(self, frame: ChainFrame) -> None:
-        """Replace the output of the amplifiers by the touch charge."""
+        """Replace the output of the amplifiers by the touch charge, and correct the memory of the film.
+
+        Args:
+            frame: The frame, which is changed in place. Its charges are the output above the tare.
+        """
         output_pC = frame.charge_pC
         previous = self._memory
-        if previous is None:
+        if previous is None:  # the first frame after the tare
             self._memory = Memory.start(self._rule, output_pC)
         else:
             frame.is_base_held = previous.is_recently_touched
@@ -234,17 +258,19 @@ class MemoryStage(OffsetStage):
                 frame.dt_s,
                 contact=frame.was_contact,
             )
+        # Out of contact, the estimate of the warmth absorbs the charge. A frame leaves the share exp(-2 dt / settle_s)
+        # of the charge, so the time constant is half of `settle_s`.
         frame.base_relax_s = 0.5 * self._rule.settle_s
         self._report(frame)
 
     def begin_touch(self, frame: ChainFrame) -> None:
-        """Predict the warmth during a touch from its values before the touch."""
+        """Replace the warmth in this frame by a prediction from its values before the touch."""
         assert self._memory is not None
         self._memory = begin_touch(self._rule, self._memory)
         self._report(frame)
 
     def reset(self) -> None:
-        """Begin again at the first frame after the tare."""
+        """Discard the state. A new state begins at the first frame after the next tare."""
         self._memory = None
 
     def add_warming(self, change: WarmingChange) -> None:
@@ -260,7 +286,7 @@ class MemoryStage(OffsetStage):
 
 
 class TouchStage(Stage):
-    """Determines whether something touches."""
+    """Determines whether something touches the film."""
 
     def __init__(self, rule: TouchRule | None, earlier_stages: list[Stage]) -> None:
         """Begin without a touch.
@@ -275,13 +301,16 @@ class TouchStage(Stage):
 
     @property
     def is_contact(self) -> bool:
-        """Whether something touched in the latest frame."""
+        """Whether something touched the film in the latest frame."""
         return self._touch.contact
 
     def step(self, frame: ChainFrame) -> None:
-        """Determine whether something touches in this frame, and notify the earlier stages if a touch begins.
+        """Determine whether something touches the film in this frame, and notify the earlier stages if a touch begins.
 
         The earlier stages may then change the charges of the frame, because the touch began before it was detected.
+
+        Args:
+            frame: The frame, after the earlier stages.
         """
         previous_touch = self._touch
         self._touch = self._next_touch(previous_touch, frame)
@@ -296,9 +325,9 @@ class TouchStage(Stage):
         self._touch = NO_TOUCH
 
     def _next_touch(self, previous_touch: Touch, frame: ChainFrame) -> Touch:
-        """Return the state of the touch detection after a frame. Without a rule, every frame is a touch.
+        """Return the state of the touch detection after a frame. Without thresholds, every frame is in contact.
 
-        The base is the smallest total charge since the last release. It decays exponentially with time.
+        The base is the smallest total charge since the last release. The base decays exponentially with time.
 
         Args:
             previous_touch: State after the previous frame.
@@ -307,7 +336,7 @@ class TouchStage(Stage):
         if self._rule is None:
             return Touch(contact=True)
         # While a finger leaves the film, a positive base must not decay, because this charge still belongs to the
-        # finger.
+        # finger. An infinite time constant makes the decay factor 1.
         base_relax_s = frame.base_relax_s
         if frame.is_base_held and previous_touch.base_pC > 0.0:
             base_relax_s = math.inf
@@ -326,7 +355,11 @@ class PressFlags(Stage):
     def step(self, frame: ChainFrame) -> None:
         """Add the flags `saturated` and `negative` to a frame.
 
-        A press that was saturated in one frame keeps the flag `saturated` until the press ends.
+        The flag `saturated` means that an amplifier is or was at its limit during the press. All later frames of the
+        press keep the flag `saturated`. The flag `negative` means that the total charge is well below zero.
+
+        Args:
+            frame: The frame, which is changed in place.
         """
         was_saturated_in_press = self._is_saturated and frame.touch.contact
         self._is_saturated = frame.is_at_limit or was_saturated_in_press
@@ -342,7 +375,7 @@ class PressFlags(Stage):
 
 
 class Warming(Stage):
-    """Estimates the common charge of a warming film with the model, and subtracts it."""
+    """Estimates the charge that a warming of the film adds to all electrodes, and subtracts this charge."""
 
     def __init__(
         self,
@@ -353,12 +386,12 @@ class Warming(Stage):
         ratios: Array | float = 1.0,
         warmth_s: float | None = None,
     ) -> None:
-        """Begin without any warming.
+        """Store the settings, and begin without any warming.
 
         Args:
             rule: Settings of the estimate of warming.
-            misfit: Misfit of the current model.
-            offset_stage: Stage that stores the charge at rest, to which the warming is added.
+            misfit: Function that returns how badly charges fit a single contact, according to the current model.
+            offset_stage: Stage that stores the charge at rest. Each change of the warming is added to this charge.
             ratios: Charge that warming adds to each electrode, relative to the mean magnitude over all electrodes,
                 shape (electrodes,), dimensionless.
             warmth_s: Time constant with which the film follows the air, s; None if it is not known.
@@ -371,11 +404,17 @@ class Warming(Stage):
         self._drift = NO_DRIFT
 
     def step(self, frame: ChainFrame) -> None:
-        """Estimate the warming of a frame in contact, subtract its change from the charges, and add the flags."""
+        """Estimate the warming of a frame in contact, subtract its change from the charges, and add the flags.
+
+        Earlier changes of the warming have already been subtracted by the stage that stores the charge at rest.
+
+        Args:
+            frame: The frame, which is changed in place.
+        """
         if not frame.touch.contact:
             self._drift = NO_DRIFT
             return
-        if frame.is_saturated:  # clipped charges have a misfit at every temperature
+        if frame.is_saturated:  # the charges of a saturated amplifier fit no contact, whatever the warming is
             return
         previous_pC = self._drift.charge_pC
         drift = track_thermal_drift(
@@ -383,7 +422,7 @@ class Warming(Stage):
         )
         self._drift = drift
 
-        # The properties of the film are not learned after a touch with a large warming.
+        # After a touch with a large warming, the stage of the film's memory must not learn the properties of the film.
         is_large = abs(drift.charge_pC) >= self._rule.tell_pC
         if drift.charge_pC != previous_pC:
             change_pC = (drift.charge_pC - previous_pC) * self._ratios
@@ -392,7 +431,7 @@ class Warming(Stage):
             self._offset_stage.add_warming(WarmingChange(change_pC, rate_pC_per_s, is_learned=not is_large))
         if is_large:
             frame.flags.append(THERMAL)
-        if drift.blind:
+        if drift.blind:  # the warming cannot be distinguished from a change of the force
             frame.flags.append(BLIND)
 
     def reset(self) -> None:

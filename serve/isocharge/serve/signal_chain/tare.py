@@ -13,13 +13,14 @@ from isocharge.serve.signal_chain.rule import Count, Rule, Setting
 
 
 class TareRule(Rule, frozen=True, kw_only=True):
-    """Conditions for frames from which the tare is measured; the section `[tare]` of a device file.
+    """Conditions for the frames from which the tare is measured, from the section `[tare]` of a device file.
 
     Attributes:
         frames: Number of frames in a tare; 100 are 0.5 s at 200 Hz.
         noise_limit_pC: Largest standard deviation of an electrode at rest, pC. The reference noise is 1 pC.
-        offset_limit_pC: Largest mean of an electrode at rest, pC. A press of 0.05 N or more on a film of 25 um gives a
-            larger mean over three electrodes. The tare therefore fails even if the press is held still.
+        offset_limit_pC: Largest magnitude of the mean charge of an electrode at rest, pC. Under a press of 0.05 N or
+            more on a film of 25 um, the mean charge of three electrodes is larger. The tare therefore fails even if the
+            press is held still.
         patience: Number of frames after which the search for quiet frames ends with an error; 0 for no limit.
     """
 
@@ -44,12 +45,16 @@ class Tare(NamedTuple):
 
 
 def look_for_tare(rule: TareRule, waiting_pC: Array, frames: int) -> Tare | None:
-    """Return the tare of the latest frames; None if there are too few frames, or the frames are not quiet.
+    """Measure the tare, which is the charge at rest, from the latest frames.
 
     Args:
-        rule: Number of frames, and limits of their noise and offset.
+        rule: Number of frames that a tare needs, limits of their noise and offset, and `patience`, the number of frames
+            after which the search ends with an error (0 for a search without end).
         waiting_pC: Charges of the latest frames, at most `rule.frames`, shape (k, electrodes), pC.
         frames: Number of frames since the search began.
+
+    Returns:
+        The tare; None if there are too few frames, or the frames are not quiet.
 
     Raises:
         TareError: If the frames are not quiet, and the search has lasted for `rule.patience` frames.
@@ -59,33 +64,36 @@ def look_for_tare(rule: TareRule, waiting_pC: Array, frames: int) -> Tare | None
     try:
         return measure_tare(rule, waiting_pC)
     except TareError:
-        if rule.patience and frames >= rule.patience:
+        has_time_limit = rule.patience > 0
+        if has_time_limit and frames >= rule.patience:
             raise
-    return None
+        return None  # search again with the next frame
 
 
 def measure_tare(rule: TareRule, raw_pC: Array) -> Tare:
-    """Return the mean and the noise of frames in which nothing touches the film.
+    """Measure the tare: the mean and the noise of each electrode in frames in which nothing touches the film.
 
     Args:
         rule: Limits of noise and offset of quiet frames.
         raw_pC: Charges of the frames, shape (n, electrodes), pC.
 
     Raises:
-        TareError: If something touches the film: a charge varies, or rests far from zero.
+        TareError: If the noise of an electrode or the magnitude of its mean charge exceeds the limit. Something then
+            touches the film.
     """
-    tare = Tare(raw_pC.mean(axis=0), raw_pC.std(axis=0), len(raw_pC))
-    noise_pC = float(tare.noise_pC.max())
-    offset_pC = float(np.abs(tare.charge_pC).max())
-    if noise_pC > rule.noise_limit_pC:
+    tare = Tare(charge_pC=raw_pC.mean(axis=0), noise_pC=raw_pC.std(axis=0), frames=len(raw_pC))
+    largest_noise_pC = float(tare.noise_pC.max())
+    largest_offset_pC = float(np.abs(tare.charge_pC).max())
+    if largest_noise_pC > rule.noise_limit_pC:
         raise TareError(
-            f"cannot tare on the last {tare.frames} frames: the charge of an electrode varies by {noise_pC:.3g} pC "
-            f"rms, expected at most {rule.noise_limit_pC:g} pC; leave the film alone and start again"
+            f"cannot tare on the last {tare.frames} frames: the charge of an electrode varies by "
+            f"{largest_noise_pC:.3g} pC rms, expected at most {rule.noise_limit_pC:g} pC; leave the film alone and "
+            "start again"
         )
-    if offset_pC > rule.offset_limit_pC:
+    if largest_offset_pC > rule.offset_limit_pC:
         raise TareError(
-            f"cannot tare on the last {tare.frames} frames: an electrode rests at {offset_pC:.4g} pC, expected at most "
-            f"{rule.offset_limit_pC:g} pC; take off what lies on the film, or raise the limit if the amplifier "
+            f"cannot tare on the last {tare.frames} frames: an electrode rests at {largest_offset_pC:.4g} pC, expected "
+            f"at most {rule.offset_limit_pC:g} pC; take off what lies on the film, or raise the limit if the amplifier "
             "rests there"
         )
     return tare

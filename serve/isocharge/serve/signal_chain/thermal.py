@@ -1,18 +1,19 @@
-"""Estimation of the warming of the film during a press. The estimate uses the misfit of the model.
+"""Estimation of the warming of the film during a press. The estimate uses the misfit that the model computes.
 
-A change of temperature adds a charge to every electrode (pyroelectricity). The charges of all electrodes are equal, or
-have known ratios. During a touch, the charge at rest cannot be measured. A contact has three unknowns, so four
-electrodes have one charge more than the contact needs.
+A change of the temperature adds a charge to every electrode (pyroelectricity). The pyroelectric charges are equal on
+all electrodes, or the ratios of these charges are known. During a touch, the charge at rest cannot be measured. A
+contact has three unknowns, so four electrodes give one charge more than is needed for the contact.
 
 A trial value of the common charge p is subtracted from all charges. The estimate is the trial value with which the
-remaining charges fit a single contact best. The squared misfit is a parabola in p, and its curvature gives the variance
-of the estimate. A Kalman filter describes p as a random walk that begins at 0 with every touch. If the memory of the
-film predicts the warmth, the slope of p is the random walk.
+remaining charges fit a single contact best. As a function of the trial value, the squared misfit is a parabola. The
+curvature of the parabola gives the variance of the estimate. A Kalman filter describes the common charge p as a random
+walk that begins at 0 with every touch. If the memory of the film predicts the warmth, the filter describes the slope of
+p as a random walk instead.
 
-At positions where a press increases all charges equally, warming cannot be distinguished from force, and the curvature
-vanishes. With three electrodes, this is the case at every position. With four electrodes, this is the case near the
-centre of a biaxial film. If warming cannot be distinguished from force, p is not changed, and the record has the flag
-`blind`.
+If warming cannot be distinguished from a change of the force, the curvature vanishes. With three electrodes, the
+curvature vanishes at every position. With four electrodes, the curvature vanishes where a press increases all charges
+equally, for example near the centre of a biaxial film. At such a position, the common charge p is not changed, and the
+record has the flag `blind`.
 """
 
 import math
@@ -35,12 +36,13 @@ Misfit = Callable[[Array], Reals]
 
 
 class ThermalRule(Rule, frozen=True, kw_only=True):
-    """Settings for estimating the warming. These settings are a part of the section `[common_mode]` of a device file.
+    """Settings for the estimate of the warming, which are a part of the section `[common_mode]` of a device file.
 
     Attributes:
         every_s: Time between two estimates, s.
-        wander_pC: Standard deviation of the change of p in one second, pC. The default of 50 pC is a change of 0.19 K
-            on 9 mm^2. A film of 25 um in air follows a step of half a kelvin within 2.7 s, about as fast.
+        wander_pC: Standard deviation of the change of p in one second, pC. The default of 50 pC is the charge of an
+            electrode of 9 mm^2 for a change of 0.19 K. A film of 25 um changes its temperature about as fast after a
+            step of the air temperature by half a kelvin.
         noise: Factor by which the errors of the model increase the standard deviation of an estimate.
         blind_pC: Standard deviation of an estimate above which temperature cannot be distinguished from force, pC.
         tell_pC: Smallest absolute value of p with which a record has the flag `thermal`, pC.
@@ -61,7 +63,7 @@ class ThermalDrift(NamedTuple):
         variance_pC2: Variance of p, pC^2.
         waited_s: Time since the last estimate, s.
         blind: Whether temperature could not be distinguished from force at the last estimate.
-        rate_pC_per_s: Change of the slope of p with this estimate, if the slope is predicted, pC/s.
+        rate_pC_per_s: Change of the slope of p by this estimate, pC/s; 0 if the slope is not predicted.
         covariance: Covariance of p and its slope, pC^2/s.
         rate_variance: Variance of the slope, pC^2/s^2.
     """
@@ -88,30 +90,39 @@ def track_thermal_drift(
     ratios: Array | float = 1.0,
     warmth_s: float | None = None,
 ) -> ThermalDrift:
-    """Return the state after the next frame in contact.
+    """Use a frame in contact to update the estimated charge p that the warming of the film adds to the electrodes.
 
-    Every `every_s`, the common charge p is estimated. A parabola is fitted to the squared misfits at several trial
-    values of p, and its minimum is the estimate. A Kalman filter combines the estimate with the prediction.
+    After each time interval `every_s`, a change of the charge p is estimated. Several trial values of the change are
+    subtracted from the charges. The misfit of a trial value is the distance of the remaining charges from the nearest
+    single contact. A parabola is fitted to the squared misfits. The minimum of the parabola is the estimate. A Kalman
+    filter weights this estimate by its variance and by the predicted variance of p.
 
     Args:
         rule: Settings of the estimate of warming.
         state: State after the previous frame.
-        charge_pC: Touch charges without the warming so far, shape (electrodes,), pC.
-        misfit: Misfit of the current model.
+        charge_pC: Touch charges from which the present p has been subtracted, shape (electrodes,), pC.
+        misfit: Function from charges, shape (n, electrodes), pC, to misfits, shape (n,), in standard deviations of the
+            noise.
         dt_s: Time since the previous frame, s.
         ratios: Charge that warming adds to each electrode, relative to p, shape (electrodes,), dimensionless.
         warmth_s: Time constant with which the slope of p decays, s; None if the slope is not predicted.
+
+    Returns:
+        The state after this frame. Its rate is the correction of the slope of p in this frame.
     """
     waited_s = state.waited_s + dt_s
     if waited_s < rule.every_s:
         return state._replace(waited_s=waited_s, rate_pC_per_s=0.0)
     predicted_pC2, predicted_covariance, predicted_rate_variance = _predicted_variances(rule, state, waited_s, warmth_s)
 
-    # Fit: squared misfit = constant + slope * p + curvature * p^2, where p is the trial value that is subtracted.
+    # Fit: squared misfit = constant + slope * c + curvature * c^2, where c is the trial value of the change.
     trial_charges_pC = charge_pC - TRIED_PC[:, np.newaxis] * ratios  # shape (trials, electrodes)
     squared_misfits = np.square(misfit(trial_charges_pC), dtype=float)
     _constant, slope, curvature = (_PARABOLA_FIT @ squared_misfits).tolist()
-    estimate_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf  # variance of the estimate
+
+    # The variance of the estimate is the inverse of the curvature, because the misfit is in standard deviations. Errors
+    # of the model increase it by `noise` squared. If the parabola is flat, warming cannot be distinguished from force.
+    estimate_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
     if estimate_pC2 > rule.blind_pC**2:
         return state._replace(waited_s=0.0, blind=True, rate_pC_per_s=0.0)
 
@@ -119,7 +130,7 @@ def track_thermal_drift(
     minimum_pC = -slope / (2.0 * curvature)
     change_pC = min(max(minimum_pC, float(TRIED_PC[0])), float(TRIED_PC[-1]))
 
-    # Kalman update of p and of its rate of change
+    # Kalman update of p and of its slope, with their variances and their covariance
     innovation_pC2 = predicted_pC2 + estimate_pC2
     charge_gain = predicted_pC2 / innovation_pC2
     rate_gain = predicted_covariance / innovation_pC2
@@ -135,10 +146,18 @@ def track_thermal_drift(
 def _predicted_variances(
     rule: ThermalRule, state: ThermalDrift, waited_s: float, warmth_s: float | None
 ) -> tuple[float, float, float]:
-    """Predict the uncertainty of the common charge p and of its rate of change.
+    """Predict the uncertainty of the common charge p and of its rate of change, after a time without an estimate.
 
-    The rate decays with the time constant `warmth_s` and has a white process noise. If this time constant is not known,
-    p is a random walk without a rate.
+    The rate decays with the time constant `warmth_s`, and random changes are added to the rate (white process noise).
+    If this time constant is not known, p is a random walk without a rate.
+
+    With the time t since the last estimate, the decay e = exp(-t / warmth_s) of the rate, the change
+    g = warmth_s (1 - e) of p for a rate of 1, and the variance r that the process noise adds to the rate, the
+    prediction is
+
+        var(p)       <- var(p) + 2 g cov(p, rate) + g^2 var(rate) + r t^2 / 3,
+        cov(p, rate) <- e (cov(p, rate) + g var(rate)) + r t / 2,
+        var(rate)    <- e^2 var(rate) + r.
 
     Args:
         rule: Settings of the estimate of warming.
@@ -147,24 +166,23 @@ def _predicted_variances(
         warmth_s: Time constant with which the rate of p decays, s; None if the rate is not predicted.
 
     Returns:
-        Variance of p, covariance of p and its rate, and variance of the rate.
+        Variance of p, pC^2; covariance of p and its rate, pC^2/s; and variance of the rate, pC^2/s^2.
     """
     if warmth_s is None:
         random_walk_pC2 = state.variance_pC2 + rule.wander_pC**2 * waited_s
         return random_walk_pC2, 0.0, 0.0
 
-    # The process noise of the rate adds the variance rate_noise * waited_s^2 / 3 to p. With the factor of 3, p changes
-    # by `wander_pC` in one second.
-    rate_noise = 3.0 * rule.wander_pC**2 * waited_s
+    # In one second, r t^2 / 3 is the square of `wander_pC`, so p changes by `wander_pC` (standard deviation).
+    added_rate_variance = 3.0 * rule.wander_pC**2 * waited_s
     decay = math.exp(-waited_s / warmth_s)
-    rate_effect_s = warmth_s * (1.0 - decay)  # change of p for a rate of 1
+    rate_effect_s = warmth_s * (1.0 - decay)
     covariance = state.covariance
     rate_variance = state.rate_variance
-    variance_pC2 = (
+    predicted_pC2 = (
         state.variance_pC2
         + rate_effect_s * (2.0 * covariance + rate_effect_s * rate_variance)
-        + rate_noise * waited_s**2 / 3.0
+        + added_rate_variance * waited_s**2 / 3.0
     )
-    predicted_covariance = decay * (covariance + rate_effect_s * rate_variance) + 0.5 * rate_noise * waited_s
-    predicted_rate_variance = decay * decay * rate_variance + rate_noise
-    return variance_pC2, predicted_covariance, predicted_rate_variance
+    predicted_covariance = decay * (covariance + rate_effect_s * rate_variance) + 0.5 * added_rate_variance * waited_s
+    predicted_rate_variance = decay * decay * rate_variance + added_rate_variance
+    return predicted_pC2, predicted_covariance, predicted_rate_variance

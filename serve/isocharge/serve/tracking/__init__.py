@@ -1,1 +1,4 @@
-"""Tracking of a contact from frame to frame, which improves the estimates of its position and its force."""
+"""Tracking of a contact over successive frames.
+
+Tracking reduces the noise of the estimated position and force, because it combines the information of many frames.
+"""

@@ -1,20 +1,23 @@
 """Gaussian mixture that follows a contact on a film whose map from contacts to charges has a fold.
 
-Where the map folds, several contacts have the same charges, and a single frame cannot distinguish them. A sequence of
-frames can distinguish them, because one contact crosses the fold while the other contact turns back at the fold.
+Near a fold of the map from contacts to charges, two different contacts produce the same charges. A single frame cannot
+distinguish these two contacts. A sequence of frames can distinguish the two contacts, because one contact crosses the
+fold while the other contact turns back at the fold.
 
-The state of a component is the position, the logarithm of the force, the rates of these three, and the logarithms of
-the electrode gains. The distribution of the state is a sum of Gaussians (Alspach and Sorenson 1972). Each component is
-updated with the measured charges by an iterated extended Kalman filter (Bell and Cathey 1993).
+The state of a component consists of x, y and the logarithm of the force, the rates of change of these three values, and
+the logarithms of the electrode gains. The distribution of the state is a sum of Gaussians (Alspach and Sorenson 1972).
+Each Gaussian component is updated with the measured charges by an iterated extended Kalman filter (Bell and Cathey
+1993).
 
 Components are added in four cases.
 
 - When a touch begins, components are placed all over the film. Components that do not explain the charges are removed.
-- If the most probable component extends across a fold, two components are added, one towards each side.
+- If the most probable component extends across a fold, one component is added on each side of the fold.
 - If the innovation of the most probable component exceeds the gate, a component with an uncertain velocity is added.
 - If the most probable component is fast, a component with zero velocity is added, because the contact may have stopped.
 
-Charges are averaged over `STEP_s` before an update. Shorter steps are hardly more accurate.
+The charges are averaged over intervals of `STEP_s` before an update. Shorter intervals would hardly improve the
+accuracy.
 """
 
 import math
@@ -50,17 +53,17 @@ from isocharge.serve.tracking.mixture_update import (
     LinearisedUpdate,
     Measurement,
     charges_and_jacobian,
-    limit_iteration_step,
+    limit_iteration_steps,
     linearise_update,
     updated_covariance,
 )
 from isocharge.serve.tracking.motion import FORCE_RATE_STD, SPEED_STD, MAX_GAP_s
 
 STEP_s = 0.005
-"""Time over which charges are averaged, s."""
+"""Length of the time interval over which charges are averaged, s."""
 
 CLOCK_TOLERANCE_s = 1e-5
-"""Amount by which a step may be shorter than `STEP_s`, s. The times of frames are not exact."""
+"""Amount by which a step may be shorter than `STEP_s`, s, because the times of the frames are not exact."""
 
 GAIN_STD = 0.01
 """Standard deviation of an electrode gain about its calibrated value, dimensionless."""
@@ -81,9 +84,9 @@ SQUARED_GATE = 8.0
 """Squared Mahalanobis distance of the innovation above which the velocity has probably changed, dimensionless."""
 
 SEARCH_INTERVAL_s = 0.05
-"""Shortest time between two searches over the whole film, each of which takes milliseconds, s."""
+"""Shortest time between two searches over the whole film, s. Each search takes milliseconds."""
 
-MAX_SQUARE = 60.0
+MAX_SQUARED_DISTANCE = 60.0
 """Largest squared distance of a component that explains the charges, dimensionless.
 
 The squared distance is the sum of the squared misfit of the charges and the squared change of the state.
@@ -95,7 +98,7 @@ MAX_RELATIVE_RADIUS = 1.1
 FOLD_DISTANCE = 4.0
 """Distance of a fold from the most probable component, in standard deviations, below which two components are added.
 
-The distance is large, because an error of a gain displaces the fold. The contact then seems to stop in front of it.
+The distance is large, because an error of a gain displaces the fold. The contact then seems to stop before the fold.
 """
 
 SPLIT_DISTANCE = 2.5
@@ -124,17 +127,20 @@ GOLDEN_ANGLE = 2.399963
 
 
 class ContactMixture:
-    """Follows one contact by its charges.
+    """Gaussian mixture that estimates the position and the force of one contact from the charges of each frame.
 
-    An object belongs to one thread. The same frames give the same results, bit for bit.
+    The methods must be called from one thread. The same sequence of frames always gives bitwise equal results.
+
+    Attributes:
+        charges: Charges of every contact on the film.
     """
 
     def __init__(self, charges: ChargeSeries, noise: ModelNoise) -> None:
-        """Begin without a contact.
+        """Start without a contact.
 
         Args:
-            charges: Charges of every contact.
-            noise: Noise of a frame, as in the training of the model.
+            charges: Charges of every contact on the film.
+            noise: Noise of the charges of a frame, with which the model was trained.
         """
         self.charges = charges
         self._noise = noise
@@ -142,48 +148,51 @@ class ContactMixture:
         self.reset()
 
     def reset(self) -> None:
-        """Discard the contact."""
+        """Discard the contact and all frames that were received."""
         self._components: Components | None = None
         self._hypotheses: list[ContactHypothesis] = []
         self._step_frames: list[tuple[Array, float]] = []  # charges and time of each frame of the present step
         self._step_begin_s = -math.inf
-        self._t_s = -math.inf  # mean time of the frames of the previous step
+        self._previous_step_s = -math.inf  # mean time of the frames of the previous step
         self._next_search_s = -math.inf  # time before which the whole film is not searched again
 
     def update(self, charge_pC: Array, t_s: float) -> list[ContactHypothesis]:
-        """Process the next frame.
+        """Process the next frame, and return the contacts that explain the charges.
 
-        The mixture is updated once for all frames of a step, which is a period of `STEP_s`. Between the updates, the
-        contacts are extrapolated to the time of the frame with their velocities.
+        The mixture is updated only once in each step, which is a time interval of length `STEP_s`. Between two updates,
+        the contacts are extrapolated to the time of the frame with constant velocities.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
             t_s: Time of the frame on any clock, s.
 
         Returns:
-            The contacts that explain the charges, in descending order of their probability; empty if there is none.
+            The contacts that explain the charges, in descending order of their probability. The list is empty if no
+            contact explains the charges.
         """
         self._step_frames.append((charge_pC, t_s))
+        # A time before the beginning of the step also ends the step, because the clock was then set back.
         is_within_step = 0.0 <= t_s - self._step_begin_s < STEP_s - CLOCK_TOLERANCE_s
         if not is_within_step:
             self._process_step(t_s)
-        return [hypothesis.extrapolated(t_s - self._t_s) for hypothesis in self._hypotheses]
+        return [hypothesis.extrapolated(t_s - self._previous_step_s) for hypothesis in self._hypotheses]
 
     def _process_step(self, t_s: float) -> None:
-        """Update the mixture with the mean charges of the frames of a step. The next step begins.
+        """Update the mixture with the mean charges of the frames in a step, and begin the next step.
 
         Args:
-            t_s: Time of the latest frame of the step, s.
+            t_s: Time of the latest frame in the step, s.
         """
-        charges, times_s = zip(*self._step_frames, strict=True)  # charges and time of each frame
+        charges_of_frames, times_s = zip(*self._step_frames, strict=True)
         mean_time_s = sum(times_s) / len(times_s)
-        dt_s = mean_time_s - self._t_s  # since the mean time of the previous step
+        dt_s = mean_time_s - self._previous_step_s  # since the mean time of the previous step
         self._step_frames = []
         self._step_begin_s = t_s
-        self._t_s = mean_time_s
+        self._previous_step_s = mean_time_s
 
-        # Follow the contact of the previous step. If there is none, search the whole film, but not in every step.
-        measurement = self._mean_measurement(charges)
+        # Follow the contact of the previous step. If there was no contact, or the charges no longer fit it, search the
+        # whole film. The search takes milliseconds, so it is not repeated in every step.
+        measurement = self._mean_measurement(charges_of_frames)
         components = None
         if self._components is not None and 0.0 < dt_s < MAX_GAP_s:
             components = self._advance(self._components, measurement, dt_s)
@@ -193,16 +202,17 @@ class ContactMixture:
         self._components = components
         self._hypotheses = [] if components is None else self._group(components)
 
-    def _mean_measurement(self, charges: Sequence[Array]) -> Measurement:
-        """Return the mean charges of a step, and their variances.
+    def _mean_measurement(self, charges_of_frames: Sequence[Array]) -> Measurement:
+        """Average the charges over the frames in a step, and compute the variances of the mean charges.
 
-        The average over the frames reduces the noise of single frames, but not the slow noise.
+        Averaging over n frames divides the variance of the frame noise by n. The slow noise is the same in all frames
+        of a step, so averaging does not reduce it.
 
         Args:
-            charges: Touch charges of each frame of the step, each of shape (n_electrode,), pC.
+            charges_of_frames: Touch charges of each frame in the step, each of shape (n_electrode,), pC.
         """
-        charge_pC = np.mean(charges, axis=0)
-        frame_noise_pC2 = self._noise.variance(charge_pC) / len(charges)
+        charge_pC = np.mean(charges_of_frames, axis=0)
+        frame_noise_pC2 = self._noise.variance(charge_pC) / len(charges_of_frames)
         slow_noise_pC2 = (SLOW_NOISE_STD * charge_pC) ** 2
         return Measurement(charge_pC, frame_noise_pC2 + slow_noise_pC2)
 
@@ -210,17 +220,17 @@ class ContactMixture:
         """Search the whole film for contacts that explain the charges.
 
         Components with large variances are placed on a spiral that covers the film, and are then updated with the
-        charges. A state contains the position, the logarithm of the force, the rates of these three, and the logarithm
-        of the gain of each electrode.
+        charges. The state of a component consists of x, y and the logarithm of the force, the rates of change of these
+        three values, and the logarithm of the gain of each electrode.
 
         Args:
             measurement: Charges of this step.
 
         Returns:
-            The components that explain the charges; None if there are none.
+            The updated components that explain the charges; None if no component explains them.
         """
         n_electrode = measurement.charge_pC.size
-        mean = np.zeros((N_INITIAL_COMPONENTS, N_MOTION + n_electrode))  # rates and logarithms of gains are 0
+        mean = np.zeros((N_INITIAL_COMPONENTS, N_MOTION + n_electrode))  # rates and logarithms of gains remain 0
         mean[:, CONTACT] = self._initial_contacts
 
         # Standard deviation of each entry of the state. Each component covers an equal part of the film.
@@ -237,11 +247,11 @@ class ContactMixture:
         return self._update(components, measurement, INITIAL_ITERATIONS)
 
     def _advance(self, components: Components, measurement: Measurement, dt_s: float) -> Components | None:
-        """Predict the components, and update them with the charges of a step.
+        """Predict the components at the time of this step, and update them with the measured charges.
 
-        A component with another velocity is added if the innovation of the most probable component (measured minus
-        predicted charges) is large, or if the most probable component is fast. The update then determines which of the
-        components is right.
+        A component with another velocity is added before the update if the most probable component is fast, or if its
+        innovation is large. The innovation is the difference between the measured and the predicted charges. The update
+        then changes the weight of each component according to how well the component explains the charges.
 
         Args:
             components: Components after the previous step.
@@ -253,8 +263,8 @@ class ContactMixture:
         """
         predicted = predict_components(components, dt_s)
 
-        # The added component begins as a copy of the most probable component. Its weight is multiplied by the
-        # probability that the velocity has changed suddenly since the previous step.
+        # The added component starts as a copy of the most probable component. Its weight is the weight of the most
+        # probable component multiplied by the probability of a sudden change of the velocity since the previous step.
         most_probable = predicted.best
         added_mean = predicted.mean[most_probable].copy()
         added_covariance = predicted.covariance[most_probable].copy()
@@ -262,7 +272,7 @@ class ContactMixture:
 
         has_large_innovation = self._squared_innovation(predicted, measurement) > SQUARED_GATE
         is_fast = np.hypot(added_mean[X_RATE], added_mean[Y_RATE]) > SPEED_STD
-        if has_large_innovation:  # the velocity may have changed
+        if has_large_innovation:  # the velocity may have changed to an unknown value
             rate_variance = np.array([NEW_SPEED_STD, NEW_SPEED_STD, FORCE_RATE_STD]) ** 2
             added_covariance[RATES, RATES] += np.diag(rate_variance)
             added_covariance[CONTACT, CONTACT] += np.diag(rate_variance * dt_s**2)
@@ -276,9 +286,9 @@ class ContactMixture:
     def _squared_innovation(self, components: Components, measurement: Measurement) -> float:
         """Compute the squared Mahalanobis distance of the innovation of the most probable component.
 
-        The innovation v is the difference of the measured and the predicted charges. Its covariance is S = J P J^T + R,
-        where P is the covariance of the state, J the derivative of the charges with respect to the state, and R the
-        covariance of the noise. The result is v^T S^-1 v.
+        The innovation v is the difference between the measured and the predicted charges. The covariance of the
+        innovation is S = J P J^T + R. Here P is the covariance of the state, J is the derivative of the charges with
+        respect to the state, and R is the covariance of the noise. The result is v^T S^-1 v.
 
         Args:
             components: Predicted components.
@@ -294,10 +304,11 @@ class ContactMixture:
     def _most_probable_states(
         self, prior: Components, measurement: Measurement, iterations: int
     ) -> tuple[Array, LinearisedUpdate]:
-        """Search for the state of each component that is most probable after the measured charges.
+        """Find the state of each component that is most probable given the measured charges.
 
-        Each iteration linearises the charges about the present state and computes the Kalman update of the prior mean
-        with them. The state moves towards the updated mean, but not beyond the range of the linearisation.
+        Each iteration linearises the charges about the present state, and computes the Kalman update of the prior mean
+        with the linearised charges. The state then moves towards the updated mean. The change of the state in one
+        iteration is limited, because the linearisation is only accurate near the present state.
 
         Args:
             prior: Predicted components.
@@ -307,21 +318,21 @@ class ContactMixture:
         Returns:
             The states, shape (n_component, n_state), and the update that is linearised at these states.
         """
-        state = prior.mean
-        linearised = linearise_update(self.charges, state, prior, measurement)
+        states = prior.mean
+        linearised = linearise_update(self.charges, states, prior, measurement)
         for _ in range(iterations):
             state_charge_covariance = linearised.cross_covariance.swapaxes(1, 2)  # (n_component, n_state, n_electrode)
             change_from_prior = (state_charge_covariance @ linearised.weighted_innovation)[:, :, 0]
-            step = prior.mean + change_from_prior - state
-            state = state + limit_iteration_step(step)
-            linearised = linearise_update(self.charges, state, prior, measurement)
-        return state, linearised
+            steps = prior.mean + change_from_prior - states
+            states = states + limit_iteration_steps(steps)
+            linearised = linearise_update(self.charges, states, prior, measurement)
+        return states, linearised
 
     def _update(self, prior: Components, measurement: Measurement, iterations: int) -> Components | None:
-        """Update the components with the charges, and then prune and split them.
+        """Update the components with the charges, remove improbable components, and split a component at a fold.
 
-        The weight of each component is multiplied by its likelihood. Components outside of the film are removed. If the
-        most probable component does not explain the charges, there is no contact.
+        The weight of each component is multiplied by the likelihood of the component. Components outside the film are
+        removed. If the most probable component does not explain the charges, the result is None.
 
         Args:
             prior: Predicted components.
@@ -329,52 +340,53 @@ class ContactMixture:
             iterations: Number of iterations of the search for the most probable state of each component.
 
         Returns:
-            The components, or None if no component explains the charges.
+            The updated components; None if the most probable component does not explain the charges.
         """
-        state, linearised = self._most_probable_states(prior, measurement, iterations)
+        states, linearised = self._most_probable_states(prior, measurement, iterations)
 
-        # Likelihood p of each component: -2 ln p = squared misfit + squared change of the state + ln det(covariance of
-        # the innovation). The change of the state is relative to its covariance before the update. All terms have the
-        # shape (n_component,).
+        # The likelihood p of a component is given by -2 ln p = squared misfit + squared change of the state + ln det S,
+        # where S is the covariance of the innovation v. The squared change of the state is relative to the covariance
+        # of the state before the update. All terms have the shape (n_component,).
         residual_pC = measurement.charge_pC - linearised.charge_pC
         squared_misfit = (residual_pC**2 / measurement.variance).sum(axis=1)
-        column = linearised.weighted_innovation  # S^-1 v of the innovation v with the covariance S
-        row = column.swapaxes(1, 2)
-        squared_state_change = (row @ linearised.charge_covariance @ column)[:, 0, 0]
-        square = squared_misfit + squared_state_change
+        weighted_innovation = linearised.weighted_innovation  # S^-1 v, shape (n_component, n_electrode, 1)
+        weighted_row = weighted_innovation.swapaxes(1, 2)
+        squared_state_change = (weighted_row @ linearised.charge_covariance @ weighted_innovation)[:, 0, 0]
+        squared_distance = squared_misfit + squared_state_change
         _sign, log_determinant = np.linalg.slogdet(linearised.innovation_covariance)
-        log_weight = prior.log_weight - 0.5 * (square + log_determinant)
+        log_weight = prior.log_weight - 0.5 * (squared_distance + log_determinant)
 
-        is_outside_film = np.hypot(state[:, X], state[:, Y]) > MAX_RELATIVE_RADIUS * self.charges.radius_mm
+        is_outside_film = np.hypot(states[:, X], states[:, Y]) > MAX_RELATIVE_RADIUS * self.charges.radius_mm
         log_weight[is_outside_film] = -np.inf
         best = int(log_weight.argmax())
-        is_explained = square[best] < MAX_SQUARE and np.isfinite(log_weight[best])
+        is_explained = squared_distance[best] < MAX_SQUARED_DISTANCE and np.isfinite(log_weight[best])
         if not is_explained:
             return None
 
         covariance = updated_covariance(prior, linearised)
         misfit = math.sqrt(squared_misfit[best])
-        updated = Components(state, covariance, log_weight - log_weight[best], misfit)
+        relative_log_weight = log_weight - log_weight[best]  # the largest logarithm becomes 0
+        updated = Components(states, covariance, relative_log_weight, misfit)
         return self._split_at_fold(prune_components(updated))
 
     def _split_at_fold(self, components: Components) -> Components:
-        """Add a component towards each side of a fold if the most probable component extends across the fold.
+        """Add one component on each side of a fold if the most probable component extends across the fold.
 
-        At a fold of the map from contacts to charges, two contacts with equal charges meet. The contact may be on
-        either side, but a single Gaussian component describes only one side well.
+        Near a fold of the map from contacts to charges, a contact on one side of the fold has the same charges as a
+        contact on the other side. A single Gaussian component describes the contacts on only one side well.
 
         Args:
             components: Components after the update with the charges of this step.
 
         Returns:
-            The components, with two additional components if there is a fold.
+            The components, and two additional components if the most probable component extends across a fold.
         """
         best = components.best
         mean = components.mean[best]
         covariance = components.covariance[best]
         has_space_for_two = len(components.mean) <= MAX_COMPONENTS - 2
 
-        # Standard deviation of the position along the longest axis of its covariance
+        # Standard deviation of the position along the longest axis of the covariance ellipse.
         variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])
         longest = variances.size - 1  # `eigh` returns the variances in ascending order
         std_mm = math.sqrt(max(variances[longest], 0.0))  # rounding errors may make the variance negative
@@ -382,13 +394,14 @@ class ContactMixture:
             return components
 
         # Expected change of the whole state if the position changes by one standard deviation along the longest axis.
-        direction = covariance[:, POSITION] @ axes[:, longest] / std_mm
+        direction = covariance[:, POSITION] @ axes[:, longest] / std_mm  # shape (n_state,)
         sides = np.array([1.0, -1.0])
         states_on_both_sides = mean + FOLD_DISTANCE * np.outer(sides, direction)
         if not self._is_across_fold(mean, states_on_both_sides).any():
             return components
 
-        # The added components are narrower along this direction, and have a smaller weight than the component between.
+        # Each added component is narrower along this direction. Its weight is the weight of the most probable component
+        # multiplied by the relative density of that component at the mean of the added component.
         removed_share = 1.0 - SPLIT_STD_RATIO**2
         narrow_covariance = covariance - removed_share * np.outer(direction, direction)
         log_weight = components.log_weight[best] - 0.5 * SPLIT_DISTANCE**2
@@ -398,16 +411,17 @@ class ContactMixture:
         return components
 
     def _is_across_fold(self, state: Array, other_states: Array) -> Booleans:
-        """Return whether a fold of the map from contacts to charges lies between a state and each of other states.
+        """Compute whether a fold of the map from contacts to charges lies between one state and several other states.
 
-        At a fold, the orientation of the map changes, and the determinant of its Jacobian changes its sign.
+        At a fold, the orientation of the map changes, and the determinant of the Jacobian of the map changes its sign.
+        If two folds lie between two states, the method finds no fold.
 
         Args:
-            state: A state, shape (6 + n_electrode,).
-            other_states: The states to compare it with, shape (n, 6 + n_electrode).
+            state: The reference state, shape (6 + n_electrode,).
+            other_states: The states that are compared with `state`, shape (n, 6 + n_electrode).
 
         Returns:
-            Whether an odd number of folds lies in between, shape (n,).
+            Whether the number of folds between `state` and each other state is odd, shape (n,).
         """
         states = np.vstack([state, other_states])
         _charges, jacobians = self.charges.linearised(states[:, CONTACT])
@@ -415,21 +429,21 @@ class ContactMixture:
         other_jacobians = jacobians[1:]
 
         # For three electrodes, det(J^T K) = det(J) det(K), which is negative if the two determinants differ in sign.
-        # With more electrodes, the Jacobians J and K are not square, but the product is.
+        # With more electrodes, the Jacobians J and K are not square, but the product J^T K is square.
         relative_orientation = np.linalg.det(state_jacobian.T @ other_jacobians)
         return np.asarray(relative_orientation < 0.0)
 
     def _group(self, components: Components) -> list[ContactHypothesis]:
-        """Combine the components that describe the same contact.
+        """Combine the components that describe the same contact into one hypothesis for each contact.
 
-        The most probable component and all components of the same contact form a group. The components that remain are
-        grouped in the same way, until no component remains.
+        The most probable component and all components that describe the same contact form the first group. The
+        remaining components are grouped in the same way, until no component remains.
 
         Args:
             components: Components after the update with the charges of this step.
 
         Returns:
-            The contacts, in descending order of their probability.
+            One hypothesis for each contact, in descending order of their probability.
         """
         probability = np.exp(components.log_weight - components.log_weight.max())
         probability /= probability.sum()
@@ -444,17 +458,18 @@ class ContactMixture:
         return sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)
 
     def _is_same_contact(self, components: Components, rows: Integers) -> Booleans:
-        """Return which components describe the same contact as the component of the first row.
+        """Compute which of the selected components describe the same contact as the first selected component.
 
-        Components of the same contact are near each other, and no fold of the map from contacts to charges lies between
-        them. They are near if x and y differ by less than a few standard deviations of the difference.
+        Two components describe the same contact if they are near each other, and no fold of the map from contacts to
+        charges lies between them. Two components are near each other if x and y both differ by less than
+        `SEPARATE_DISTANCE` standard deviations of the difference.
 
         Args:
             components: All components.
-            rows: Indices of the components to compare, shape (n,). The first one is the reference.
+            rows: Indices of the selected components, shape (n,). The first selected component is the reference.
 
         Returns:
-            Whether each component of `rows` describes the same contact, shape (n,).
+            Whether each selected component describes the same contact as the reference, shape (n,).
         """
         first = rows[0]
         mean = components.mean[rows]
@@ -468,26 +483,38 @@ class ContactMixture:
 
 
 def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:
-    """Return contacts (x, y, ln F) of medium force on a spiral that covers the film, shape (n, 3).
+    """Return contacts (x, y, ln F) that are evenly distributed over the film on a spiral (Vogel 1979).
 
-    On this spiral (Vogel 1979), the contacts cover equal areas of the film: the radius grows with the square root of
-    the number of the contact, and successive contacts differ by the golden angle.
+    The radius of a contact grows with the square root of its number, and the angle between successive contacts is the
+    golden angle. Every contact then represents the same area of the film. All contacts have the same medium force.
+
+    Args:
+        charges: Charges of every contact on the film, with the radius of the film and its range of forces.
+
+    Returns:
+        Contacts, shape (`N_INITIAL_COMPONENTS`, 3), mm and the logarithm of N.
     """
     number = np.arange(N_INITIAL_COMPONENTS)
     angle = GOLDEN_ANGLE * number
     radius_mm = charges.radius_mm * np.sqrt((number + 0.5) / N_INITIAL_COMPONENTS)
     x_mm = radius_mm * np.cos(angle)
     y_mm = radius_mm * np.sin(angle)
-    medium_log_force = np.log(charges.force_N).mean()
+    medium_log_force = np.log(charges.force_N).mean()  # of the smallest and the largest force
     log_force = np.full(N_INITIAL_COMPONENTS, medium_log_force)
     return np.column_stack([x_mm, y_mm, log_force])
 
 
 def contact_mixture(predictor: Predictor) -> ContactMixture | None:
-    """Return the mixture for the film of a model; None if the model has no file `charges.npz`.
+    """Create the mixture that follows contacts on the film of a model.
+
+    Args:
+        predictor: The model.
+
+    Returns:
+        The mixture; None if the model has no file `charges.npz`.
 
     Raises:
-        ModelError: If the file is damaged.
+        ModelError: If the file `charges.npz` is damaged.
     """
     charges = read_charges(predictor.folder, len(predictor.metadata.electrodes))
     if charges is None:

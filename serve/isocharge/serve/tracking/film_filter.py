@@ -1,20 +1,23 @@
-"""Bayesian filter that estimates the pretension of a film and its other unknowns from touches.
+"""Bayesian filter that estimates the pretension of a film and other unknown parameters of the film from touches.
 
-The misfit vector of a touch is the part of its charges that no contact explains. The misfit vector depends on
+The misfit vector of a touch is the part of the charges that no contact explains. The misfit vector depends on two kinds
+of unknowns.
 
-- the pretension of the film, non-linearly: the pretension is estimated on a grid;
-- the linear unknowns, in which the misfit vector is linearised: the directions in which the calibration left the film
-  uncertain (`FilmDirections`), the drift of the gain of each electrode, and a common offset. The common offset is a
-  charge that is added to all electrodes while a touch lasts, such as the pyroelectric charge of a warm finger.
+- The pretension of the film changes the misfit vector non-linearly. The pretension is therefore estimated on a grid.
+- The linear unknowns change the misfit vector approximately linearly. The linear unknowns are the directions in which
+  the calibration left the film uncertain (`FilmDirections`), the drift of the gain of each electrode, and a common
+  offset. The common offset is a charge that is added to all electrodes during a touch, such as the pyroelectric charge
+  that a warm finger produces.
 
-At each pretension, a Kalman filter estimates the linear unknowns (a Rao-Blackwellised filter, Doucet and others 2000).
-If a gain, an offset or an error of the calibration explains a change of the misfit, the estimated pretension therefore
-hardly changes.
+At each pretension of the grid, a Kalman filter estimates the linear unknowns (a Rao-Blackwellised filter, Doucet and
+others 2000). If a gain, an offset or an error of the calibration explains a change of the misfit, the estimated
+pretension therefore hardly changes.
 
-The size of the offsets is unknown at first. The filter therefore compares several offset levels. At the first level,
-touches have no offset. At the other levels, offsets have standard deviations from small to large. Each level has a
-Kalman filter at each pretension, and the levels are weighted by their evidence. The level may change between two
-touches, because a warm hand may come or go (an interacting multiple model, Blom and Bar-Shalom 1988).
+The size of the offsets is unknown before the first touch. The filter therefore compares several offset levels. At the
+first level, touches have no offset. At the other levels, the offsets have standard deviations from small to large. Each
+level has a Kalman filter at each pretension, and the levels are weighted by their probabilities. The level may change
+between two touches, for example because a warm hand approaches the film (an interacting multiple model, Blom and
+Bar-Shalom 1988).
 """
 
 import math
@@ -91,10 +94,10 @@ PROBABILITY_COLUMN = 0
 
 
 class FilmFilter:
-    """Estimates the pretension of one film by touches of unknown position and force.
+    """Filter that estimates the pretension of one film from touches whose position and force are unknown.
 
     Attributes:
-        grid_MPa: Grid of pretensions, shape (n_pretension,), MPa.
+        grid_MPa: Evenly spaced pretensions for which the filter computes probabilities, shape (n_pretension,), MPa.
     """
 
     def __init__(
@@ -105,14 +108,15 @@ class FilmFilter:
         largest_offset_pC: float,
         offset_ratio: Array,
     ) -> None:
-        """Begin with the film as it was calibrated.
+        """Start with the distribution of the film after the calibration.
 
         Args:
             pretensions: Weights of the network at any pretension.
             directions: Directions in which the film is uncertain at a given pretension.
-            drift_MPa_per_root_hour: Standard deviation of the change of the pretension in an hour.
-            largest_offset_pC: Largest standard deviation of the offsets that the filter tolerates; 0 if touches have
-                no offsets.
+            drift_MPa_per_root_hour: Standard deviation of the change of the pretension in an hour, MPa. The standard
+                deviation is proportional to the square root of the time.
+            largest_offset_pC: Largest standard deviation of the offsets that the filter tolerates, pC; 0 if touches
+                have no offsets.
             offset_ratio: Charge that an offset adds to each electrode, relative to the common offset, shape
                 (n_electrode,).
         """
@@ -120,71 +124,75 @@ class FilmFilter:
         self.grid_MPa = evenly_spaced(low, high, GRID_STEP_MPa)
         self._pretensions = pretensions
         self._network = pretensions.at(evenly_spaced(low, high, NETWORK_STEP_MPa))
-        self._drift = drift_MPa_per_root_hour
-        self._largest_offset = largest_offset_pC
+        self._drift_MPa_per_root_hour = drift_MPa_per_root_hour
+        self._largest_offset_pC = largest_offset_pC
         self._offset_ratio = offset_ratio
         self._directions = directions
         self._layout = UnknownsLayout(pretensions.typical_pC.size, directions.count)
 
         level_count = len(RELATIVE_LEVELS) if largest_offset_pC > 0.0 else 1
-        self._level_std = largest_offset_pC * np.array(RELATIVE_LEVELS[:level_count])
-        self._scatter_std = largest_offset_pC * np.array(RELATIVE_SCATTER[:level_count])
+        self._level_std_pC = largest_offset_pC * np.array(RELATIVE_LEVELS[:level_count])
+        self._scatter_std_pC = largest_offset_pC * np.array(RELATIVE_SCATTER[:level_count])
         self.reset()
 
     def reset(self) -> None:
-        """Return to the distribution before the first touch."""
+        """Discard all touches, and return to the distribution before the first touch."""
         # Joint probability of the offset level and the pretension, shape (n_level, n_pretension). Level 0 is the level
         # without offsets, and the other levels share the remaining probability equally.
-        level_count = self._level_std.size
-        level_probability = np.full(level_count, (1.0 - NO_OFFSET_PROBABILITY) / max(level_count - 1, 1))
+        level_count = self._level_std_pC.size
+        offset_level_count = level_count - 1
+        offset_level_probability = (1.0 - NO_OFFSET_PROBABILITY) / max(offset_level_count, 1)
+        level_probability = np.full(level_count, offset_level_probability)
         level_probability[0] = 1.0 - level_probability[1:].sum()
         change_MPa = self.grid_MPa - self._pretensions.calibrated_MPa
         pretension_probability = normal_probabilities(change_MPa, self._pretensions.std_MPa)
-        self._probability = np.outer(level_probability, pretension_probability)
+        self._joint_probability = np.outer(level_probability, pretension_probability)
 
-        # Mean and covariance of the linear unknowns at each level and pretension.
-        shape = self._probability.shape
+        # Mean and covariance of the linear unknowns at each level and pretension. Only the means of the directions
+        # depend on the pretension.
+        shape = self._joint_probability.shape
         size = self._layout.size
         self._mean = np.zeros((*shape, size))
         self._mean[..., self._layout.directions] = np.outer(change_MPa, self._directions.by_pretension)
         self._covariance = np.zeros((*shape, size, size))
         self._covariance[:] = self._stationary_covariance()[:, None]  # the same at every pretension
         self._last_touch_s: float | None = None
-        self._pending_variance = 0.0
+        self._pending_variance_MPa2 = 0.0  # variance of the drift that `_change_pretension` has not applied yet
 
     @property
-    def probability(self) -> Array:
+    def pretension_probability(self) -> Array:
         """Probability of each pretension, shape (n_pretension,)."""
-        return np.asarray(self._probability.sum(axis=0))
+        return np.asarray(self._joint_probability.sum(axis=0))
 
     @property
     def level_probability(self) -> Array:
         """Probability of each offset level, shape (n_level,)."""
-        return np.asarray(self._probability.sum(axis=1))
+        return np.asarray(self._joint_probability.sum(axis=1))
 
     @property
     def mean_MPa(self) -> float:
         """Mean of the pretension, MPa."""
-        return float(self.probability @ self.grid_MPa)
+        return float(self.pretension_probability @ self.grid_MPa)
 
     @property
     def offset_correction_MPa(self) -> float:
-        """Difference between the mean of the pretension and its mean at the level without offsets, MPa."""
-        probability_without_offset = self._probability[0] / self._probability[0].sum()
+        """Mean of the pretension minus the mean of the pretension at the level without offsets, MPa."""
+        probability_without_offset = self._joint_probability[0] / self._joint_probability[0].sum()
         return self.mean_MPa - float(probability_without_offset @ self.grid_MPa)
 
     @property
-    def nearest(self) -> int:
+    def nearest_index(self) -> int:
         """Index of the pretension of the grid that is nearest to the mean."""
         return int(np.abs(self.grid_MPa - self.mean_MPa).argmin())
 
     @property
     def is_offset_too_large(self) -> bool:
         """Whether the offsets are probably larger than the largest offsets that the filter tolerates."""
-        if self._level_std.size == 1:
+        level_count = self._level_std_pC.size
+        if level_count == 1:  # touches are assumed to have no offsets
             return False
-        is_at_last_level = self._likeliest_level == self._level_std.size - 1
-        return is_at_last_level or abs(self._mean_offset_pC) > MAX_RELATIVE_OFFSET * self._largest_offset
+        is_at_last_level = self._likeliest_level == level_count - 1
+        return is_at_last_level or abs(self._mean_offset_pC) > MAX_RELATIVE_OFFSET * self._largest_offset_pC
 
     @property
     def offset_pC(self) -> Array:
@@ -193,31 +201,41 @@ class FilmFilter:
 
     @property
     def _mean_offset_pC(self) -> float:
-        return float(self._mean[self._likeliest_level, self.nearest, self._layout.offset])
+        """Mean of the common offset at the most likely level and the pretension nearest to the mean, pC."""
+        return float(self._mean[self._likeliest_level, self.nearest_index, self._layout.offset])
 
     @property
     def _likeliest_level(self) -> int:
+        """Index of the offset level with the largest probability."""
         return int(self.level_probability.argmax())
 
     def direction_means(self, pretension_MPa: float) -> Array:
-        """Return the means of the directions at one pretension, shape (n_direction,), in standard deviations."""
-        level_weight = self._probability / self.probability
-        level_means = self._mean[..., self._layout.directions]
+        """Return the means of the directions at one pretension, averaged over the offset levels.
+
+        Args:
+            pretension_MPa: The pretension, MPa. The means are interpolated between the pretensions of the grid.
+
+        Returns:
+            Means, shape (n_direction,), in standard deviations of the directions.
+        """
+        level_weight = self._joint_probability / self.pretension_probability
+        level_means = self._mean[..., self._layout.directions]  # shape (n_level, n_pretension, n_direction)
         grid_means = (level_weight[..., None] * level_means).sum(axis=0)  # shape (n_pretension, n_direction)
         return np.array([np.interp(pretension_MPa, self.grid_MPa, direction_mean) for direction_mean in grid_means.T])
 
     def _stationary_covariance(self) -> Array:
         """Return the covariance of the linear unknowns before any touch, shape (n_level, n_unknown, n_unknown).
 
-        The unknowns are independent. Gains and directions are in units of their standard deviations.
+        The unknowns are independent. The variances of the gains and directions are 1, because these unknowns are in
+        units of their standard deviations.
         """
         layout = self._layout
-        covariance = np.tile(np.eye(layout.size), (self._level_std.size, 1, 1))
-        covariance[:, layout.offset, layout.offset] = self._level_std**2
+        covariance = np.tile(np.eye(layout.size), (self._level_std_pC.size, 1, 1))
+        covariance[:, layout.offset, layout.offset] = self._level_std_pC**2
         return covariance
 
     def predict(self, clock_s: float) -> None:
-        """Predict the distribution at the time of a touch.
+        """Predict the distribution at the time of a touch from the distribution after the previous touch.
 
         Args:
             clock_s: Time of the touch on a clock that does not jump, s.
@@ -229,9 +247,9 @@ class FilmFilter:
         self._change_pretension(elapsed_s)
 
     def _relax_unknowns(self, elapsed_s: float) -> None:
-        """Let the distributions of the gains and of the offset relax towards their stationary distributions.
+        """Move the distributions of the gains and of the offset towards their stationary distributions.
 
-        The directions do not change with time.
+        The means decay exponentially with the time constant of each unknown. The directions do not change with time.
 
         Args:
             elapsed_s: Time since the previous touch, s.
@@ -247,112 +265,123 @@ class FilmFilter:
         self._covariance = decay_of_products * self._covariance + (1.0 - decay_of_products) * stationary
 
     def _change_level(self) -> None:
-        """Account for a change of the offset level, which has a small probability.
+        """Account for the small probability that the offset level has changed since the previous touch.
 
-        The method is the mixing step of an interacting multiple model (Blom and Bar-Shalom 1988). The mean offset of
-        the new level does not depend on the mean offset of the previous level. The other linear unknowns stay the same.
+        The method is the mixing step of an interacting multiple model (Blom and Bar-Shalom 1988). After a change of the
+        offset level, the mean offset does not depend on the previous mean offset. A change of the level does not affect
+        the other linear unknowns.
         """
-        level_count = self._level_std.size
+        level_count = self._level_std_pC.size
         if level_count == 1:
             return
         changed_mean, changed_covariance = self._moments_after_level_change()
 
-        # If the level changes, all levels are equally likely.
-        unchanged_probability = (1.0 - LEVEL_CHANGE_PROBABILITY) * self._probability
-        changed_probability = LEVEL_CHANGE_PROBABILITY / level_count * self.probability
-        self._probability = unchanged_probability + changed_probability
+        # After a change of the level, all levels are equally likely.
+        unchanged_probability = (1.0 - LEVEL_CHANGE_PROBABILITY) * self._joint_probability
+        changed_probability = LEVEL_CHANGE_PROBABILITY / level_count * self.pretension_probability  # (n_pretension,)
+        self._joint_probability = unchanged_probability + changed_probability
 
-        # The probability of a change is broadcast over the axis of the mean and over the two axes of the covariance.
-        changed_weight = changed_probability / self._probability
+        # Average the moments with and without a change. The weight is broadcast over the axis of the unknowns for the
+        # means, and over the two axes of the unknowns for the covariances.
+        changed_weight = changed_probability / self._joint_probability  # shape (n_level, n_pretension)
         mean_weight = changed_weight[..., None]
         self._mean = (1.0 - mean_weight) * self._mean + mean_weight * changed_mean
         covariance_weight = changed_weight[..., None, None]
         self._covariance = (1.0 - covariance_weight) * self._covariance + covariance_weight * changed_covariance
 
     def _moments_after_level_change(self) -> tuple[Array, Array]:
-        """Return the mean and the covariance of the linear unknowns if the offset level has just changed.
+        """Compute the mean and the covariance of the linear unknowns directly after a change of the offset level.
 
-        The offset is distributed as before any touch. The other unknowns are averaged over the previous levels.
+        The offset then has the same distribution as before the first touch. The moments of the other unknowns are
+        averaged over the previous levels.
 
         Returns:
-            Mean, shape (n_pretension, n_unknown), which is equal at all new levels. Covariance at each new level, shape
-            (n_level, n_pretension, n_unknown, n_unknown).
+            Mean, shape (n_pretension, n_unknown). The mean does not depend on the new level. Covariance at each new
+            level, shape (n_level, n_pretension, n_unknown, n_unknown).
         """
         offset = self._layout.offset
-        level_weight = self._probability / self.probability
+        level_weight = self._joint_probability / self.pretension_probability  # shape (n_level, n_pretension)
         mean = (level_weight[..., None] * self._mean).sum(axis=0)
         mean[:, offset] = 0.0
 
         average_covariance = (level_weight[..., None, None] * self._covariance).sum(axis=0)
-        covariance = np.repeat(average_covariance[None], self._level_std.size, axis=0)
+        covariance = np.repeat(average_covariance[None], self._level_std_pC.size, axis=0)
         covariance[:, :, offset, :] = 0.0
         covariance[:, :, :, offset] = 0.0
-        covariance[:, :, offset, offset] = self._level_std[:, None] ** 2
+        covariance[:, :, offset, offset] = self._level_std_pC[:, None] ** 2
         return mean, covariance
 
     def _change_pretension(self, elapsed_s: float) -> None:
-        """Account for a drift of the pretension, and for a jump to any pretension, which has a small probability.
+        """Account for a drift of the pretension, and for the small probability of a jump to any pretension.
 
-        The means and covariances of the linear unknowns at a pretension are averages over the previous pretensions from
-        which the film may have come. The averages are weighted by the probabilities of these pretensions.
+        The means and the covariances of the linear unknowns at a new pretension are averaged over all previous
+        pretensions. The weight of a previous pretension is the probability that the pretension has changed from the
+        previous value to the new value.
 
         Args:
             elapsed_s: Time since the previous touch, s.
         """
-        self._pending_variance += self._drift**2 * elapsed_s / SECONDS_PER_HOUR
+        self._pending_variance_MPa2 += self._drift_MPa_per_root_hour**2 * elapsed_s / SECONDS_PER_HOUR
         moments = self._weighted_moments()
 
-        # The grid cannot represent a drift that is smaller than its step. Such a drift is added to the next one.
-        drift_std = math.sqrt(self._pending_variance)
-        if drift_std >= GRID_STEP_MPa:
-            moments = smooth_moments(moments, drift_std)
-            self._pending_variance = 0.0
+        # The grid cannot represent a drift that is smaller than the step of the grid. The variance of such a drift
+        # remains pending and is added to the variance of the next drift.
+        drift_std_MPa = math.sqrt(self._pending_variance_MPa2)
+        if drift_std_MPa >= GRID_STEP_MPa:
+            moments = smooth_moments(moments, drift_std_MPa)
+            self._pending_variance_MPa2 = 0.0
         moments /= moments[..., PROBABILITY_COLUMN].sum()
 
-        # After a jump, the film may have come from any pretension with equal probability.
+        # After a jump, all pretensions have the same moments: the mean of the moments over the previous pretensions.
         moments_after_jump = moments.mean(axis=1, keepdims=True)
         moments = (1.0 - JUMP_PROBABILITY) * moments + JUMP_PROBABILITY * moments_after_jump
         self._set_weighted_moments(moments)
 
     def _weighted_moments(self) -> Array:
-        """Return the probability, the mean and the covariance of each level and pretension in one array.
+        """Return the probability, the mean and the covariance at each level and pretension in one array.
 
-        The mean and the covariance are multiplied by the probability. The weighted average over several pretensions is
-        therefore a sum.
+        The mean and the covariance are multiplied by the probability. Adding the moments of several pretensions
+        therefore computes an average that is weighted by the probabilities.
 
         Returns:
-            Moments, shape (n_level, n_pretension, 1 + n_unknown + n_unknown^2).
+            Moments, shape (n_level, n_pretension, 1 + n_unknown + n_unknown^2). The last axis contains the probability,
+            the weighted mean and the weighted covariance, in this order.
         """
-        level_count, grid_size = self._probability.shape
+        level_count, grid_size = self._joint_probability.shape
         size = self._layout.size
         flat_covariance = self._covariance.reshape(level_count, grid_size, size * size)
         moments = np.concatenate([np.ones((level_count, grid_size, 1)), self._mean, flat_covariance], axis=2)
-        moments *= self._probability[..., None]
+        moments *= self._joint_probability[..., None]
         return moments
 
     def _set_weighted_moments(self, moments: Array) -> None:
-        """Set the probabilities, the means and the covariances from the result of `_weighted_moments`."""
-        level_count, grid_size = self._probability.shape
+        """Set the probabilities, the means and the covariances from an array of weighted moments.
+
+        Args:
+            moments: Weighted moments, as `_weighted_moments` returns them.
+        """
+        level_count, grid_size = self._joint_probability.shape
         size = self._layout.size
-        self._probability = moments[..., PROBABILITY_COLUMN]
-        normalised = moments / self._probability[..., None]
+        self._joint_probability = moments[..., PROBABILITY_COLUMN]
+        normalised = moments / self._joint_probability[..., None]
         mean_columns = slice(1, 1 + size)
         covariance_columns = slice(1 + size, None)
         self._mean = normalised[..., mean_columns]
         self._covariance = normalised[..., covariance_columns].reshape(level_count, grid_size, size, size)
 
     def update(self, charge_pC: Array, log_changes: Array, misfit_slopes: Array | None = None) -> TouchResiduals:
-        """Update the distribution by a touch.
+        """Update the distribution with a touch.
 
-        The Kalman update assumes that the touch fits the model. A touch may also be an outlier with a small
-        probability. Each estimate is therefore changed only in proportion to the probability that the touch fits.
+        The touch may be an outlier with a small probability. The changes that the Kalman update computes are therefore
+        multiplied by the probability that the touch is not an outlier.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
             log_changes: Changes of the logarithms of the charges by one unit of each direction at the contact, shape
                 (n_direction, n_electrode).
             misfit_slopes: Derivatives of the misfit vector with respect to the logarithms of the charges, shape
-                (n_electrode, n_electrode), in units of the noise. If None, they are finite differences of the network.
+                (n_electrode, n_electrode), in units of the noise. If None, the derivatives are computed as finite
+                differences with the network.
 
         Returns:
             The squared misfits that remain after the update.
@@ -368,16 +397,16 @@ class FilmFilter:
         self._mean = self._mean + good_probability[..., None] * kalman.mean_change
         self._covariance = self._covariance - good_probability[..., None, None] * kalman.covariance_reduction
 
-        # Bayes' theorem for the levels and pretensions.
-        unnormalised_probability = self._probability * total_density
-        self._probability = unnormalised_probability / unnormalised_probability.sum()
+        # Update the probabilities of the levels and pretensions by Bayes' theorem.
+        unnormalised_probability = self._joint_probability * total_density
+        self._joint_probability = unnormalised_probability / unnormalised_probability.sum()
         return self._residuals(misfit, jacobian, noise_covariance)
 
     def _noise_covariance(self, jacobian: Array) -> Array:
-        """Return the covariance of the misfit vector of a touch, if the linear unknowns are known.
+        """Compute the covariance that the misfit vector of a touch would have if the linear unknowns were known.
 
-        The covariance is the identity matrix for a good touch, plus a term for the scatter of the offset from touch to
-        touch.
+        The covariance is the sum of two matrices. The identity matrix describes the noise of a good touch. The other
+        matrix describes the random deviation of the offset of a single touch from the mean offset.
 
         Args:
             jacobian: Jacobian of the misfit vector, as `_linearise` returns it.
@@ -388,16 +417,17 @@ class FilmFilter:
         """
         offset_jacobian = jacobian[..., self._layout.offset]  # shape (n_level, n_pretension, n_electrode)
         outer_product = offset_jacobian[..., :, None] * offset_jacobian[..., None, :]
-        scatter_variance = self._scatter_std[:, None, None, None] ** 2
+        scatter_variance = self._scatter_std_pC[:, None, None, None] ** 2
         scatter_covariance = scatter_variance * outer_product
         return np.asarray(np.eye(self._layout.electrodes) + scatter_covariance)
 
     def _linearise(self, charge_pC: Array, log_changes: Array, misfit_slopes: Array | None) -> tuple[Array, Array]:
         """Compute the misfit vector of a touch at each pretension, and the Jacobian for the linear unknowns.
 
-        A gain or a direction changes the misfit vector by the product of the misfit slopes and its change of ln Q. The
-        derivatives with respect to the offset are finite differences. Their step is the estimated mean offset of the
-        level, so that the linearised misfit vector without this offset is exact.
+        The derivative with respect to a gain or a direction is the product of the misfit slopes and the change of ln Q
+        that the gain or the direction causes. The derivative with respect to the offset is a finite difference, whose
+        step is the estimated mean offset of the offset level. The linearised misfit vector is therefore exact for
+        charges from which the mean offset is subtracted.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
@@ -408,20 +438,21 @@ class FilmFilter:
 
         Returns:
             Misfit vectors, shape (n_pretension, n_electrode). Jacobian of the misfit vectors, shape (n_level,
-            n_pretension, n_electrode, n_unknown). The unit of both is the root mean square of good touches.
+            n_pretension, n_electrode, n_unknown). Both are relative to the root mean square misfit of good touches.
         """
         layout = self._layout
         gain_changes = GAIN_STD * np.eye(layout.electrodes)
         offset_step_pC = self._offset_steps()
 
-        # The network evaluates the charges of the touch, and these charges without the offset of each level.
+        # One call evaluates the network for the charges of the touch and for the charges without the offset of each
+        # level.
         charges_without_offset = charge_pC - np.outer(offset_step_pC, self._offset_ratio)
-        vectors = self._misfit_vectors(np.vstack([charge_pC, charges_without_offset]))
-        misfit = vectors[0]
-        without_offset = vectors[1:]  # shape (n_level, n_pretension, n_electrode)
+        misfit_vectors = self._misfit_vectors(np.vstack([charge_pC, charges_without_offset]))
+        misfit = misfit_vectors[0]
+        misfit_without_offset = misfit_vectors[1:]  # shape (n_level, n_pretension, n_electrode)
 
-        jacobian = np.empty((*self._probability.shape, layout.electrodes, layout.size))
-        jacobian[..., layout.offset] = (misfit - without_offset) / offset_step_pC[:, None, None]
+        jacobian = np.empty((*self._joint_probability.shape, layout.electrodes, layout.size))
+        jacobian[..., layout.offset] = (misfit - misfit_without_offset) / offset_step_pC[:, None, None]
         if misfit_slopes is None:
             jacobian[..., layout.gains] = self._misfit_differences(charge_pC, misfit, gain_changes)
             jacobian[..., layout.directions] = self._misfit_differences(charge_pC, misfit, log_changes)
@@ -438,36 +469,38 @@ class FilmFilter:
             charge_pC: Charges, shape (n, n_electrode), pC.
 
         Returns:
-            Misfit vectors, shape (n, n_pretension, n_electrode). The unit is the root mean square of good touches.
+            Misfit vectors, shape (n, n_pretension, n_electrode), relative to the root mean square misfit of good
+            touches.
         """
         return self._network.vectors(charge_pC, self.grid_MPa) / self._pretensions.misfit_rms
 
     def _misfit_differences(self, charge_pC: Array, misfit: Array, log_changes: Array) -> Array:
-        """Compute the changes of the misfit vectors of a touch by changes of its charges as finite differences.
+        """Compute the changes of the misfit vectors of a touch that given changes of its charges cause.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
-            misfit: Misfit vectors of these charges, shape (n_pretension, n_electrode).
+            misfit: Misfit vectors of the unchanged charges, shape (n_pretension, n_electrode).
             log_changes: Changes of the logarithms of the charges, shape (n_change, n_electrode).
 
         Returns:
             Changes of the misfit vectors, shape (n_pretension, n_electrode, n_change).
         """
         changed_misfit = self._misfit_vectors(charge_pC * np.exp(log_changes))
-        return np.moveaxis(changed_misfit - misfit, 0, 2)
+        return np.moveaxis(changed_misfit - misfit, 0, 2)  # the axis of the changes becomes the last axis
 
     def _offset_steps(self) -> Array:
         """Return the step of the finite difference with respect to the offset at each level, shape (n_level,), pC.
 
-        The step is the mean offset of the level, or `SMALLEST_OFFSET_STEP_pC` if the mean offset is smaller.
+        The step is the mean offset of the level, or `SMALLEST_OFFSET_STEP_pC` if the magnitude of the mean offset is
+        smaller than `SMALLEST_OFFSET_STEP_pC`.
         """
-        pretension_weight = self._probability / self._probability.sum(axis=1, keepdims=True)
+        pretension_weight = self._joint_probability / self._joint_probability.sum(axis=1, keepdims=True)
         mean_offset_pC = (pretension_weight * self._mean[..., self._layout.offset]).sum(axis=1)
         is_small = np.abs(mean_offset_pC) < SMALLEST_OFFSET_STEP_pC
         return np.where(is_small, SMALLEST_OFFSET_STEP_pC, mean_offset_pC)
 
     def _residuals(self, misfit: Array, jacobian: Array, noise_covariance: Array) -> TouchResiduals:
-        """Return the squared misfits of a touch after the touch is corrected with the most likely offset level.
+        """Compute the squared misfits of a touch after a correction with the estimates at the most likely offset level.
 
         Args:
             misfit: Misfit vectors, as `_linearise` returns them.
@@ -484,10 +517,11 @@ class FilmFilter:
         residual = misfit - multiply_stacks(level_jacobian, mean)
         residual_without_gains = misfit - multiply_stacks(level_jacobian, mean_without_gains)
 
-        offset_jacobian = level_jacobian[self.nearest, :, self._layout.offset]
-        offset_variance = self._scatter_std[level] ** 2 * (offset_jacobian**2).sum()
+        offset_jacobian = level_jacobian[self.nearest_index, :, self._layout.offset]
+        offset_variance = self._scatter_std_pC[level] ** 2 * (offset_jacobian**2).sum()
 
-        # The squared misfit at each pretension g is r^T P r, the sum over the electrodes e and f.
+        # The squared misfit at a pretension is r^T P r, where r is the residual and P is the precision. In the indices
+        # of `einsum`, g is the pretension, and e and f are electrodes.
         quadratic_form = "ge,gef,gf->g"
         return TouchResiduals(
             filtered=np.einsum(quadratic_form, residual, precision, residual),

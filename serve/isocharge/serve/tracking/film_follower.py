@@ -1,17 +1,23 @@
 """Correction of contacts for changes of the film, which are estimated from ordinary touches.
 
-The charges of four electrodes have one degree of freedom more than a contact (x, y, force). This degree of freedom is
-the misfit. If the pretension of a film changes, for example because the room is warmer by 1 K, the misfits of all
-touches grow. The pretension of the film is the pretension at which the misfits are smallest.
+The charges of four electrodes have one degree of freedom more than a contact (x, y, force). The misfit is the distance
+of the charges from the charges that a contact can produce. If the pretension of a film changes, for example because the
+room becomes warmer by 1 K, the misfits of all touches increase. The estimated pretension is the pretension for which
+the misfits of the touches are smallest.
 
-The module `isocharge.serve.tracking.film_filter` estimates the pretension from the frame with the largest force of each
-touch. The filter also estimates the gains, a common offset, and the directions in which the film remained uncertain
-after the calibration (`FilmDirections`). Contacts are corrected for the estimated pretension and directions.
+The module `isocharge.serve.tracking.film_filter` estimates the pretension from one frame of each touch, namely the
+frame with the largest force. The filter also estimates the gains, a common offset, and the directions in which the film
+remained uncertain after the calibration (`FilmDirections`). Contacts are corrected for the estimated pretension and for
+the estimated directions.
 
 If no pretension explains a touch, for example a touch with two contacts, the touch hardly changes the estimate. The
-film is lost if no pretension explains the latest touches, or if a wrong gain explains the latest touches far better.
-The film is also lost if the charges have a common offset, for example from a warm hand, that is larger than the
-settings allow. The contacts on a lost film are computed with the estimate before the latest touches.
+film is considered lost in three cases.
+
+- No pretension explains the latest touches.
+- A wrong gain of one electrode explains the latest touches far better than any pretension.
+- The charges have a common offset, for example from a warm hand, that is larger than the settings allow.
+
+The contacts on a lost film are computed with the estimate before the latest touches.
 """
 
 import math
@@ -35,10 +41,10 @@ from isocharge.serve.tracking.followable_pretensions import followable_pretensio
 from isocharge.serve.tracking.pretension_grid import odds_of_no_change
 
 HARMLESS_FLAGS = frozenset({STRESS, GAP, REPEAT})
-"""Flags of a frame that do not make its touch unusable. GAP and REPEAT only mean that frames were lost."""
+"""Flags of a frame with which its touch remains usable. GAP and REPEAT only mean that frames were lost."""
 
 HARMLESS_FLAGS_OUTSIDE = HARMLESS_FLAGS | {OUTSIDE, BEYOND, MISFIT}
-"""Flags of a frame with the flag OUTSIDE that do not make its touch unusable.
+"""Flags with which a touch remains usable if the same frame also has the flag OUTSIDE.
 
 The first frames of every touch have the flag OUTSIDE.
 """
@@ -65,9 +71,9 @@ WRONG_GAINS = np.outer([-1.0, 1.0], [0.03, 0.04, 0.06, 0.09]).ravel()
 """Gain errors of a single electrode that are compared with a change of the pretension."""
 
 WRONG_GAIN_MARGIN = 9.0
-"""Smallest reduction of the sum of squared misfits by a wrong gain with which the gain is considered wrong.
+"""Smallest reduction of the sum of squared misfits for which a gain is considered wrong.
 
-The sum with the wrong gain is compared with the smallest sum for any pretension.
+The reduction is the smallest sum for any pretension minus the smallest sum for any wrong gain.
 """
 
 OFFSET_CORRECTION_ERROR = 0.5
@@ -77,22 +83,22 @@ UNCHANGED_PROBABILITY = 0.2
 """Probability before the first touch that the pretension has not changed since the calibration."""
 
 SENSITIVITY_STEP_MPa = 0.05
-"""Step of the finite differences with respect to the pretension."""
+"""Step of the finite differences with respect to the pretension, MPa."""
 
 SMALLEST_CHANGE_MPa = 0.01
-"""Smallest change of the pretension after which the weights of the model are computed again."""
+"""Smallest change of the pretension after which the weights of the model are computed again, MPa."""
 
 
 class FollowRule(Rule, frozen=True, kw_only=True):
     """Settings of the correction for changes of the film; the section `[follow]` of a device file.
 
     Attributes:
-        drift_MPa_per_root_hour: Standard deviation of the change of the pretension in an hour. The standard deviation
-            is proportional to the square root of the time. On a ring of aluminium, a change of the temperature by 1 K
-            changes the pretension by 0.3 to 0.44 MPa.
-        largest_offset_pC: Standard deviation of the largest charges that warmth may add to all electrodes during a
-            touch. The film is not followed while the charges are more than twice as large. 0 means that warmth adds no
-            charges.
+        drift_MPa_per_root_hour: Standard deviation of the change of the pretension in an hour, MPa. The standard
+            deviation is proportional to the square root of the time. On a ring of aluminium, a change of the
+            temperature by 1 K changes the pretension by 0.3 to 0.44 MPa.
+        largest_offset_pC: Largest standard deviation of the charge that warmth may add to all electrodes during a
+            touch, pC. The film is not followed while the mean added charge exceeds twice this value. 0 means that
+            warmth adds no charge.
     """
 
     drift_MPa_per_root_hour: Setting = 0.35
@@ -100,11 +106,12 @@ class FollowRule(Rule, frozen=True, kw_only=True):
 
 
 class FollowedContact(NamedTuple):
-    """A contact after the correction for the estimate of the film.
+    """A contact that was corrected for the estimated changes of the film.
 
     Attributes:
-        contact: The contact.
-        charge_pC: Charges for which the model of the followed pretension gives this contact, shape (n_electrode,), pC.
+        contact: The corrected contact.
+        charge_pC: Charges for which the model with the estimated pretension predicts this contact, shape
+            (n_electrode,), pC.
     """
 
     contact: Contact
@@ -115,7 +122,7 @@ class PeakFrame(NamedTuple):
     """The frame with the largest force of a touch.
 
     Attributes:
-        contact: Contact of the frame.
+        contact: Contact that the model computed for the frame.
         charge_pC: Touch charges of the frame, shape (n_electrode,), pC.
     """
 
@@ -124,17 +131,19 @@ class PeakFrame(NamedTuple):
 
 
 class SquaredMisfits(NamedTuple):
-    """Squared misfits of one touch, relative to the mean squared misfit of good touches.
+    """Squared misfits of one touch for different hypotheses about the film.
 
-    The squared misfits are limited to `LARGEST_SQUARE`.
+    The squared misfits are relative to the mean squared misfit of good touches. Each value is limited to
+    `LARGEST_SQUARE`.
 
     Attributes:
-        filtered: Squared misfit after the correction by all linear unknowns, at each pretension, shape (n_pretension,).
+        filtered: Squared misfit at each pretension after a correction for the gains, the offset and the directions,
+            shape (n_pretension,).
         filtered_at_estimate: Element of `filtered` at the pretension that was estimated at the time of the touch.
-        without_gains: Squared misfit after the correction by the offset and the directions, but not by the gains, at
-            each pretension, shape (n_pretension,).
-        wrong_gain: Squared misfit with each of the wrong gains, for the calibrated film and for the followed film,
-            shape (n_case,).
+        without_gains: Squared misfit at each pretension after a correction for the offset and the directions, but not
+            for the gains, shape (n_pretension,).
+        wrong_gain: Squared misfit for each wrong gain of each electrode, first with the model of the calibrated film
+            and then with the model of the estimated pretension, shape (2 * n_wrong_gain * n_electrode,).
     """
 
     filtered: Array
@@ -144,21 +153,21 @@ class SquaredMisfits(NamedTuple):
 
 
 class FilmFollower:
-    """Estimates changes of one film from its touches, and corrects contacts for these changes.
+    """Estimator of the changes of one film, which corrects contacts for the estimated changes.
 
-    The methods must be called from one thread. The same frames always give bitwise equal contacts.
+    The methods must be called from one thread. The same sequence of frames always gives bitwise equal contacts.
 
     Attributes:
         predictor: Model of the film with the estimated pretension.
-        is_lost: Whether the estimate is not updated, because no pretension explains the latest touches.
+        is_lost: Whether the film is lost. The estimate is not updated while the film is lost.
     """
 
     def __init__(self, predictor: Predictor, rule: FollowRule | None = None, offset_ratio: Array | float = 1.0) -> None:
-        """Begin with the estimate that the film has not changed since the calibration.
+        """Start with the assumption that the film has not changed since the calibration.
 
         Args:
-            predictor: The calibrated model.
-            rule: Settings; None for the settings of an empty section.
+            predictor: Model of the calibrated film.
+            rule: Settings; None for the default value of every setting.
             offset_ratio: Charge that warmth adds to each electrode, relative to the common offset, shape
                 (n_electrode,), or one number for all electrodes.
 
@@ -166,7 +175,7 @@ class FilmFollower:
             ModelError: If the model has three electrodes, or has no file of pretensions, or the file of pretensions
                 belongs to another model.
         """
-        self._calibrated = predictor
+        self._calibrated_predictor = predictor
         self._pretensions = followable_pretensions(predictor)
         electrodes = self._pretensions.typical_pC.size
         self._directions = read_film_directions(predictor.folder, electrodes)
@@ -184,14 +193,14 @@ class FilmFollower:
             directions=np.zeros(self._directions.count),
             directions_per_MPa=np.zeros(self._directions.count),
         )
-        # Each row contains a wrong gain of one electrode, and the gain 1 of the other electrodes.
+        # Each row contains a wrong gain for one electrode, and the gain 1 for all other electrodes.
         self._wrong_gains = 1.0 + np.kron(np.eye(electrodes), WRONG_GAINS[:, None])
         self.reset()
 
     def reset(self) -> None:
-        """Discard all touches, and return to the estimate that the film has not changed since the calibration."""
+        """Discard all touches, and assume again that the film has not changed since the calibration."""
         self._filter.reset()
-        self.predictor = self._calibrated
+        self.predictor = self._calibrated_predictor
         self.is_lost = False
         self._applied_estimate = self._calibrated_estimate
 
@@ -199,7 +208,7 @@ class FilmFollower:
         self._neighbouring_model: Predictor | None = None
         self._neighbouring_step_MPa = SENSITIVITY_STEP_MPa
 
-        # Factors of the charges for both models, and the contact for which they were computed; see `_charge_factors`.
+        # Charge factors for both models, and the contact for which the factors were computed; see `_charge_factors`.
         self._factors: tuple[Array, Array] | None = None
         self._factors_contact: Contact | None = None
         self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
@@ -209,23 +218,23 @@ class FilmFollower:
         self.discard_touch()
 
     def discard_touch(self) -> None:
-        """Discard the present touch, for example after an outage or a new tare."""
+        """Discard the frames of the present touch, for example after an outage or a new tare."""
         self._peak: PeakFrame | None = None
         self._is_touch_usable = True
 
     @property
     def film(self) -> FollowedFilm:
-        """Present estimate of the film for a record."""
+        """Present estimate of the film, in the form in which a prediction record contains it."""
         estimate = self._applied_estimate
         return FollowedFilm(estimate.pretension_MPa, estimate.std_MPa, self._touch_count)
 
     def observe_frame(
         self, charge_pC: Array | None, contact: Contact | None, flags: tuple[str, ...], clock_s: float
     ) -> None:
-        """Process a frame. After the last frame of a touch, the estimate of the film is updated.
+        """Process the next frame, and update the estimate of the film when a touch ends.
 
-        The estimate is updated with the frame of the touch that has the largest force and no flags. A touch is not used
-        if one of its frames has a flag that is not harmless.
+        The estimate is updated with one frame of the touch, namely the frame without flags that has the largest force.
+        A touch is not used if one of its frames has a flag that is not harmless.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC; None if nothing touches the film.
@@ -244,18 +253,25 @@ class FilmFollower:
             self._peak = PeakFrame(contact, charge_pC)
 
     def _end_touch(self, clock_s: float) -> None:
-        """Update the estimate with the touch that has just ended, unless the flags of a frame make it unusable."""
+        """Update the estimate with the touch that has just ended, unless the touch is unusable.
+
+        A touch is unusable if a frame has a flag that is not harmless, or if all frames have flags.
+
+        Args:
+            clock_s: Time of the first frame without contact on a clock that does not jump, s.
+        """
         if self._peak is not None and self._is_touch_usable:
             self.observe_touch(self._peak, clock_s)
         self.discard_touch()
 
     def follow_contact(self, contact: Contact, charge_pC: Array) -> FollowedContact:
-        """Correct a contact for the present estimate of the film, and add the uncertainty of the pretension.
+        """Correct a contact for the estimated changes of the film.
 
-        The same contact gives other charges on the followed film than on the calibrated film. The measured charges are
-        therefore divided by the ratio of these charges, and the contact is computed again from the result. The
-        uncertainty is computed with a model at a neighbouring pretension. Before the first estimate, the contact is
-        returned unchanged.
+        The present film produces different charges than the film that `predictor` describes. The measured charges are
+        therefore divided by the ratio of the charges of these two films, and the contact is computed again from the
+        result. The uncertainty of the pretension is added to the standard deviations of the contact. For this purpose,
+        the contact is also computed with a model at a neighbouring pretension. Before the first estimate of the film,
+        the contact is returned unchanged.
 
         Args:
             contact: Contact that `predictor` computed from the charges.
@@ -276,19 +292,21 @@ class FilmFollower:
         return FollowedContact(corrected_contact.widened(shift), corrected_pC)
 
     def _charge_factors(self, contact: Contact) -> tuple[Array, Array]:
-        """Return the factors by which the charges are divided before they are passed to the models.
+        """Return the factors by which charges are divided before a model computes a contact from them.
 
-        The factors are computed again only if the contact has moved.
+        The factors depend on the contact and on the estimate of the film. The factors are computed again only after the
+        contact has moved or the estimate has changed.
 
         Args:
-            contact: Contact near which the factors are needed.
+            contact: Contact for which the factors are needed.
 
         Returns:
-            Factors for the model of the estimated pretension and for the model of the neighbouring pretension, each of
-            shape (n_electrode,).
+            Factors for the model with the estimated pretension, and factors for the model with the neighbouring
+            pretension, each of shape (n_electrode,).
         """
         if self._factors is None or not is_close(contact, self._factors_contact):
-            (log_changes,) = self._directions.log_changes(np.array([contact[:3]]))
+            contacts = np.array([contact[:3]])  # one contact (x, y, force), shape (1, 3)
+            log_changes = self._directions.log_changes(contacts)[0]
             factor = self._applied_estimate.charge_factor(log_changes)
             neighbouring_factor = self._applied_estimate.charge_factor(log_changes, self._neighbouring_step_MPa)
             self._factors = factor, neighbouring_factor
@@ -299,8 +317,8 @@ class FilmFollower:
         """Update the estimate of the film with a touch, and decide whether the film is lost.
 
         The film is lost if no pretension explains the latest touches, if the gain of an electrode seems to be wrong, or
-        if the offsets are too large. When the film gets lost, the estimate returns to that before the latest touches.
-        No estimate is used before `FEWEST_TOUCHES` touches.
+        if the offsets are too large. When the film becomes lost, the estimate before the latest touches is used again.
+        No estimate is used before `FEWEST_TOUCHES` touches were observed.
 
         Args:
             peak: Frame with the largest force of the touch.
@@ -309,7 +327,8 @@ class FilmFollower:
         contacts = np.array([peak.contact[:3]])  # one contact (x, y, force), shape (1, 3)
         log_changes = self._directions.log_changes(contacts)[0]
         self._filter.predict(clock_s)
-        residuals = self._filter.update(peak.charge_pC, log_changes, self._misfit_slopes(contacts, peak.charge_pC))
+        misfit_slopes = self._misfit_slopes(contacts, peak.charge_pC)
+        residuals = self._filter.update(peak.charge_pC, log_changes, misfit_slopes)
         self._touch_count += 1
         self._recent_misfits.append(self._squared_misfits(peak.charge_pC, log_changes, residuals))
         if len(self._recent_misfits) < FEWEST_TOUCHES:
@@ -321,7 +340,7 @@ class FilmFollower:
             estimate = self._estimate()
             self._recent_estimates.append(estimate)
             self._apply_estimate(estimate)
-        elif not was_lost:  # the film has been lost with this touch
+        elif not was_lost:  # the film became lost with this touch
             self._apply_estimate(self._estimate_before_recent_touches())
             self._recent_estimates.clear()
 
@@ -333,23 +352,26 @@ class FilmFollower:
             charge_pC: Touch charges, shape (n_electrode,), pC.
 
         Returns:
-            Derivatives, shape (n_electrode, n_electrode), in units of the noise. None if the file of directions does
+            Derivatives, shape (n_electrode, n_electrode), in units of the noise; None if the file of directions does
             not contain the charges of the calibrated film.
         """
-        noise_std_pC = np.sqrt(self._calibrated.metadata.noise.variance(charge_pC))
+        noise_std_pC = np.sqrt(self._calibrated_predictor.metadata.noise.variance(charge_pC))
         slopes = self._directions.misfit_slopes(contacts, charge_pC[None], noise_std_pC[None])
         return None if slopes is None else slopes[0]
 
     def _estimate_before_recent_touches(self) -> FilmStateEstimate:
-        """Return the estimate before the latest `RECENT_TOUCHES` touches."""
-        is_old_enough = len(self._recent_estimates) == RECENT_TOUCHES
-        return self._recent_estimates[0] if is_old_enough else self._calibrated_estimate
+        """Return the estimate before the latest `RECENT_TOUCHES` touches.
+
+        If there are fewer than `RECENT_TOUCHES` estimates, the result is the estimate from the calibration.
+        """
+        is_long_enough = len(self._recent_estimates) == RECENT_TOUCHES
+        return self._recent_estimates[0] if is_long_enough else self._calibrated_estimate
 
     def _squared_misfits(self, charge_pC: Array, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
-        """Return the squared misfits of a touch, which determine whether the film is lost.
+        """Compute the squared misfits of a touch that are needed to decide whether the film is lost.
 
-        One group of misfits tests the hypothesis that the gain of one electrode is wrong. For these misfits, the
-        charges are corrected for the offset and the directions, and are then multiplied by each wrong gain.
+        The attribute `wrong_gain` of the result tests the hypothesis that the gain of one electrode is wrong. For this
+        test, the charges are corrected for the offset and the directions, and are then multiplied by each wrong gain.
 
         Args:
             charge_pC: Touch charges of the frame with the largest force, shape (n_electrode,), pC.
@@ -359,7 +381,7 @@ class FilmFollower:
         directions = self._filter.direction_means(self._filter.mean_MPa)
         corrected_pC = (charge_pC - self._filter.offset_pC) * np.exp(-directions @ log_changes)
         charges_with_wrong_gain_pC = corrected_pC * self._wrong_gains  # one row for each wrong gain
-        calibrated_misfit = self._calibrated.predict_batch(charges_with_wrong_gain_pC).misfit
+        calibrated_misfit = self._calibrated_predictor.predict_batch(charges_with_wrong_gain_pC).misfit
         followed_misfit = self.predictor.predict_batch(charges_with_wrong_gain_pC).misfit
         misfit = np.concatenate([calibrated_misfit, followed_misfit]).astype(float)
         mean_square_of_good_touches = self._pretensions.misfit_rms**2 * (1.0 + residuals.offset_variance)
@@ -368,7 +390,7 @@ class FilmFollower:
         filtered = np.minimum(residuals.filtered, LARGEST_SQUARE)
         return SquaredMisfits(
             filtered=filtered,
-            filtered_at_estimate=float(filtered[self._filter.nearest]),
+            filtered_at_estimate=float(filtered[self._filter.nearest_index]),
             without_gains=np.minimum(residuals.without_gains, LARGEST_SQUARE),
             wrong_gain=np.minimum(wrong_gain, LARGEST_SQUARE),
         )
@@ -376,12 +398,13 @@ class FilmFollower:
     def _is_unexplained(self) -> bool:
         """Return whether no pretension explains the latest touches.
 
-        The squared misfits of these touches are added up at the present estimate of the pretension, and at the
-        estimates at the times of the touches. The smaller sum is compared with a limit.
+        The squared misfits of the latest touches are added up in two ways. The first sum uses the present estimate of
+        the pretension for all touches. The second sum uses the estimate at the time of each touch. If the smaller of
+        the two sums exceeds a limit, no pretension explains the touches.
         """
         count = len(self._recent_misfits)
-        nearest = self._filter.nearest
-        sum_at_present_estimate = sum(float(touch.filtered[nearest]) for touch in self._recent_misfits)
+        nearest_index = self._filter.nearest_index
+        sum_at_present_estimate = sum(float(touch.filtered[nearest_index]) for touch in self._recent_misfits)
         sum_at_earlier_estimates = sum(touch.filtered_at_estimate for touch in self._recent_misfits)
         largest_explained_sum = EXPLAINED_SQUARE * count + EXPLAINED_SCATTER * math.sqrt(count)
         return min(sum_at_present_estimate, sum_at_earlier_estimates) > largest_explained_sum
@@ -393,23 +416,23 @@ class FilmFollower:
         return bool(sum_by_wrong_gain.min() < sum_by_pretension.min() - WRONG_GAIN_MARGIN)
 
     def _estimate(self) -> FilmStateEstimate:
-        """Return the estimate of the film, averaged over two hypotheses.
+        """Compute the estimate of the film as an average over two hypotheses.
 
-        The first hypothesis is that the pretension has changed since the calibration. The second hypothesis is that it
-        has not changed, which has the probability `UNCHANGED_PROBABILITY` before the first touch. The variance includes
-        the difference between the two hypotheses.
+        The first hypothesis is that the pretension has changed since the calibration. The second hypothesis is that the
+        pretension has not changed. Before the first touch, the second hypothesis has the probability
+        `UNCHANGED_PROBABILITY`. The variance of the result includes the difference between the two hypotheses.
         """
         calibrated_MPa = self._pretensions.calibrated_MPa
         change_MPa = self._filter.mean_MPa - calibrated_MPa
         variance_MPa2 = self._filter_variance() + self._additional_variance()
         changed_probability = self._changed_probability()
 
-        # Mean and variance of the mixture of both hypotheses
+        # Mean and standard deviation of the mixture of both hypotheses.
         pretension_MPa = calibrated_MPa + changed_probability * change_MPa
         variance_between_MPa2 = changed_probability * (1.0 - changed_probability) * change_MPa**2
         std_MPa = math.sqrt(variance_MPa2 + variance_between_MPa2)
 
-        # Means of the directions at this pretension, and their slopes as finite differences
+        # Means of the directions at the estimated pretension, and the slopes of the means as finite differences.
         directions = self._filter.direction_means(pretension_MPa)
         neighbouring_directions = self._filter.direction_means(pretension_MPa + SENSITIVITY_STEP_MPa)
         directions_per_MPa = (neighbouring_directions - directions) / SENSITIVITY_STEP_MPa
@@ -418,32 +441,31 @@ class FilmFollower:
     def _filter_variance(self) -> float:
         """Return the variance of the pretension according to the filter, MPa^2."""
         deviations_MPa = self._filter.grid_MPa - self._filter.mean_MPa
-        return float(self._filter.probability @ deviations_MPa**2)
+        return float(self._filter.pretension_probability @ deviations_MPa**2)
 
     def _additional_variance(self) -> float:
-        """Return the variance of the pretension that the filter does not contain, MPa^2.
+        """Return the variance of the pretension that is caused by errors outside the filter, MPa^2.
 
-        This variance consists of the errors of the other parameters of the film and of the error of the correction for
-        offsets.
+        These errors are the errors of the other parameters of the film, and the error of the correction for offsets.
         """
-        offset_std = OFFSET_CORRECTION_ERROR * self._filter.offset_correction_MPa
-        return self._pretensions.floor_MPa**2 + offset_std**2
+        offset_std_MPa = OFFSET_CORRECTION_ERROR * self._filter.offset_correction_MPa
+        return self._pretensions.floor_MPa**2 + offset_std_MPa**2
 
     def _changed_probability(self) -> float:
         """Return the probability that the pretension has changed since the calibration."""
         pretensions = self._pretensions
         change_MPa = self._filter.grid_MPa - pretensions.calibrated_MPa
         likelihood_ratio = odds_of_no_change(
-            change_MPa, self._filter.probability, pretensions.std_MPa, self._additional_variance()
+            change_MPa, self._filter.pretension_probability, pretensions.std_MPa, self._additional_variance()
         )
-        odds = likelihood_ratio * UNCHANGED_PROBABILITY / (1.0 - UNCHANGED_PROBABILITY)
-        return 1.0 / (1.0 + odds)
+        unchanged_odds = likelihood_ratio * UNCHANGED_PROBABILITY / (1.0 - UNCHANGED_PROBABILITY)
+        return 1.0 / (1.0 + unchanged_odds)
 
     def _apply_estimate(self, estimate: FilmStateEstimate) -> None:
         """Use a new estimate of the film for all later contacts.
 
         If the pretension has changed by less than `SMALLEST_CHANGE_MPa`, the present pretension and the present models
-        are kept, and only the other values of the estimate are used.
+        are kept. The other values of the new estimate are used in any case.
         """
         self._factors = None  # the factors of the charges belong to the previous estimate
         present_MPa = self._applied_estimate.pretension_MPa
@@ -459,11 +481,13 @@ class FilmFollower:
             self._set_neighbouring_model(self._applied_estimate.pretension_MPa)
 
     def _set_neighbouring_model(self, pretension_MPa: float) -> None:
-        """Set the model with which the sensitivity of contacts to the pretension is computed.
+        """Create the model at a neighbouring pretension, with which the sensitivity to the pretension is computed.
+
+        The neighbouring pretension is larger than the estimated pretension by `SENSITIVITY_STEP_MPa`. If no weights are
+        available for the larger pretension, the neighbouring pretension is smaller by the same amount.
 
         Args:
-            pretension_MPa: The estimated pretension. The pretension of the model is larger by `SENSITIVITY_STEP_MPa`,
-                or smaller if the larger pretension is outside the range of the weights.
+            pretension_MPa: The estimated pretension, MPa.
         """
         step_MPa = SENSITIVITY_STEP_MPa
         _, largest_MPa = self._pretensions.range_MPa
@@ -474,5 +498,5 @@ class FilmFollower:
         self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)  # the sign of the step does not affect variances
 
     def _model_with_pretension(self, pretension_MPa: float) -> Predictor:
-        """Return the model of the calibrated film if it had another pretension."""
-        return self._calibrated.with_constants(self._pretensions.constants(pretension_MPa))
+        """Return the model of the calibrated film at the pretension `pretension_MPa`."""
+        return self._calibrated_predictor.with_constants(self._pretensions.constants(pretension_MPa))

@@ -1,4 +1,4 @@
-"""Estimate of the state of a film, which `film_follower` computes from touches."""
+"""Estimated state of a film, which the module `film_follower` computes from touches."""
 
 from typing import NamedTuple
 
@@ -11,10 +11,11 @@ class FilmStateEstimate(NamedTuple):
     """Estimate of the pretension of the film and of the directions in which the film is uncertain.
 
     Attributes:
-        pretension_MPa: Estimate of the pretension.
-        std_MPa: Standard deviation of the pretension.
-        directions: Estimate of the directions at this pretension, shape (n_direction,), in standard deviations.
-        directions_per_MPa: Change of this estimate with the pretension, shape (n_direction,), 1/MPa.
+        pretension_MPa: Estimate of the pretension, MPa.
+        std_MPa: Standard deviation of the pretension, MPa.
+        directions: Estimated coordinates along the directions at the estimated pretension, shape (n_direction,), in
+            standard deviations.
+        directions_per_MPa: Derivative of `directions` with respect to the pretension, shape (n_direction,), 1/MPa.
     """
 
     pretension_MPa: float
@@ -23,11 +24,13 @@ class FilmStateEstimate(NamedTuple):
     directions_per_MPa: Array
 
     def charge_factor(self, log_changes: Array, step_MPa: float = 0.0) -> Array:
-        """Compute the ratio of the charges of this film to the charges of the calibrated film at the same pretension.
+        """Compute the ratio of the charges of the estimated film to the charges of the calibrated film.
+
+        Both films are assumed to have the same pretension.
 
         Args:
             log_changes: Changes of ln Q by one unit of each direction, shape (n_direction, n_electrode).
-            step_MPa: Difference of this pretension from the estimated pretension.
+            step_MPa: Pretension for which the ratio is computed, minus the estimated pretension, MPa.
 
         Returns:
             Ratios, shape (n_electrode,), dimensionless.

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class UnknownsLayout:
-    """Positions of the linear unknowns in a vector.
+    """Indices of the linear unknowns in the vector of all linear unknowns.
+
+    The vector contains the gains, the offset and the directions, in this order.
 
     Attributes:
         electrodes: Number of electrodes.
@@ -17,17 +19,17 @@ class UnknownsLayout:
 
     @property
     def gains(self) -> slice:
-        """Deviations of the gains from one, in units of GAIN_STD, one for each electrode."""
+        """Slice of the gains: the deviation of each gain from 1, in units of `GAIN_STD`, for each electrode."""
         return slice(0, self.electrodes)
 
     @property
     def offset(self) -> int:
-        """Mean of the common offset, pC."""
+        """Index of the mean of the common offset, pC."""
         return self.electrodes
 
     @property
     def directions(self) -> slice:
-        """Coordinates along the directions in which the film is uncertain, in standard deviations."""
+        """Slice of the coordinates along the directions in which the film is uncertain, in standard deviations."""
         return slice(self.electrodes + 1, self.size)
 
     @property

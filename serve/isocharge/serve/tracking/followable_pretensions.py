@@ -1,4 +1,7 @@
-"""Reading of the weights of a model for other pretensions, and checks that the weights belong to the model."""
+"""Reading of the weights with which a model describes its film at other pretensions.
+
+The module also checks that the weights belong to the model.
+"""
 
 import numpy as np
 
@@ -8,14 +11,20 @@ from isocharge.serve.prediction.predictor import Predictor
 
 
 def followable_pretensions(predictor: Predictor) -> Pretensions:
-    """Read the file of pretensions of a model, and check that changes of its film can be estimated.
+    """Read the file of pretensions of a model, and check that changes of the film can be estimated with the model.
+
+    Args:
+        predictor: Model of the calibrated film.
+
+    Returns:
+        The weights of the network at any pretension.
 
     Raises:
         ModelError: If the model has three electrodes, or has no file of pretensions, or the file of pretensions belongs
             to another model.
     """
     electrodes = predictor.metadata.electrodes
-    if len(electrodes) <= 3:
+    if len(electrodes) <= 3:  # three charges have no misfit
         raise ModelError(
             f"model {predictor.metadata.label}: its film cannot be followed: {len(electrodes)} charges "
             f"{electrodes} only determine x, y and force; expected a model with four electrodes or more, whose misfit "
@@ -27,13 +36,13 @@ def followable_pretensions(predictor: Predictor) -> Pretensions:
 
 
 def _check_same_model(predictor: Predictor, pretensions: Pretensions) -> None:
-    """Check that the weights of a file of pretensions belong to a model.
+    """Check that the weights in a file of pretensions belong to a model.
 
-    With the weights of the calibrated pretension, the graph of the model must compute the same contacts as with its own
-    weights. With the weights of another pretension, the graph must compute other contacts.
+    With the weights for the calibrated pretension, the graph of the model must compute the same contacts as with the
+    weights of the model itself. With the weights for another pretension, the graph must compute different contacts.
 
     Args:
-        predictor: The calibrated model, with its own weights.
+        predictor: Model of the calibrated film, with its own weights.
         pretensions: Weights of the network at any pretension, from the file.
 
     Raises:
@@ -44,13 +53,14 @@ def _check_same_model(predictor: Predictor, pretensions: Pretensions) -> None:
     charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)  # a weak, a typical and a strong press
     calibrated_model = predictor.with_constants(pretensions.constants(pretensions.calibrated_MPa))
     other_model = predictor.with_constants(pretensions.constants(other_MPa))
-    own = np.asarray(predictor.predict_batch(charges_pC))
-    calibrated = np.asarray(calibrated_model.predict_batch(charges_pC))
-    other = np.asarray(other_model.predict_batch(charges_pC))
+    expected_contacts = np.asarray(predictor.predict_batch(charges_pC))
+    calibrated_contacts = np.asarray(calibrated_model.predict_batch(charges_pC))
+    other_contacts = np.asarray(other_model.predict_batch(charges_pC))
 
-    # The tolerance covers the rounding errors of the interpolated weights. Missing correlations are NaN.
-    is_equal_at_calibration = np.allclose(calibrated, own, rtol=1e-5, atol=1e-5, equal_nan=True)
-    depends_on_pretension = not np.array_equal(other, own)
+    # The tolerance covers the rounding errors of the interpolated weights. Correlations that the model does not compute
+    # are NaN in both arrays.
+    is_equal_at_calibration = np.allclose(calibrated_contacts, expected_contacts, rtol=1e-5, atol=1e-5, equal_nan=True)
+    depends_on_pretension = not np.array_equal(other_contacts, expected_contacts)
     if not (is_equal_at_calibration and depends_on_pretension):
         raise ModelError(
             f"{predictor.folder}: pretensions.npz is not of this model.onnx; copy the model's folder again, or "

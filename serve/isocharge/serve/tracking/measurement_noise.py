@@ -1,15 +1,16 @@
 """Noise of the measured contacts, which is described by the shape of its covariance and by its estimated size.
 
-The standard deviations that a model reports apply to the noise with which the model was trained. The noise of a board
-may be smaller or larger. Noise changes from frame to frame, but a contact moves smoothly. The size of the noise is
-therefore estimated from the residuals of a linear extrapolation through the two previous frames.
+The standard deviations that a model reports apply to the noise with which the model was trained. The actual noise of a
+board may be smaller or larger. Noise changes randomly from frame to frame, whereas a contact moves smoothly. Each frame
+is therefore compared with a linear extrapolation of the two previous frames. The differences between the frames and the
+extrapolations determine the estimated size of the noise.
 """
 
 import math
 from typing import NamedTuple
 
 PRIOR_FRAMES = 5
-"""Weight of the variance stated by the model, as a number of frames."""
+"""Weight of the variance stated by the model in the average, as a number of frames."""
 
 MAX_FRAMES = 100
 """Number of frames over which the estimate is averaged."""
@@ -31,10 +32,12 @@ MIN_UNCORRELATED_SHARE = 1e-6
 
 
 class CovarianceShape(NamedTuple):
-    """Covariance of a measurement divided by the square root of its determinant, so that the determinant is 1.
+    """Covariance matrix of a measurement, scaled to the determinant 1.
+
+    The inverse of the scaled matrix is stored, divided by the number of dimensions. `mean_square` uses this form.
 
     Attributes:
-        inverse_xx: Element xx of the inverse of this matrix, divided by the number of dimensions.
+        inverse_xx: Element xx of the inverse, divided by the number of dimensions.
         inverse_yy: Element yy of the inverse, divided by the number of dimensions.
         inverse_xy: Element xy of the inverse, divided by the number of dimensions.
         dimensions: Number of dimensions: 2 for a position, 1 for the logarithm of a force.
@@ -47,7 +50,9 @@ class CovarianceShape(NamedTuple):
 
     @classmethod
     def of_position(cls, x_std_mm: float, y_std_mm: float, correlation: float) -> tuple["CovarianceShape", float]:
-        """Split the covariance of a position into its shape and its size: covariance = size * shape.
+        """Split the covariance of a position into a shape with the determinant 1 and a size.
+
+        The covariance is the product of the size and the shape.
 
         Args:
             x_std_mm: Standard deviation of x, mm.
@@ -55,13 +60,14 @@ class CovarianceShape(NamedTuple):
             correlation: Correlation of x and y, from -1 to 1.
 
         Returns:
-            The shape, and the square root of the determinant of the covariance, mm^2.
+            The shape, and the size in mm^2. The size is the square root of the determinant of the covariance.
         """
-        # The determinant is (x_std * y_std)^2 * (1 - correlation^2). The size is its square root, so that the shape has
-        # the determinant 1. The inverse of the shape is stored, divided by the number of dimensions.
+        # The determinant of the covariance is (x_std * y_std)^2 * (1 - correlation^2).
         uncorrelated_share = 1.0 - correlation * correlation
         root = math.sqrt(max(uncorrelated_share, MIN_UNCORRELATED_SHARE))
         size_mm2 = x_std_mm * y_std_mm * root
+
+        # Elements of the inverse of the shape, divided by the number of dimensions.
         dimensions = 2
         scale = dimensions * root
         inverse_xx = y_std_mm / (x_std_mm * scale)
@@ -81,14 +87,14 @@ SCALAR_SHAPE = CovarianceShape(inverse_xx=1.0, inverse_yy=0.0, inverse_xy=0.0, d
 
 
 class NoiseEstimate(NamedTuple):
-    """Size of the noise, as estimated from the frames.
+    """Estimate of the size of the noise, and the latest measured value.
 
     Attributes:
-        relative_variance: Variance of the noise, relative to the variance stated by the model.
-        frames: Number of frames in the average, at most `MAX_FRAMES`.
+        relative_variance: Estimated variance of the noise, relative to the variance stated by the model.
+        frames: Number of frames over which the variance was averaged, at most `MAX_FRAMES`.
         measured: Latest measured value: a position x + iy, mm, or the logarithm of a force.
         rate: Rate of change between the latest two measured values, mm/s or 1/s.
-        dt_s: Time between the latest two measured values, s; 0 if there is only one.
+        dt_s: Time between the latest two measured values, s; 0 if there is only one value.
     """
 
     relative_variance: float
@@ -99,17 +105,22 @@ class NoiseEstimate(NamedTuple):
 
     @classmethod
     def start(cls, measured: complex) -> "NoiseEstimate":
-        """Return the estimate after the first measured value. The estimate is the variance stated by the model."""
+        """Return the noise estimate after the first measured value: the variance that the model states.
+
+        Args:
+            measured: The measured value: a position x + iy, mm, or the logarithm of a force.
+        """
         return cls(relative_variance=1.0, frames=PRIOR_FRAMES, measured=measured, rate=0j, dt_s=0.0)
 
     def updated(
         self, measured: complex, dt_s: float, shape: CovarianceShape, stated_variance: float
     ) -> "NoiseEstimate":
-        """Return the estimate after another measured value.
+        """Return the estimate after the next measured value.
 
-        The value is compared with the linear extrapolation of the two previous values. The estimate is the mean of the
-        squared errors of these extrapolations over the latest frames, relative to the error that the variance stated by
-        the model would cause. The squared error of one frame is limited, because a sudden movement is not noise.
+        The measured value is compared with the linear extrapolation of the two previous values. The squared error of
+        the extrapolation is divided by the mean squared error that noise with the stated variance would cause. The
+        estimated relative variance is the mean of this quotient over the latest frames. The quotient of a single frame
+        is limited, because a sudden movement is not noise.
 
         Args:
             measured: The measured value: a position x + iy, mm, or the logarithm of a force.
@@ -119,18 +130,19 @@ class NoiseEstimate(NamedTuple):
         """
         change = measured - self.measured
         rate = change / dt_s
-        if self.dt_s <= 0.0:  # there is only one previous value, so that no value can be extrapolated
+        if self.dt_s <= 0.0:  # there is only one previous value, so there is no extrapolation yet
             return self._replace(measured=measured, rate=rate, dt_s=dt_s)
 
-        # The error is x2 - (1 + r) x1 + r x0, where r is the ratio of the two intervals. The noise of the three values
-        # is independent, so that the error has the variance (1 + (1 + r)^2 + r^2) times the variance of one value.
+        # The error is x2 - (1 + r) x1 + r x0, where x0, x1 and x2 are the latest three values, and r is the ratio of
+        # the two intervals. The noise of the three values is independent. The variance of the error is therefore the
+        # variance of one value times 1 + (1 + r)^2 + r^2.
         time_ratio = dt_s / self.dt_s
         extrapolation_variance = stated_variance * (1.0 + time_ratio * time_ratio + (1.0 + time_ratio) ** 2)
         extrapolation_error = change - self.rate * dt_s
         relative_square = shape.mean_square(extrapolation_error) / extrapolation_variance
         limited_square = min(relative_square, MAX_RELATIVE_SQUARE * self.relative_variance)
 
-        # Running mean, in which the number of frames is limited so that the estimate follows changes of the noise.
+        # Update the running mean. The number of frames is limited, so that the estimate follows changes of the noise.
         frames = min(self.frames + 1, MAX_FRAMES)
         mean_square = self.relative_variance + (limited_square - self.relative_variance) / frames
         relative_variance = min(max(mean_square, MIN_RELATIVE_VARIANCE), MAX_RELATIVE_VARIANCE)

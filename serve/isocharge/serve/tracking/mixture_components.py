@@ -1,4 +1,7 @@
-"""Components of the Gaussian mixture in `contact_mixture`: their prediction, pruning and combination."""
+"""Components of the Gaussian mixture with which `contact_mixture` follows a contact.
+
+The functions predict, prune and combine components.
+"""
 
 import math
 from typing import NamedTuple
@@ -58,18 +61,19 @@ MIN_LOG_WEIGHT = -14.0
 """Logarithm of the weight, relative to the largest weight, below which a component is removed."""
 
 MERGE_DISTANCE = 0.7
-"""Distance below which two components are merged, in standard deviations of each entry of `MOTION`."""
+"""Difference of each entry of `MOTION` below which two components are merged, in standard deviations of the entry."""
 
 
 class ContactHypothesis(NamedTuple):
-    """A contact that explains the charges.
+    """A contact that explains the measured charges, with its probability.
 
     Attributes:
-        mean: Mean of the state, shape (6 + n_electrode,): x and y (mm), ln F, their rates (mm/s, 1/s), and the
-            logarithms of the gains.
+        mean: Mean of the state, shape (6 + n_electrode,): x and y in mm, ln F, the rates of these three values in mm/s
+            and 1/s, and the logarithms of the gains.
         covariance: Covariance of the state, shape (6 + n_electrode, 6 + n_electrode).
-        probability: Probability that this contact touches the film.
-        misfit: Distance of the measured charges from the charges of the contact, in standard deviations.
+        probability: Probability that the film is touched by this contact, and not by another contact.
+        misfit: Distance between the measured charges and the charges of the contact, in standard deviations of the
+            noise.
     """
 
     mean: Array
@@ -78,9 +82,9 @@ class ContactHypothesis(NamedTuple):
     misfit: float
 
     def extrapolated(self, dt_s: float) -> "ContactHypothesis":
-        """Return the hypothesis at a later time.
+        """Return the hypothesis at a later time, extrapolated with constant rates.
 
-        The covariance stays the same, because the time is short.
+        The covariance is not changed, because its growth during the short time is negligible.
 
         Args:
             dt_s: Time by which the hypothesis is extrapolated, s.
@@ -91,10 +95,10 @@ class ContactHypothesis(NamedTuple):
 
     @property
     def contact(self) -> Contact:
-        """The hypothesis as a `Contact`, the type that a model predicts.
+        """The hypothesis converted to a `Contact`, which is also the type of the predictions of a model.
 
         The state contains the logarithm of the force. The standard deviation of the force is therefore the force
-        multiplied by the standard deviation of this logarithm.
+        multiplied by the standard deviation of the logarithm.
         """
         x_mm, y_mm, log_force = self.mean[CONTACT].tolist()
         covariance = self.covariance[CONTACT, CONTACT]  # of x, y and ln F, shape (3, 3)
@@ -103,13 +107,13 @@ class ContactHypothesis(NamedTuple):
         x_std_mm, y_std_mm, log_force_std = std.tolist()
         force_N = math.exp(log_force)
         return Contact(
-            x_mm,
-            y_mm,
-            force_N,
-            x_std_mm,
-            y_std_mm,
-            log_force_std * force_N,
-            self.misfit,
+            x_mm=x_mm,
+            y_mm=y_mm,
+            force_N=force_N,
+            x_std_mm=x_std_mm,
+            y_std_mm=y_std_mm,
+            force_std_N=log_force_std * force_N,
+            misfit=self.misfit,
             xy_correlation=float(correlation[X, Y]),
             xF_correlation=float(correlation[X, LOG_FORCE]),
             yF_correlation=float(correlation[Y, LOG_FORCE]),
@@ -123,9 +127,9 @@ class ContactHypothesis(NamedTuple):
 
     @property
     def moving_probability(self) -> float:
-        """Probability that a contact at rest would have a smaller estimated velocity than this contact.
+        """Probability that the estimated speed of a contact at rest would be smaller than the speed of this contact.
 
-        The probability is the result of a chi-squared test of the velocity.
+        The probability is the result of a chi-squared test with two degrees of freedom.
         """
         velocity = self.mean[VELOCITY]
         covariance = self.covariance[VELOCITY, VELOCITY]
@@ -134,13 +138,14 @@ class ContactHypothesis(NamedTuple):
 
 
 class Components(NamedTuple):
-    """The components of the mixture.
+    """The n Gaussian components of the mixture.
 
     Attributes:
-        mean: Means of the state, shape (n, 6 + n_electrode).
-        covariance: Covariances of the state, shape (n, 6 + n_electrode, 6 + n_electrode).
-        log_weight: Logarithms of the weights, shape (n,). Only their differences matter.
-        misfit: Distance of the latest charges from the charges of the most probable component, in standard deviations.
+        mean: Mean of the state of each component, shape (n, 6 + n_electrode).
+        covariance: Covariance of the state of each component, shape (n, 6 + n_electrode, 6 + n_electrode).
+        log_weight: Logarithm of the weight of each component, shape (n,). Only differences of the logarithms matter.
+        misfit: Distance between the latest charges and the charges of the most probable component, in standard
+            deviations of the noise; NaN before the first update.
     """
 
     mean: Array
@@ -154,16 +159,16 @@ class Components(NamedTuple):
         return int(self.log_weight.argmax())
 
     def select(self, rows: "list[int] | Integers") -> "Components":
-        """Return the components with the indices `rows`."""
+        """Return only the components with the indices `rows`."""
         return self._replace(mean=self.mean[rows], covariance=self.covariance[rows], log_weight=self.log_weight[rows])
 
     def with_component(self, mean: Array, covariance: Array, log_weight: float) -> "Components":
-        """Return the components with an additional component.
+        """Return all components and one additional component.
 
         Args:
-            mean: Mean of the state, shape (6 + n_electrode,).
+            mean: Mean of the state of the additional component, shape (6 + n_electrode,).
             covariance: Covariance of the state, shape (6 + n_electrode, 6 + n_electrode).
-            log_weight: Logarithm of the weight.
+            log_weight: Logarithm of the weight of the additional component.
         """
         return self._replace(
             mean=np.vstack([self.mean, mean]),
@@ -173,13 +178,13 @@ class Components(NamedTuple):
 
 
 def predict_components(components: Components, dt_s: float) -> Components:
-    """Predict the components by a motion with constant velocity and white acceleration.
+    """Predict the components at the next step for motion with constant velocity and white acceleration.
 
     Args:
-        components: Components after the previous step.
+        components: Components after the update of the previous step.
         dt_s: Time since the previous step, s.
     """
-    # A state contains a contact (x, y, ln F), its rates, and gains, which stay the same.
+    # A state contains x, y and ln F, the rates of these three values, and the gains. The gains are constant.
     mean = components.mean.copy()
     mean[:, CONTACT] += dt_s * mean[:, RATES]
 
@@ -187,8 +192,8 @@ def predict_components(components: Components, dt_s: float) -> Components:
     transition[CONTACT, RATES] = dt_s * np.eye(3)
     covariance = transition @ components.covariance @ transition.T
 
-    # The white acceleration makes the velocity uncertain. Its density for the position is proportional to the squared
-    # speed, because contacts at rest rarely move, but it is never 0.
+    # The spectral density of the white acceleration of the position is proportional to the squared speed, because a
+    # fast contact changes its velocity more than a slow contact. The density has a lower limit.
     squared_speed = (mean[:, VELOCITY] ** 2).sum(axis=1)
     relative_density = np.maximum(squared_speed / POSITION_MOTION.velocity_variance, MIN_ACCELERATION_SHARE)
     position_density = POSITION_MOTION.acceleration_density * relative_density
@@ -199,14 +204,14 @@ def predict_components(components: Components, dt_s: float) -> Components:
 
 
 def _add_process_noise(covariance: Array, value: int, rate: int, density: Array | float, dt_s: float) -> None:
-    """Add the process noise of a white acceleration in place (Bar-Shalom, Li and Kirubarajan 2001, 6.2.2).
+    """Add the process noise of a white acceleration to covariances (Bar-Shalom, Li and Kirubarajan 2001, 6.2.2).
 
     Args:
-        covariance: Covariances of the state, shape (n, 6 + n_electrode, 6 + n_electrode).
-        value: Index of the value in the state.
-        rate: Index of its rate in the state.
+        covariance: Covariances of the state, shape (n, 6 + n_electrode, 6 + n_electrode). They are changed in place.
+        value: Index of x, y or ln F in the state.
+        rate: Index of the rate of the same quantity in the state.
         density: Spectral density of the acceleration, shape (n,) or a number, in squared units of the value per s^3.
-        dt_s: Length of the step, s.
+        dt_s: Time over which the acceleration acts, s.
     """
     covariance[:, value, value] += density * dt_s**3 / 3.0
     covariance[:, value, rate] += density * dt_s**2 / 2.0
@@ -215,64 +220,70 @@ def _add_process_noise(covariance: Array, value: int, rate: int, density: Array 
 
 
 def prune_components(components: Components) -> Components:
-    """Remove improbable components, and merge similar components.
+    """Remove improbable components, and merge components with a similar motion.
 
-    A component is merged into a more probable component with a similar motion: only its weight is added. At most the
-    `MAX_COMPONENTS` most probable components remain.
+    If the motion of a component is similar to the motion of a more probable component, the component is removed. The
+    weight of the removed component is added to the weight of the more probable component. Only the `MAX_COMPONENTS`
+    most probable components remain.
 
     Args:
-        components: Components after an update. The largest logarithm of their weights is 0.
+        components: Components after an update. The largest logarithm of the weights is 0.
     """
     log_weight = components.log_weight.copy()
-    descending_rows = np.argsort(-log_weight, kind="stable")
+    descending_rows = np.argsort(-log_weight, kind="stable")  # rows of the components, the most probable first
     probable_rows = descending_rows[log_weight[descending_rows] > MIN_LOG_WEIGHT]
-    selected: list[int] = []
+    remaining_rows: list[int] = []
     for row in probable_rows.tolist():
-        similar_row = _similar_component(components, row, selected)
+        similar_row = _similar_component(components, row, remaining_rows)
         if similar_row is None:
-            selected.append(row)
+            remaining_rows.append(row)
         else:
-            log_weight[similar_row] = np.logaddexp(log_weight[similar_row], log_weight[row])
-    return components._replace(log_weight=log_weight).select(selected[:MAX_COMPONENTS])
+            log_weight[similar_row] = np.logaddexp(log_weight[similar_row], log_weight[row])  # add the weights
+    return components._replace(log_weight=log_weight).select(remaining_rows[:MAX_COMPONENTS])
 
 
-def _similar_component(components: Components, row: int, candidates: list[int]) -> int | None:
-    """Return the first candidate whose motion is similar to the motion of a component; None if there is none.
+def _similar_component(components: Components, row: int, candidate_rows: list[int]) -> int | None:
+    """Return the first candidate whose motion is similar to the motion of a given component.
 
-    The motion is x, y, ln F and their rates. It is similar if each of these values differs by less than
-    `MERGE_DISTANCE` standard deviations of the component.
+    A motion consists of x, y, ln F and the rates of these three values. Two motions are similar if each value differs
+    by less than `MERGE_DISTANCE` standard deviations of the given component.
 
     Args:
         components: All components.
-        row: Row of the component.
-        candidates: Rows of the candidates.
+        row: Row of the given component.
+        candidate_rows: Rows of the candidates.
+
+    Returns:
+        Row of the candidate; None if no candidate has a similar motion.
     """
     motion = components.mean[:, MOTION]
     std = np.sqrt(components.covariance[row].diagonal()[MOTION])
-    for candidate in candidates:
-        difference = np.abs(motion[row] - motion[candidate])
+    for candidate_row in candidate_rows:
+        difference = np.abs(motion[row] - motion[candidate_row])
         if (difference < MERGE_DISTANCE * std).all():
-            return candidate
+            return candidate_row
     return None
 
 
 def combine_components(components: Components, probability: Array) -> ContactHypothesis:
-    """Combine components of the same contact into one Gaussian with the mean and the covariance of their mixture.
+    """Combine components that describe the same contact into one hypothesis.
+
+    The hypothesis has the mean and the covariance of the mixture of the components.
 
     Args:
-        components: The components.
+        components: The n components to combine.
         probability: Probability of each component, shape (n,).
 
     Returns:
-        The contact. Its probability is the sum of the probabilities of the components.
+        The hypothesis. Its probability is the sum of the probabilities of the components.
     """
     total_probability = probability.sum()
-    share = probability / total_probability
-    mean = share @ components.mean
+    weight = probability / total_probability  # the weights add up to 1
+    mean = weight @ components.mean
     deviation = components.mean - mean  # shape (n, n_state)
 
     # The covariance of a mixture is the mean of the covariances plus the covariance of the means.
-    covariance_within = np.tensordot(share, components.covariance, 1)
-    covariance_between = (share[:, None] * deviation).T @ deviation
+    covariance_within = np.tensordot(weight, components.covariance, 1)
+    covariance_between = (weight[:, None] * deviation).T @ deviation
     covariance = covariance_within + covariance_between
     return ContactHypothesis(mean, covariance, float(total_probability), components.misfit)

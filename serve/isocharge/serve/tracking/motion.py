@@ -1,4 +1,4 @@
-"""Process noise that the tracking filters assume for the motion of a contact."""
+"""Parameters of the process noise that the tracking filters assume for the motion of a contact."""
 
 from typing import NamedTuple
 
@@ -16,10 +16,10 @@ MAX_GAP_s = 1.0
 
 
 class MotionModel(NamedTuple):
-    """Process noise of a position, in mm, or of the logarithm of a force.
+    """Parameters of the process noise of one quantity: a position in mm, or the logarithm of a force.
 
     Attributes:
-        held_drift: Growth of the variance of a held contact, mm^2/s or 1/s.
+        held_drift: Increase of the variance per second while the contact is held, mm^2/s or 1/s.
         velocity_variance: Variance of the velocity at the beginning of a movement, mm^2/s^2 or 1/s^2.
         acceleration_density: Spectral density of the white acceleration of a contact whose squared speed is
             `velocity_variance`, mm^2/s^3 or 1/s^3. At other speeds the density is proportional to the squared speed,

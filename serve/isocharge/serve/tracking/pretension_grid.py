@@ -1,4 +1,4 @@
-"""Distributions of a pretension on a grid of evenly spaced values."""
+"""Probability distributions of a pretension on a grid of evenly spaced values."""
 
 import math
 
@@ -11,37 +11,42 @@ GRID_STEP_MPa = 0.02
 
 
 def evenly_spaced(low: float, high: float, step: float) -> Array:
-    """Return evenly spaced numbers from `low` to `high`.
+    """Return evenly spaced numbers from `low` to `high`, both included.
 
-    The distance between two numbers is as close to `step` as possible.
+    The range is divided into a whole number of intervals, whose length is as close to `step` as possible.
     """
     interval_count = max(round((high - low) / step), 1)
     return np.linspace(low, high, interval_count + 1)
 
 
 def normal_probabilities(deviation: Reals, std: float) -> Array:
-    """Return the probabilities of evenly spaced deviations from the mean. The distribution is normal.
+    """Return the probabilities of evenly spaced deviations from the mean of a normal distribution.
 
     The probabilities add up to 1.
+
+    Args:
+        deviation: Evenly spaced deviations from the mean, shape (n,).
+        std: Standard deviation of the normal distribution, in the unit of the deviations.
     """
     density = np.exp(-0.5 * (deviation / std) ** 2)
     return np.asarray(density / density.sum())
 
 
 def odds_of_no_change(change_MPa: Array, probability: Array, prior_std_MPa: float, additional_variance: float) -> float:
-    """Compute the odds that a pretension is unchanged, against a change with a normal prior distribution.
+    """Compute the odds of the hypothesis that a pretension has not changed, against the hypothesis that it has changed.
 
-    Both hypotheses are assumed to have the same prior probability. The odds are then the ratio of two probability
-    densities of the change at zero, after and before the measurements. Both densities belong to the hypothesis of a
-    change (the Savage-Dickey density ratio, Dickey 1971).
+    If the pretension has changed, the prior distribution of the change is a normal distribution with the mean zero.
+    Both hypotheses are assumed to have the same prior probability. The odds are then the posterior density of a zero
+    change divided by the prior density of a zero change (the Savage-Dickey density ratio, Dickey 1971). Both densities
+    belong to the hypothesis that the pretension has changed.
 
     Args:
         change_MPa: Changes on an evenly spaced grid, shape (n,), MPa.
-        probability: Probability of each change after the measurements if there was a change, shape (n,).
-        prior_std_MPa: Standard deviation of the change before the measurements, MPa. The mean is zero.
+        probability: Posterior probability of each change if the pretension has changed, shape (n,).
+        prior_std_MPa: Standard deviation of the prior distribution of the change, MPa.
         additional_variance: Variance of the errors that `probability` does not include, MPa^2.
     """
-    # The grid cannot represent a density that is narrower than its step.
+    # The kernel has at least the width of a grid step, because the grid cannot represent a narrower density.
     kernel_variance = additional_variance + GRID_STEP_MPa**2
     kernel = np.exp(-0.5 * change_MPa**2 / kernel_variance) / math.sqrt(2.0 * math.pi * kernel_variance)
     posterior_density = float(probability @ kernel)
@@ -49,25 +54,26 @@ def odds_of_no_change(change_MPa: Array, probability: Array, prior_std_MPa: floa
     return posterior_density / prior_density
 
 
-def smooth_moments(moments: Array, std: float) -> Array:
-    """Smooth moments over the pretensions by a normal distribution.
+def smooth_moments(moments: Array, std_MPa: float) -> Array:
+    """Smooth moments over the pretensions by convolution with a normal distribution.
 
     Args:
         moments: Moments at each pretension of the grid, shape (n_level, n_pretension, n_moment). Beyond the ends of the
             grid, the moments are assumed to be constant.
-        std: Standard deviation of the normal distribution, MPa.
+        std_MPa: Standard deviation of the normal distribution, MPa.
 
     Returns:
         The smoothed moments, of the same shape.
     """
     # The kernel is the normal distribution on the grid, cut off at four standard deviations.
     grid_size = moments.shape[1]
-    reach = min(round(4.0 * std / GRID_STEP_MPa), grid_size)  # number of grid steps to each side
-    kernel = normal_probabilities(GRID_STEP_MPa * np.arange(-reach, reach + 1.0), std)
-    padded = np.pad(moments, ((0, 0), (reach, reach), (0, 0)), mode="edge")
+    kernel_reach = min(round(4.0 * std_MPa / GRID_STEP_MPa), grid_size)  # number of grid steps on each side
+    deviation_MPa = GRID_STEP_MPa * np.arange(-kernel_reach, kernel_reach + 1.0)
+    kernel = normal_probabilities(deviation_MPa, std_MPa)
+    padded_moments = np.pad(moments, ((0, 0), (kernel_reach, kernel_reach), (0, 0)), mode="edge")
 
-    # Convolve along the pretensions: add the moments, shifted by each step of the kernel.
-    smoothed = np.zeros_like(moments)
+    # The convolution is the sum of the moments, shifted by each deviation and multiplied by its probability.
+    smoothed_moments = np.zeros_like(moments)
     for start, weight in enumerate(kernel):
-        smoothed += weight * padded[:, start : start + grid_size]
-    return smoothed
+        smoothed_moments += weight * padded_moments[:, start : start + grid_size]
+    return smoothed_moments

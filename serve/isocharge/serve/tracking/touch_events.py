@@ -1,4 +1,4 @@
-"""Events of a touch: press, hold, slide, tap and release."""
+"""Detection of the events of a touch: press, hold, slide, tap and release."""
 
 from isocharge.serve.record.record import TrackedContact
 
@@ -9,7 +9,7 @@ MAX_TAP_TIME_s = 0.25
 """Longest duration of a tap, s."""
 
 SLIDE_DISTANCE_mm = 0.3
-"""Distance from the latest position of rest above which a moving contact slides, mm."""
+"""Distance from the position at which the contact last rested, above which a moving contact slides, mm."""
 
 SLIDE_PROBABILITY = 0.95
 """Probability that the contact moves, above which it may slide."""
@@ -19,37 +19,38 @@ REST_PROBABILITY = 0.5
 
 
 class TouchEvents:
-    """Derives the events of a touch from the tracked contacts."""
+    """Detector of the events of a touch, which it derives from the tracked contact of each frame."""
 
     def __init__(self) -> None:
-        """Begin without a touch."""
-        self._press_s = 0.0
-        self._rest_position = 0j
-        self._rest_begin_s = 0.0
+        """Start without a touch."""
+        # `begin` sets these values when a touch begins.
+        self._press_s = 0.0  # time at which the touch began
+        self._rest_position = 0j  # position x + iy at which the contact last rested, mm
+        self._rest_begin_s = 0.0  # time at which the contact began to rest at this position
         self._latest_event = ""
 
     def begin(self, tracked: TrackedContact, t_s: float) -> str:
-        """Begin a touch, and return its first event.
+        """Begin a new touch, and return its first event, which is always `press`.
 
         Args:
-            tracked: The first tracked contact.
+            tracked: Tracked contact of the first frame of the touch.
             t_s: Time of the frame, s.
         """
         self._press_s = t_s
-        self._rest_position = complex(tracked.x_mm, tracked.y_mm)  # a position is x + iy, mm
+        self._rest_position = complex(tracked.x_mm, tracked.y_mm)
         self._rest_begin_s = t_s
         self._latest_event = "press"
         return "press"
 
     def step(self, tracked: TrackedContact, t_s: float) -> str | None:
-        """Return the event that begins with a frame; None if there is none.
+        """Return the event that begins with the next frame of a touch; None if no event begins.
 
         A slide begins when the contact moves and is away from the position at which it last rested. A hold begins when
         the contact has rested at one position for `HOLD_TIME_s`. The same event does not occur twice in succession. If
-        it is uncertain whether the contact moves or rests, nothing begins.
+        it is uncertain whether the contact moves or rests, no event begins.
 
         Args:
-            tracked: The tracked contact. Its attribute `moving` is the probability that it moves.
+            tracked: Tracked contact of the frame. Its attribute `moving` is the probability that the contact moves.
             t_s: Time of the frame, s.
         """
         position = complex(tracked.x_mm, tracked.y_mm)
@@ -68,7 +69,9 @@ class TouchEvents:
         return None
 
     def end(self, t_s: float) -> str:
-        """Return the event with which a touch ends.
+        """Return the event with which a touch ends: `tap` or `release`.
+
+        A touch ends with a tap if the touch was short, and no other event has followed the press.
 
         Args:
             t_s: Time of the first frame without a contact, s.

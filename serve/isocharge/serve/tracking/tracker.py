@@ -1,8 +1,8 @@
-"""Tracking of a contact from frame to frame: its position, force and velocity, and the events of the touch.
+"""Tracking of a contact over successive frames: its position, force and velocity, and the events of the touch.
 
-A `ContactFilter` smooths the contacts that a model predicts. If the map from contacts to charges has a fold, the model
-describes only the contacts on one side of the fold. For such films, a `ContactMixture` follows the contact by the
-charges instead.
+On most films, a `ContactFilter` smooths the contacts that a model predicts. If the map from contacts to charges has a
+fold, a model predicts only the contacts on one side of the fold. On such a film, a `ContactMixture` estimates the
+contact directly from the charges.
 """
 
 from isocharge.common.arrays import Array
@@ -23,32 +23,32 @@ class TrackRule(Rule, frozen=True, kw_only=True):
     """Settings of the tracking; the section `[track]` of a device file.
 
     Attributes:
-        lasting: Share of the standard deviations stated by the model that is the same in every frame of a held contact,
-            0 to 1. The default of 0.12 is the measured share of the approximation errors of a model. If the gains are
-            known to only a few percent, set this to about 1.
+        lasting: Standard deviation of the errors that are the same in every frame of a held contact, divided by the
+            standard deviation that the model states, 0 to 1. The default of 0.12 was measured for the approximation
+            errors of a model. If the gains are known to only a few percent, set this to about 1.
     """
 
     lasting: Share = 0.12
 
 
 class Tracker:
-    """Tracks one contact at a time.
+    """Tracker of one contact, which processes the frames one after another.
 
-    A tracker belongs to one thread. The same frames give the same results, bit for bit.
+    The methods must be called from one thread. The same sequence of frames always gives bitwise equal results.
 
     Attributes:
-        mixture: The mixture that follows the contact by its charges; None for a film whose map has no fold.
-        mixture_contact: The contact of the latest frame as estimated by the mixture. It replaces the contact of the
-            model. None without a mixture.
-        other: Another contact that also explains the charges; None if there is no such contact, or without a mixture.
+        mixture: Mixture that estimates the contact from the charges; None for a film whose map has no fold.
+        mixture_contact: Contact that the mixture estimated for the latest frame. It replaces the contact that the model
+            predicted. None if there is no mixture, or if the mixture has no estimate.
+        other: Another contact that also explains the charges; None if there is no such contact, or no mixture.
     """
 
     def __init__(self, rule: TrackRule | None = None, mixture: ContactMixture | None = None) -> None:
-        """Begin without a contact.
+        """Start without a contact.
 
         Args:
-            rule: Settings; by default the default values of all settings.
-            mixture: The mixture for a film whose map has a fold; None for other films.
+            rule: Settings; None for the default value of every setting.
+            mixture: Mixture for a film whose map has a fold; None for other films.
         """
         rule = rule or TrackRule()
         self.mixture = mixture
@@ -56,7 +56,7 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Discard the contact, as after an outage or a new tare."""
+        """Discard the tracked contact, for example after an outage or a new tare."""
         self.mixture_contact: Contact | None = None
         self.other: OtherContact | None = None
         self._tracked: TrackedContact | None = None
@@ -68,21 +68,21 @@ class Tracker:
     def update(
         self, contact: Contact | None, t_s: float, flags: tuple[str, ...] = (), charge_pC: Array | None = None
     ) -> tuple[TrackedContact | None, str | None]:
-        """Process the next frame.
+        """Process the next frame, and return the tracked contact and the event that begins with this frame.
 
-        On most films, a filter smooths the contacts that the model predicts. On a film on which several contacts may
-        have the same charges, a mixture tracks these contacts by the charges themselves.
+        Without a mixture, a filter smooths the contact that the model predicted. With a mixture, the tracked contact is
+        the most probable of the contacts that the mixture estimates from the charges.
 
         Args:
-            contact: Contact predicted by the model; None if nothing touches, or the frame is invalid.
+            contact: Contact predicted by the model; None if nothing touches the film, or if the frame is invalid.
             t_s: Time of the frame on any clock, s.
             flags: Flags of the frame.
             charge_pC: Touch charges of the frame, shape (n_electrode,), pC; only needed with a mixture.
 
         Returns:
-            The tracked contact, and the event that begins with this frame. The contact is None if nothing touches, or
-            if no contact has explained the charges since the touch began. The event is `press`, `hold`, `slide`, `tap`
-            or `release`; None if no event begins.
+            The tracked contact, and the event that begins with this frame. The contact is None if nothing touches the
+            film, or if no contact has explained the charges since the touch began. The event is `press`, `hold`,
+            `slide`, `tap` or `release`; None if no event begins.
         """
         self.mixture_contact = None
         if contact is None:
@@ -94,9 +94,9 @@ class Tracker:
             tracked = self._filter.step(contact, t_s, flags)
         else:
             hypotheses: list[ContactHypothesis] = []  # possible contacts, the most probable first
-            if SATURATED not in flags:
+            if SATURATED not in flags:  # the charges of a saturated frame are wrong
                 hypotheses = self.mixture.update(charge_pC, t_s)
-            if not hypotheses:  # the frame contains no information, so that the previous contact stays
+            if not hypotheses:  # the frame contains no information, so the previous contact is returned again
                 return self._tracked, None
             self.mixture_contact = hypotheses[0].contact
             self.other = _other_contact(hypotheses)
@@ -109,23 +109,30 @@ class Tracker:
         return tracked, self._events.step(tracked, t_s)
 
     def _end_touch(self, t_s: float) -> str | None:
-        """Discard the contact, and return the event with which its touch ends; None if there was no touch."""
+        """Discard the tracked contact, and return the event with which its touch ends.
+
+        Args:
+            t_s: Time of the first frame without a contact, s.
+
+        Returns:
+            The event `tap` or `release`; None if there was no touch.
+        """
         if self._tracked is None:
             # The mixture may have received charges that no contact explains. Discard them before the next touch.
             if self.mixture is not None:
                 self.mixture.reset()
             return None
         event = self._events.end(t_s)
-        self.reset()  # afterwards, because it also discards the events
+        self.reset()  # only now, because `reset` also discards the events of the touch
         return event
 
 
 def _tracked_contact(hypothesis: ContactHypothesis, contact: Contact) -> TrackedContact:
-    """Return a hypothesis as a tracked contact.
+    """Convert a hypothesis of the mixture to a tracked contact.
 
     Args:
-        hypothesis: A contact that explains the charges.
-        contact: The contact of the hypothesis.
+        hypothesis: Hypothesis that explains the charges, which contains the velocity of the contact.
+        contact: The attribute `contact` of the hypothesis, which is passed because it is expensive to compute again.
     """
     vx_mm_s, vy_mm_s = hypothesis.velocity_mm_per_s
     return TrackedContact(
@@ -142,13 +149,14 @@ def _tracked_contact(hypothesis: ContactHypothesis, contact: Contact) -> Tracked
 
 
 def _other_contact(hypotheses: list[ContactHypothesis]) -> OtherContact | None:
-    """Return the second most probable contact; None if the most probable contact is certain.
+    """Return the second most probable contact; None if the most probable contact is nearly certain.
 
     Args:
-        hypotheses: The contacts that explain the charges, in descending order of their probability.
+        hypotheses: The contacts that explain the charges, at least one, in descending order of their probability.
     """
-    if len(hypotheses) == 1 or hypotheses[0].probability > CERTAIN_PROBABILITY:
+    most_probable = hypotheses[0]
+    if len(hypotheses) == 1 or most_probable.probability > CERTAIN_PROBABILITY:
         return None
-    _, second, *_ = hypotheses
-    contact = second.contact
-    return OtherContact(contact.x_mm, contact.y_mm, contact.force_N, second.probability)
+    second_most_probable = hypotheses[1]
+    contact = second_most_probable.contact
+    return OtherContact(contact.x_mm, contact.y_mm, contact.force_N, second_most_probable.probability)

@@ -2,12 +2,12 @@
 
 The filter is an interacting multiple model (Blom and Bar-Shalom 1988). Each mode has a Kalman filter. Before each
 frame, the estimates of the two modes are mixed, because the contact may have changed from one mode to the other. The
-innovations then determine the probability of each mode. The held mode has no velocity. In the moving mode, the velocity
-is unknown when a movement begins, and then changes by a white acceleration.
+innovation of each mode then determines the new probability of the mode. In the held mode, the velocity is zero. In the
+moving mode, the velocity is unknown when a movement begins, and is then changed by a white acceleration.
 
-A position is a complex number x + iy, and the logarithm of a force is a real number. All covariances are assumed to be
-multiples of the covariance of the measurement. A single variance then replaces each matrix, and a step takes
-microseconds.
+A position is represented by a complex number x + iy, and the logarithm of a force by a real number. All covariance
+matrices are assumed to be multiples of the covariance matrix of the measurement. A single number then represents each
+matrix, and a step takes only microseconds.
 """
 
 import math
@@ -37,7 +37,7 @@ MIN_PROBABILITY = 1e-6
 
 
 class Estimate(NamedTuple):
-    """Estimate of a position or of the logarithm of a force.
+    """Estimate of a position, or of the logarithm of a force, with its variance.
 
     Attributes:
         value: Position x + iy, mm, or logarithm of the force.
@@ -50,22 +50,22 @@ class Estimate(NamedTuple):
 
 @dataclass(slots=True)
 class TwoModeFilter:
-    """A filter with two modes, and its state.
+    """Filter with a held mode and a moving mode, for a position or for the logarithm of a force.
 
-    The unit of a value is mm for a position, and the logarithm of a force is dimensionless. Times are in s.
+    The unit of a value is mm for a position. The logarithm of a force is dimensionless. Times are in s.
 
     Attributes:
-        motion: Process noise.
+        motion: Parameters of the process noise.
         moving_probability: Probability of the moving mode.
-        held_value: Value of the held mode.
+        held_value: Value that the held mode estimates.
         held_variance: Variance of `held_value`.
-        moving_value: Value of the moving mode.
-        velocity: Velocity of the moving mode.
+        moving_value: Value that the moving mode estimates.
+        velocity: Rate of change of the value in the moving mode.
         moving_variance: Variance of `moving_value`.
         moving_covariance: Covariance of `moving_value` and `velocity`.
         velocity_variance: Variance of `velocity`.
-        noise: Size of the measurement noise.
-        noise_age_s: Time since the size of the noise was last updated, s.
+        noise: Estimate of the size of the measurement noise.
+        noise_age_s: Time since `noise` was last updated, s.
     """
 
     motion: MotionModel
@@ -85,9 +85,9 @@ class TwoModeFilter:
         """Return the filter after the first frame.
 
         Args:
-            measured: The measured value.
-            variance: Variance of its noise.
-            motion: Process noise.
+            measured: Measured value of the first frame.
+            variance: Variance of the noise of this value.
+            motion: Parameters of the process noise.
         """
         return cls(
             motion,
@@ -103,27 +103,28 @@ class TwoModeFilter:
         )
 
     def step(self, measured: complex, dt_s: float, shape: CovarianceShape, stated_variance: float) -> Estimate | None:
-        """Process the next frame.
+        """Process the next frame: predict both modes, and update both modes with the measured value.
 
-        The function does not call `min`, `max` and `CovarianceShape.mean_square`, because function calls would take a
-        third of its time.
+        The method computes minima, maxima and squared distances without calls of `min`, `max` and
+        `CovarianceShape.mean_square`, because the calls would take a third of its time.
 
         Args:
-            measured: The measured value.
+            measured: The measured value of the frame.
             dt_s: Time since the previous frame, s, positive.
             shape: Shape of the covariance of the measured value.
             stated_variance: Variance of the noise that is independent from frame to frame, as stated by the model. A
                 larger variance gives the frame a smaller weight.
 
         Returns:
-            The estimate; None if the frame does not belong to this contact. The state is then unchanged.
+            The estimate of the value; None if the frame does not belong to the same contact as the previous frames. In
+            this case, the state of the filter is not changed.
         """
         inverse_xx, inverse_yy, inverse_xy, dimensions = shape
         held_drift, initial_velocity_variance, acceleration_density = self.motion
         noise_variance = stated_variance * self.noise.relative_variance
 
-        # Probability of each mode at this frame. `started_share` is the probability that a moving contact was held at
-        # the previous frame, and `stopped_share` is the probability that a held contact was moving.
+        # Probability of each mode at this frame. `started_share` is the probability that a contact that moves now was
+        # held at the previous frame. `stopped_share` is the probability that a contact that is held now was moving.
         start_probability = dt_s / MEAN_HELD_TIME_s
         if start_probability > MAX_CHANGE_PROBABILITY:
             start_probability = MAX_CHANGE_PROBABILITY

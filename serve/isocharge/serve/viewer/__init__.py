@@ -1,6 +1,7 @@
-"""The live page, which shows the contacts of a live stream or a recording in a browser.
+"""Live page: a web page that shows the contacts of a live stream or of a recording in a browser.
 
-The process that reads a port never waits for the page. The reading process writes samples of fixed size into a pipe
-(`link`), and a separate process serves browsers (`process`, `hub`, `server`). The folder `page` contains the files of
-the page.
+Two processes work together. The reader is the process that reads a port. The reader writes samples of a fixed size into
+a pipe (module `link`). The reader of a live stream never waits for the page. A separate process receives the samples
+and sends them to browsers (modules `process`, `hub` and `server`). The folder `page` contains the HTML file, the
+scripts and the style sheet of the page.
 """

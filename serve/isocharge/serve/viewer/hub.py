@@ -1,8 +1,9 @@
-"""Distribution of the samples of a stream to the viewers of the live page.
+"""Distribution of the samples of a stream to the viewers, which are the browsers that show the live page.
 
-The tape stores the samples by number: the latest samples of a live stream, or all samples of a recording. A viewer
-confirms each message that it has drawn. The next message is sent only after this confirmation, and contains all samples
-that have arrived in the meantime. If there are too many samples, they are coalesced. No messages are queued for a slow
+The class `Tape` stores samples under consecutive numbers. A tape contains the latest samples of a live stream, or all
+samples of a recording. A viewer confirms each message that it has drawn. While too many messages are unconfirmed, the
+viewer receives no further message. The next message then contains all samples that have arrived in the meantime. If
+there are too many samples for one message, neighbouring samples are coalesced. No messages are queued for a slow
 viewer.
 """
 
@@ -31,28 +32,34 @@ from isocharge.serve.viewer.messages import (
 )
 
 LIVE_SAMPLES = 1 << 14
-"""Number of stored samples of a live stream, which is 16 s at 1 kHz. Slower browsers miss samples."""
+"""Number of stored samples of a live stream.
+
+They cover 16 s at 1 kHz. A browser that falls further behind misses samples.
+"""
 
 MAX_PIECES = 600
 """Largest number of pieces in the overview of a recording."""
 
 FIRST_PIECE_S = 0.01
-"""Duration of a piece in the overview of a short recording, s. It is doubled until `MAX_PIECES` pieces suffice."""
+"""Duration of a piece in the overview of a short recording, s.
+
+The duration is doubled until at most `MAX_PIECES` pieces are needed.
+"""
 
 
 class Tape:
-    """Ring buffer of the latest samples of a stream.
+    """Ring buffer that stores the latest samples of a stream.
 
     Args:
         dtype: NumPy type of a sample.
         capacity: Number of samples that are stored.
 
     Attributes:
-        total: Number of all samples that were appended.
+        total: Number of samples that were appended since the tape was created.
     """
 
     def __init__(self, dtype: "np.dtype[Any]", capacity: int = LIVE_SAMPLES) -> None:
-        """Begin without samples. The class describes the arguments."""
+        """Create a tape without samples. The docstring of the class describes the arguments."""
         self.total = 0
         self._ring: Samples = np.zeros(capacity, dtype)
 
@@ -63,43 +70,53 @@ class Tape:
 
     def append(self, samples: Samples) -> None:
         """Append samples. If the buffer is full, the new samples replace the oldest samples."""
-        latest = samples[-len(self._ring) :]
-        first = self.total + len(samples) - len(latest)
-        self._ring[np.arange(first, first + len(latest)) % len(self._ring)] = latest
-        self.total += len(samples)
+        capacity = len(self._ring)
+        latest = samples[-capacity:]  # earlier samples would be overwritten at once
+        total = self.total + len(samples)
+        numbers = np.arange(total - len(latest), total)
+        self._ring[numbers % capacity] = latest
+        self.total = total
 
     def samples(self, start: int, stop: int) -> Samples:
-        """Return the stored samples with numbers from `start` to `stop` - 1."""
-        return self._ring[np.arange(max(start, self.oldest), stop) % len(self._ring)]
+        """Return the samples with the numbers from `start` to `stop` - 1.
+
+        Samples that were overwritten are left out.
+        """
+        numbers = np.arange(max(start, self.oldest), stop)
+        return self._ring[numbers % len(self._ring)]
 
     def timestamp(self, number: int) -> float:
-        """Return the Unix time of a sample, s."""
+        """Return the Unix time of the stored sample with the given number, s."""
         return float(self._ring[number % len(self._ring)]["timestamp"])
 
-    def index(self, timestamp: float) -> int:
-        """Return the number of the first sample after a Unix time, s."""
-        return bisect_right(range(self.total), timestamp, lo=self.oldest, key=self.timestamp)
+    def first_number_after(self, time_s: float) -> int:
+        """Return the number of the first stored sample that is later than a Unix time, s.
+
+        If there is no such sample, the result is the number of the next sample that will be appended.
+        """
+        numbers = range(self.total)
+        return bisect_right(numbers, time_s, lo=self.oldest, key=self.timestamp)
 
     def span(self) -> tuple[float, float]:
-        """Return the Unix times of the oldest and the latest sample, s; zeros if there are no samples."""
+        """Return the Unix times of the oldest and the latest stored sample, s, or two zeros if there are no samples."""
         if not self.total:
             return 0.0, 0.0
         return self.timestamp(self.oldest), self.timestamp(self.total - 1)
 
     def close(self) -> None:
-        """Close the file of the samples, if there is one."""
+        """Close the file that contains the samples, if there is such a file."""
 
 
 class RecordedTape(Tape):
-    """All samples of a recording, stored in a temporary file.
+    """Tape that stores all samples of a recording in a temporary file.
 
-    A time that is smaller than the previous time is replaced by the previous time.
+    A time that is earlier than the time of the previous sample is replaced by the time of the previous sample.
     """
 
     def __init__(self, dtype: "np.dtype[Any]") -> None:
-        """Create the temporary file, and the overview of the forces.
+        """Create the temporary file and an empty overview of the forces.
 
-        The overview divides the recording into pieces of equal time, and contains the largest force of each piece.
+        The overview divides the recording into pieces of equal duration, and contains the largest force in each piece.
 
         Args:
             dtype: NumPy type of a sample.
@@ -108,13 +125,14 @@ class RecordedTape(Tape):
         self._file = tempfile.TemporaryFile()  # noqa: SIM115
         self._piece_s = FIRST_PIECE_S  # duration of a piece
         self._max_force_N: list[float] = []
-        self._map(LIVE_SAMPLES)
+        self._map_file(LIVE_SAMPLES)
 
     def append(self, samples: Samples) -> None:
         """Append samples, and update the overview.
 
-        Missing or decreasing times are replaced by the previous time, so that the times never decrease. The memory is
-        doubled repeatedly if necessary.
+        A missing time, or a time before the previous sample, is replaced by the time of the previous sample. The stored
+        times therefore never decrease. If the samples do not fit into the mapped file, the capacity of the file is
+        doubled until they fit.
 
         Args:
             samples: The samples, shape (n,).
@@ -122,29 +140,32 @@ class RecordedTape(Tape):
         if not len(samples):
             return
         ordered = samples.copy()
-        _, latest_s = self.span()
-        known_s = np.nan_to_num(samples["timestamp"], nan=0.0)
-        largest_so_far_s = np.maximum.accumulate(known_s)
-        ordered["timestamp"] = np.maximum(largest_so_far_s, latest_s)
-        while self.total + len(ordered) > len(self._ring):  # a recording is stored completely
-            self._map(2 * len(self._ring))
+        _, latest_stored_s = self.span()
+        times_s = np.nan_to_num(samples["timestamp"], nan=0.0)  # a missing time becomes 0, which is never the largest
+        largest_so_far_s = np.maximum.accumulate(times_s)
+        ordered["timestamp"] = np.maximum(largest_so_far_s, latest_stored_s)
+        while self.total + len(ordered) > len(self._ring):
+            self._map_file(2 * len(self._ring))
         super().append(ordered)
         self._update_overview(ordered)
 
     def close(self) -> None:
-        """Close the file of the samples."""
+        """Close the temporary file, which the operating system then removes."""
         self._file.close()
 
-    def _map(self, capacity: int) -> None:
-        """Map the file to memory. The mapped memory has room for a given number of samples."""
+    def _map_file(self, capacity: int) -> None:
+        """Map the file to memory, with a size of `capacity` samples. The stored samples are unchanged."""
         self._ring = np.memmap(self._file, self._ring.dtype, "r+", shape=(capacity,))
 
     def overview(self) -> list[float]:
-        """Return the largest force in each piece of the recording, N. All pieces have the same length."""
+        """Return the largest force in each piece of the recording, N. All pieces have the same duration."""
         return [round(force_N, 3) for force_N in self._max_force_N]
 
     def _update_overview(self, samples: Samples) -> None:
-        """Update the largest force of each piece of time. If there are too many pieces, join them in pairs.
+        """Update the largest force in each piece of the recording with the forces of new samples.
+
+        If the recording would have more than `MAX_PIECES` pieces, neighbouring pieces are joined in pairs, and the
+        duration of a piece is doubled.
 
         Args:
             samples: New samples, shape (n,), whose times do not decrease.
@@ -154,14 +175,15 @@ class RecordedTape(Tape):
             pairs = [self._max_force_N[first : first + 2] for first in range(0, len(self._max_force_N), 2)]
             self._max_force_N = [max(pair) for pair in pairs]
             self._piece_s *= 2.0
-        piece_of_sample = (elapsed_s / self._piece_s).astype(int)
+        piece_of_sample = (elapsed_s / self._piece_s).astype(int)  # index of the piece that contains the sample
         piece_count = int(piece_of_sample[-1]) + 1
         new_piece_count = piece_count - len(self._max_force_N)
         self._max_force_N += [0.0] * new_piece_count
 
-        # Neighbouring samples of one piece form a run, whose largest force NumPy computes in one call for all runs.
+        # The times do not decrease. The samples in one piece are therefore neighbours, which are called a run here.
+        # `reduceat` computes the largest force of every run in one call.
         force_N = np.nan_to_num(samples["force_N"], nan=0.0)
-        begins_run = np.diff(piece_of_sample, prepend=-1) != 0  # the first sample always begins a run
+        begins_run = np.diff(piece_of_sample, prepend=-1) != 0  # true for the first sample, because no piece is -1
         run_starts = np.flatnonzero(begins_run)
         run_pieces = piece_of_sample[run_starts].tolist()
         run_max_N = np.maximum.reduceat(force_N, run_starts).tolist()
@@ -171,7 +193,7 @@ class RecordedTape(Tape):
 
 @dataclass
 class Playhead:
-    """Position of a viewer in a recording.
+    """Position at which a viewer plays a recording.
 
     Attributes:
         at_s: Time since the start of the recording, s.
@@ -186,12 +208,13 @@ class Playhead:
     has_jumped: bool = True
 
     def advance(self, step_s: float, end_s: float, *, is_complete: bool) -> bool:
-        """Advance the position in a recording that is played. At its end, playing stops.
+        """Advance the position if the recording is being played, and stop playing at the end of the recording.
 
-        The end of the part that has been read so far only limits the position, because the next part may follow.
+        While the recording is still being read, the position stays within the part that has already been read. Playing
+        then continues.
 
         Args:
-            step_s: Time since the latest call, s.
+            step_s: Time that has passed since the previous call, s.
             end_s: Length of the part of the recording that has been read, s.
             is_complete: Whether the whole recording has been read.
 
@@ -205,10 +228,12 @@ class Playhead:
         return not self.is_playing
 
     def apply(self, request: ReplayRequest, end_s: float) -> None:
-        """Carry out a request of the page. Playing at the end of the recording begins at its start.
+        """Carry out a request of the page.
+
+        If the position is at the end of the recording, a request to play starts again at the beginning.
 
         Args:
-            request: A new speed, a new position (s from the start of the recording), or a request to pause or to play.
+            request: Request to change the speed, to go to another position, to pause, or to play.
             end_s: Length of the part of the recording that has been read, s.
         """
         match request:
@@ -224,12 +249,12 @@ class Playhead:
                     self._jump(0.0)
 
     def _jump(self, at_s: float) -> None:
-        """Set the position to a time since the start of the recording, s."""
+        """Set the position to `at_s`, which is a time since the start of the recording, s."""
         self.at_s = at_s
         self.has_jumped = True
 
     def to_json(self) -> dict[str, float | bool]:
-        """Return the position for the page."""
+        """Return the position, the speed and the state of playing as a JSON object for the page."""
         return {"at_s": round(self.at_s, 3), "speed": self.speed, "is_playing": self.is_playing}
 
 
@@ -262,24 +287,26 @@ PROGRESS_INTERVAL_S = 0.5
 
 
 class Hub:
-    """The stream and its viewers. All methods must be called in the same event loop.
+    """Receives the samples of a stream, and manages the viewers of the stream.
+
+    All methods must be called in the same event loop.
 
     Attributes:
         is_recording: Whether the stream is a recording.
         request_type: Type of the requests that the page may send.
-        tape: The samples.
+        tape: The stored samples of the stream.
         description: Description of the film for the page.
         state: Values for the page that change rarely, such as counters and markers.
-        version: Number of changes of `state`.
+        version: Number of times that `state` has changed.
         viewers: The connected viewers.
         has_ended: Whether the process that reads the stream has ended.
     """
 
     def __init__(self, link: PageEnd, description: dict[str, Any], *, is_recording: bool) -> None:
-        """Begin without samples and without viewers.
+        """Create a hub without samples and without viewers.
 
-        A recording is stored completely, and its viewers may select a position. Of a live stream, only the latest
-        samples are stored.
+        All samples of a recording are stored, and each viewer may select a position in the recording. If the stream is
+        live, only the latest samples are stored.
 
         Args:
             link: Link to the process that reads the stream.
@@ -299,37 +326,45 @@ class Hub:
         self.tape: Tape = RecordedTape(self._dtype) if is_recording else Tape(self._dtype)
 
     def close(self) -> None:
-        """Close the link and the file of a recording."""
+        """Close the link to the reader. If the stream is a recording, also close the file with its samples."""
         self._link.close_here()
         self.tape.close()
 
     def handle(self, request: LiveRequest | ReplayRequest, viewer: "Viewer") -> bool:
-        """Carry out a request of a page, or pass it to the reader. Return whether one of these has succeeded."""
+        """Carry out the request of a viewer, or pass the request to the reader of the stream.
+
+        Args:
+            request: The request. A request of the type `ReplayRequest` is carried out here.
+            viewer: The viewer that has sent the request.
+
+        Returns:
+            True if the request was carried out or passed to the reader, and False if the reader cannot receive it.
+        """
         if isinstance(request, ReplayRequest):
             viewer.apply(request)
             return True
         return self._link.send_request(request)
 
     async def run(self) -> None:
-        """Receive samples and messages, and wake the viewers. The method ends when the reader has ended."""
-        progress_update_s = 0.0  # Unix time of the latest update
+        """Receive samples and messages from the reader, and wake the viewers, until the reader has ended."""
+        latest_update_s = 0.0  # Unix time of the latest update of the progress
         while self._link.is_open:  # the reader has not ended
             self._receive()
-            if time.time() - progress_update_s > PROGRESS_INTERVAL_S:
-                progress_update_s = time.time()
+            if time.time() - latest_update_s > PROGRESS_INTERVAL_S:
+                latest_update_s = time.time()
                 self._update_progress()
             self._wake_viewers()
             await asyncio.sleep(POLL_INTERVAL_S if self.viewers else IDLE_POLL_INTERVAL_S)
         self.has_ended = True
-        self._wake_viewers()  # so that they see `has_ended`
+        self._wake_viewers()  # the tasks that send to the viewers then notice `has_ended`
 
     def _wake_viewers(self) -> None:
-        """Wake all viewers, which then check whether they have new samples."""
+        """Wake the tasks of all viewers. Each task then checks whether there are new samples to send."""
         for viewer in self.viewers:
             viewer.wake.set()
 
     def _receive(self) -> None:
-        """Receive the samples and messages that the reader has sent."""
+        """Receive the samples and messages that the reader has already sent, without waiting."""
         data = self._link.receive_samples(self._dtype.itemsize)
         if data:
             self.tape.append(np.frombuffer(data, self._dtype))
@@ -339,14 +374,14 @@ class Hub:
             self._update_state({"has_ended": True})
 
     def _update_progress(self) -> None:
-        """Update the state with the part of a recording that has been read."""
+        """If the stream is a recording, update the state with the part of the recording that was read so far."""
         if isinstance(self.tape, RecordedTape) and self.state.get("samples") != self.tape.total:
             self._update_state({"samples": self.tape.total, "span": self.tape.span(), "overview": self.tape.overview()})
 
     def _update_state(self, message: dict[str, Any]) -> None:
-        """Update the state with the values in a message of the reader.
+        """Update the state with the values of a message from the reader.
 
-        A marker is appended to the list of the latest markers. All other values replace those with the same names.
+        A marker is appended to the list of the latest markers. Every other value replaces the value with the same name.
         """
         values = dict(message)
         marker = values.pop("marker", None)
@@ -358,48 +393,49 @@ class Hub:
 
 
 class Viewer:
-    """State of one browser, which contains the part of the stream that the browser has received.
+    """One browser that shows the page. The object stores which part of the stream the browser has received.
 
     Args:
-        hub: The stream.
+        hub: Hub of the stream that the browser shows.
 
     Attributes:
         wake: Event that is set when there may be something to send.
     """
 
     def __init__(self, hub: Hub) -> None:
-        """Begin with the latest samples of a live stream, or at the start of a recording."""
+        """Begin with the samples of the last `HISTORY_S` seconds of a live stream, or at the start of a recording."""
         now_s = time.time()
         self.wake = asyncio.Event()
         self._hub = hub
         self._playhead = Playhead() if hub.is_recording else None  # the position that is shown
 
         # Samples and values that the page has received
-        self._next_sample = hub.tape.index(now_s - HISTORY_S)  # number of the first sample that was not sent
-        self._begins_anew = True  # whether the next message replaces everything that the page shows
+        # Number of the first sample that was not sent. In a recording, `_begin_anew_after_jump` replaces this number.
+        self._next_sample = hub.tape.first_number_after(now_s - HISTORY_S)
+        self._begins_anew = True  # whether the page clears its plots when it receives the next message
         self._missed_samples = 0  # number of samples that were overwritten before they could be sent
         self._state_version = -1  # version of the state that was sent last
-        self._must_send_playhead = True
+        self._must_send_playhead = True  # whether the position has changed since it was sent
 
         # Messages with samples, which the page confirms
         self._sent_messages = 0
         self._confirmed_messages = 0
-        self._latest_message_s = now_s
-        self._latest_advance_s = now_s
+        self._latest_message_s = now_s  # Unix time at which the number of samples in a message was last limited
+        self._latest_advance_s = now_s  # Unix time at which the position was last advanced
 
     def confirm(self, number: int) -> None:
-        """Store that the page has drawn the message with this number."""
+        """Store that the page has drawn all messages up to the given number."""
         self._confirmed_messages = max(self._confirmed_messages, min(number, self._sent_messages))
         self.wake.set()
 
     def apply(self, request: ReplayRequest) -> None:
-        """Carry out a request that changes the position in the recording."""
+        """Carry out a request to change the position or the speed, to play, or to pause the recording."""
         if self._playhead is not None:
             self._playhead.apply(request, self._length_s())
             self._must_send_playhead = True
 
     def messages(self, now_s: float) -> list[bytes | str]:
-        """Return the messages to send now. No messages are returned while too many messages are unconfirmed.
+        """Return the messages to send now, or an empty list while too many messages are unconfirmed.
 
         Args:
             now_s: Unix time, s.
@@ -409,10 +445,11 @@ class Viewer:
         if self._sent_messages - self._confirmed_messages >= MAX_UNCONFIRMED_MESSAGES:
             return []
 
-        # The number of samples in a message is limited by the time since the previous message.
+        # The number of samples in a message is limited in proportion to the time since the previous message.
         elapsed_s = now_s - self._latest_message_s
         self._latest_message_s = now_s
-        max_samples = int(min(max(MAX_SAMPLE_RATE_HZ * elapsed_s, MIN_MESSAGE_SAMPLES), MAX_MESSAGE_SAMPLES))
+        proportional_limit = MAX_SAMPLE_RATE_HZ * elapsed_s
+        max_samples = int(min(max(proportional_limit, MIN_MESSAGE_SAMPLES), MAX_MESSAGE_SAMPLES))
 
         messages: list[bytes | str] = []
         if self._state_version != self._hub.version:
@@ -427,29 +464,32 @@ class Viewer:
         return messages
 
     def _next_samples_message(self, max_samples: int, now_s: float) -> bytes | None:
-        """Return a message with the next samples; None if there are no new samples.
+        """Return a message with the next samples, or None if there is nothing to send.
 
         Args:
-            max_samples: Largest number of samples in the message. More samples are coalesced.
+            max_samples: Largest number of samples in the message. If there are more new samples, they are coalesced.
             now_s: Unix time, s.
         """
         tape = self._hub.tape
         self._begin_anew_after_jump()
         stop = self._first_hidden_sample()
-        start = max(self._next_sample, tape.oldest)  # older samples are no longer on the tape
-        begins_anew = self._begins_anew  # the page then discards what it shows, even if there are no samples
+        start = max(self._next_sample, tape.oldest)  # samples before `oldest` were overwritten
+        begins_anew = self._begins_anew  # such a message is sent even without samples, so that the page is cleared
         self._begins_anew = False
         if stop <= start and not begins_anew:
             return None
         self._missed_samples += start - self._next_sample
         self._next_sample = stop
         self._sent_messages += 1
-        limit = MAX_MESSAGE_SAMPLES if begins_anew else max_samples
+        limit = MAX_MESSAGE_SAMPLES if begins_anew else max_samples  # such a message covers a long time
         samples = coalesce(tape.samples(start, stop), limit)
         return samples_message(self._sent_messages, now_s, samples, self._missed_samples, begin_anew=begins_anew)
 
     def _begin_anew_after_jump(self) -> None:
-        """If the viewer has selected a position, let the next message begin with the samples before this position."""
+        """If the viewer has selected another position, prepare a message that replaces everything that the page shows.
+
+        The message begins with the samples of the last `HISTORY_S` seconds before the new position.
+        """
         playhead = self._playhead
         tape = self._hub.tape
         if playhead is None or not playhead.has_jumped or not tape.total:
@@ -457,25 +497,25 @@ class Viewer:
         playhead.has_jumped = False
         self._begins_anew = True
         start_s, _ = tape.span()  # time of the first sample of the recording
-        self._next_sample = tape.index(start_s + playhead.at_s - HISTORY_S)
+        self._next_sample = tape.first_number_after(start_s + playhead.at_s - HISTORY_S)
 
     def _first_hidden_sample(self) -> int:
-        """Return the number of the first sample that the viewer must not receive yet.
+        """Return the number of the first sample that must not be sent to the viewer yet.
 
-        In a recording, this is the first sample after the position. In a live stream, this is the next sample that will
-        arrive.
+        In a recording, the result is the number of the first sample after the position of the viewer. In a live stream,
+        the result is the number of the next sample that will arrive.
         """
         tape = self._hub.tape
         if self._playhead is None or not tape.total:
             return tape.total
         start_s, _ = tape.span()
-        return tape.index(start_s + self._playhead.at_s)
+        return tape.first_number_after(start_s + self._playhead.at_s)
 
     def _advance(self, playhead: Playhead, now_s: float) -> None:
-        """Advance the position in the recording by the time since the latest call.
+        """Advance the position in the recording by the time that has passed since the previous call.
 
         Args:
-            playhead: The position.
+            playhead: The position of the viewer, which is changed.
             now_s: Unix time, s.
         """
         step_s = max(now_s - self._latest_advance_s, 0.0)
@@ -485,6 +525,6 @@ class Viewer:
             self._must_send_playhead = True
 
     def _length_s(self) -> float:
-        """Return the length of the part of the recording that has been read, s."""
+        """Return the duration of the part of the recording that has been read so far, s."""
         start_s, end_s = self._hub.tape.span()
         return end_s - start_s

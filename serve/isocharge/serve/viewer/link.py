@@ -1,8 +1,8 @@
-"""Link between the process that reads a port (the reader) and the process that serves the live page.
+"""Link between two processes: the reader, which reads a port, and the process that serves the live page.
 
-Samples are sent through a pipe. The operating system never splits a write of this size. Messages in both directions are
-JSON. Each message is one datagram of a socket pair. The reader never waits. If the pipe is full, a sample is discarded
-and counted.
+Samples are sent through a pipe. A sample is so small that the operating system never writes only a part of it. Messages
+in both directions are JSON objects. Each message is sent as one datagram through a socket pair. The reader of a live
+stream never waits: if the pipe is full, it discards the sample and counts it.
 """
 
 import fcntl
@@ -34,9 +34,9 @@ class LinkEnd:
     """One end of the link.
 
     Attributes:
-        samples: End of the pipe.
-        messages: End of the socket pair.
-        is_open: Whether the other process was running at the latest attempt to send or receive samples.
+        samples: This process's end of the pipe, which carries the samples.
+        messages: This process's end of the socket pair, which carries the messages.
+        is_open: False if the latest attempt to send or receive samples found that the other process has ended.
     """
 
     samples: Connection
@@ -44,12 +44,20 @@ class LinkEnd:
     is_open: bool = True
 
     def close_here(self) -> None:
-        """Close the copy of this end in this process. Another process may have its own copy."""
+        """Close this process's copy of this end. The copy of another process stays open."""
         self.messages.close()
         self.samples.close()
 
     def _send(self, message: bytes, flags: int) -> bool:
-        """Send a message, and return whether it was sent."""
+        """Send a message through the socket pair.
+
+        Args:
+            message: A JSON object, encoded as UTF-8.
+            flags: Flags of `socket.send`, such as `MSG_DONTWAIT`.
+
+        Returns:
+            Whether the message was sent.
+        """
         try:
             self.messages.send(message, flags)
         except OSError:
@@ -59,18 +67,21 @@ class LinkEnd:
 
 @dataclass
 class ReaderEnd(LinkEnd):
-    """The end of the link that belongs to the process that reads the port.
+    """End of the link in the process that reads the port.
 
     Attributes:
         dropped: Number of samples that were discarded because the pipe was full.
-        waits: Whether sending waits while the pipe is full.
+        waits: Whether sending waits while the pipe or the socket is full.
     """
 
     dropped: int = 0
     waits: bool = False
 
     def send_sample(self, sample: bytes) -> None:
-        """Send a sample. If the pipe is full, discard the sample, or wait if `enable_waiting` was called."""
+        """Send a sample. If the pipe is full, the sample is discarded.
+
+        After `enable_waiting` was called, the method waits instead until the pipe has room for the sample.
+        """
         try:
             os.write(self.samples.fileno(), sample)
         except BlockingIOError:
@@ -79,20 +90,24 @@ class ReaderEnd(LinkEnd):
             self.is_open = False
 
     def enable_waiting(self) -> None:
-        """Wait from now on, instead of discarding data, if the pipe is full when data are sent.
+        """From now on, let `send_sample` and `send_message` wait for the page instead of discarding data.
 
-        The stream of a recording waits, so that all samples of the recording are shown.
+        This method must be called for a recording, because the page must show all samples of the recording.
         """
         os.set_blocking(self.samples.fileno(), True)
         self.waits = True
 
     def send_message(self, **content: Any) -> bool:
-        """Send a message, and return whether it was sent."""
+        """Send a message to the process of the page, and return whether it was sent.
+
+        Args:
+            content: Names and values of the JSON object.
+        """
         flags = 0 if self.waits else socket.MSG_DONTWAIT
         return self._send(json.dumps(content).encode(), flags)
 
     def wait_for_request(self) -> LiveRequest | None:
-        """Wait for a request of the page, and return it; return None if the process of the page has ended."""
+        """Wait for a request of the page, and return the request, or None if the process of the page has ended."""
         try:
             data = self.messages.recv(MAX_MESSAGE_BYTES)
         except OSError:
@@ -100,7 +115,7 @@ class ReaderEnd(LinkEnd):
         return REQUEST_DECODER.decode(data) if data else None
 
     def close(self) -> None:
-        """Close this end. A thread that waits in `wait_for_request` then continues."""
+        """Close this end. A thread that waits in `wait_for_request` then receives None."""
         self.is_open = False
         with suppress(OSError):
             self.messages.shutdown(socket.SHUT_RDWR)
@@ -109,12 +124,12 @@ class ReaderEnd(LinkEnd):
 
 @dataclass
 class PageEnd(LinkEnd):
-    """The end in the process of the page."""
+    """End of the link in the process that serves the page."""
 
-    _incomplete: bytes = b""
+    _incomplete: bytes = b""  # beginning of a sample whose other bytes have not arrived yet
 
     def receive_samples(self, size: int) -> bytes:
-        """Return the complete samples that have already arrived. The method does not wait.
+        """Return the bytes of all complete samples that have already arrived. The method does not wait.
 
         Args:
             size: Size of a sample, bytes. The bytes of an incomplete sample are kept for the next call.
@@ -133,7 +148,7 @@ class PageEnd(LinkEnd):
         return data[:complete_bytes]
 
     def receive_messages(self) -> list[Message]:
-        """Return the messages that have already arrived. The method does not wait."""
+        """Return all messages that have already arrived. The method does not wait."""
         messages: list[Message] = []
         with suppress(OSError):  # BlockingIOError means that no further message has arrived
             while data := self.messages.recv(MAX_MESSAGE_BYTES, socket.MSG_DONTWAIT):
@@ -141,16 +156,17 @@ class PageEnd(LinkEnd):
         return messages
 
     def send_request(self, request: LiveRequest) -> bool:
-        """Send a request to the reader, and return whether it was sent."""
+        """Send a request to the reader, and return whether the request was sent."""
         return self._send(msgspec.json.encode(request), socket.MSG_DONTWAIT)
 
 
 def make_link() -> tuple[ReaderEnd, PageEnd]:
-    """Create both ends of a link. Each end may be passed to a process that is started by `spawn`.
+    """Create both ends of a link.
 
-    A pipe carries the samples from the reader to the page. A pair of sockets carries messages in both directions.
+    A pipe carries the samples from the reader to the page. A pair of sockets carries messages in both directions. Each
+    end can be passed to a new process that `multiprocessing` starts with the method `spawn`.
     """
-    page_pipe, reader_pipe = Pipe(duplex=False)  # the end that receives, and the end that sends
+    page_pipe, reader_pipe = Pipe(duplex=False)  # the page receives, and the reader sends
     for pipe_end in (page_pipe, reader_pipe):
         os.set_blocking(pipe_end.fileno(), False)
     with suppress(OSError):  # a smaller pipe is sufficient if the system does not allow this size

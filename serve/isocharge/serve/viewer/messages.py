@@ -1,25 +1,40 @@
-"""Messages between the server and the live page: the description of the film, binary samples, and requests.
+"""Messages between the server and the live page, namely the description of the film, samples and requests.
 
-The page reads the description before the first sample. The description contains the geometry, the electrodes, the model
-and the deflection field. The geometry comes from the sensor in the metadata of the model. Parts of the film that the
-sensor does not describe are not drawn. The deflection field is a file in the folder of the model. For the films of the
-released models, the deflection field is a file of isocharge.
+The page reads the description of the film before the first sample. The description contains the geometry of the film,
+the electrodes, the model and the deflection field. The geometry is a part of the metadata of the model. The page does
+not draw parts of the film that the metadata do not describe. The deflection field is stored in a file in the folder of
+the model. The files for the films of the released models are part of isocharge.
 
-A binary message to the page is little-endian: kind (u8, 1), zero (u8), number of samples (u16), number of the message
-(u32), time of sending (Unix time in seconds, f64), number of records that this page has missed (u32), options (u32, bit
-0: discard what was shown before), and the samples. When the page has drawn a message, it sends a confirmation, which is
-a binary message with the number (u32) of the drawn message.
+Samples are sent to the page in binary messages with the following little-endian fields:
 
-A sample is a prediction record of fixed size. If contacts are tracked, a sample contains the tracked contact instead of
-the contact of the frame. Several records are coalesced to one sample if there are more records than a browser can show.
-A sample is little-endian: the timestamp (Unix time in seconds, f64); the numbers that the declaration of the record
-marks for the live page (f32 each); the numbers of the other contact (f32 each); the flags (u32, one bit for each flag
-of `isocharge.serve.flags`, and the highest bit for a contact); the number of coalesced records (u32); and the touch
-charges (pC, f32 for each electrode). Zeros fill the sample up to a multiple of eight bytes. An unknown number is NaN.
-The description of the film contains the offset of each number.
+- kind of the message (u8), which is 1
+- zero (u8)
+- number of samples in the message (u16)
+- number of the message (u32)
+- time of sending (f64, Unix time in seconds)
+- number of records that this page has missed (u32)
+- options (u32): if bit 0 is set, the page discards everything that it has shown before
+- the samples
 
-A request of the page is a JSON object such as {"do": "marker", "text": "here"}. The value of `do` is the name of one of
-the request classes below in lower case.
+When the page has drawn a message, it sends a confirmation. The confirmation is a binary message with the number (u32)
+of the drawn message.
+
+A sample is a prediction record in a binary form with a fixed size. If contacts are tracked, a sample contains the
+tracked contact instead of the contact of the frame. If there are more records than a browser can show, several records
+are coalesced into one sample. A sample has the following little-endian fields:
+
+- the timestamp (f64, Unix time in seconds)
+- the numbers of the record that are marked for the live page in the declaration of the record (f32 each)
+- the numbers of the other contact (f32 each)
+- the flags (u32), with one bit for each flag of `isocharge.serve.flags`, and the highest bit for a contact
+- the number of coalesced records (u32)
+- the touch charge of each electrode (f32, pC)
+- zeros that fill the sample up to a multiple of eight bytes
+
+An unknown number is sent as NaN. The description of the film contains the offset of each field in a sample.
+
+A request of the page is a JSON object, such as {"do": "marker", "text": "here"}. Each kind of request is a class in
+this module. The value of `do` is the name of this class in lower case.
 """
 
 import math
@@ -43,10 +58,10 @@ from isocharge.serve.record.fields import Field
 from isocharge.serve.record.record import RECORD_FIELDS, PredictionRecord
 
 FLAG_BITS = {word: 1 << position for position, word in enumerate(MEANINGS)}
-"""Bit of each flag in a sample."""
+"""Bit that represents each flag in a sample."""
 
 CONTACT_BIT = 1 << 31
-"""Bit that is set if the sample is a contact."""
+"""Bit of the flags of a sample that is set if the sample contains a contact."""
 
 MAX_FLOAT32 = float(np.finfo(np.float32).max)
 """Largest number of the type float32."""
@@ -55,13 +70,16 @@ Samples = np.ndarray[Any, np.dtype[np.void]]
 """Samples in the order of their times, shape (n,), with the type of a `SampleFormat`."""
 
 OTHER_PREFIX = "other_"
-"""Beginning of the names of the values of the other contact in a sample."""
+"""Prefix of the names of the other contact's numbers in a sample."""
 
 
 def _live_numbers() -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the numbers in a sample: those of the record, and those of its `other` contact.
+    """Return the names of the numbers in a sample.
 
-    The timestamp is not among the names, because a sample contains it as a number of another type.
+    The timestamp is not among these names, because it has another type than the other numbers of a sample.
+
+    Returns:
+        The names of the numbers of the record itself, and the names of the numbers of its field `other`.
     """
     (other_field,) = (field for field in RECORD_FIELDS if field.name == "other")
     record_names = tuple(name for name in _live_names(RECORD_FIELDS) if name != "timestamp")
@@ -70,34 +88,35 @@ def _live_numbers() -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _live_names(fields: Sequence[Field]) -> tuple[str, ...]:
-    """Return the names of the fields that are numbers and are shown on the live page."""
+    """Return the names of those fields that are numbers and that the live page shows."""
     return tuple(field.name for field in fields if field.meaning.is_shown_live and field.kind == "number")
 
 
 RECORD_NUMBERS, OTHER_NUMBERS = _live_numbers()
-"""Names of the numbers of a record and of its other contact that a sample contains."""
+"""Names of the numbers in a sample: the numbers of the record, and the numbers of the other contact."""
 
 
 class SampleFormat:
-    """The layout of the samples of a sensor with these electrodes.
+    """Binary layout of the samples of a sensor, which depends on the number of electrodes.
 
     Attributes:
         electrodes: Names of the electrodes, in the order of the charges.
-        dtype: A sample as a NumPy record.
+        dtype: NumPy type of a sample, with named fields.
     """
 
     def __init__(self, electrodes: tuple[str, ...]) -> None:
-        """Compute the layout of a sample, whose size is a multiple of 8 bytes.
+        """Compute the layout of a sample. The size of a sample is a multiple of 8 bytes.
 
         Args:
-            electrodes: Names of the electrodes.
+            electrodes: Names of the electrodes, in the order of the charges.
         """
         self.electrodes = electrodes
         n_electrode = len(electrodes)
         n_number = len(RECORD_NUMBERS) + len(OTHER_NUMBERS)
         # The time has 8 bytes. All numbers, the flags, the number of records and the charges have 4 bytes each.
         used_bytes = 8 + 4 * (n_number + 2 + n_electrode)
-        padding = -used_bytes % 8
+        padding = -used_bytes % 8  # bytes that are missing to the next multiple of 8
+        # Little-endian: timestamp (d), numbers (f), flags (I), number of records (I), charges (f) and padding (x)
         self._struct = struct.Struct(f"<d{n_number}fII{n_electrode}f{padding}x")
         names = (*RECORD_NUMBERS, *(f"{OTHER_PREFIX}{name}" for name in OTHER_NUMBERS))
         fields: list[Any] = [
@@ -112,7 +131,7 @@ class SampleFormat:
         self.dtype = np.dtype(fields)
 
     def describe(self) -> dict[str, Any]:
-        """Return the layout for the page: the size of a sample (bytes), and the offset of each number (bytes)."""
+        """Return the size of a sample and the offset of each field, bytes, as a JSON object for the page."""
         layout: Mapping[str, Any] = self.dtype.fields or {}  # name, and (type, offset) or (type, offset, title)
         offsets = {}
         for name, (_type, offset, *_title) in layout.items():
@@ -121,21 +140,22 @@ class SampleFormat:
         return {"bytes": self.dtype.itemsize, "offsets": offsets}
 
     def pack(self, record: PredictionRecord) -> bytes:
-        """Return a record as the bytes of a sample.
+        """Convert a record to the bytes of a sample.
 
-        The sample contains the tracked contact if there is one, because the page shows it. Numbers of another contact
-        that also explains the charges follow. Unknown numbers become NaN, and each flag is one bit.
+        If the record contains a tracked contact, the sample contains the tracked contact instead of the contact of the
+        frame. Numbers that are unknown become NaN.
         """
-        bits = CONTACT_BIT if record.contact else 0
+        flag_bits = CONTACT_BIT if record.contact else 0
         for flag in record.flags:
-            bits |= FLAG_BITS[flag]
+            flag_bits |= FLAG_BITS[flag]
 
         values = []
         for name in RECORD_NUMBERS:
             value = getattr(record, name)
             if record.tracked is not None:
-                value = getattr(record.tracked, name, value)  # the tracked contact does not have all numbers
+                value = getattr(record.tracked, name, value)  # the tracked contact has only some of the numbers
             values.append(value)
+        # The field `other` is another contact that explains the charges equally well.
         values += [None if record.other is None else getattr(record.other, name) for name in OTHER_NUMBERS]
         numbers = [math.nan if value is None else value for value in values]
 
@@ -143,82 +163,87 @@ class SampleFormat:
         charges = [charge_by_electrode.get(name) for name in self.electrodes]
         charge_pC = [math.nan if charge is None else charge for charge in charges]
         timestamp = math.nan if record.timestamp is None else record.timestamp
-        record_count = 1  # the page may later receive several samples as a single one, which counts all records
+        record_count = 1  # `coalesce` adds the counts of the samples that it replaces by a single sample
         try:
-            return self._struct.pack(timestamp, *numbers, bits, record_count, *charge_pC)
+            return self._struct.pack(timestamp, *numbers, flag_bits, record_count, *charge_pC)
         except OverflowError:  # a number is beyond the range of float32
-            return self._struct.pack(timestamp, *_clip(numbers), bits, record_count, *_clip(charge_pC))
+            return self._struct.pack(timestamp, *_clip(numbers), flag_bits, record_count, *_clip(charge_pC))
 
 
 def _clip(values: Sequence[float]) -> list[float]:
-    """Return numbers that are limited to the range of float32."""
+    """Limit each number to the range of the type float32, and return the results."""
     return [min(max(value, -MAX_FLOAT32), MAX_FLOAT32) for value in values]
 
 
 def coalesce(samples: Samples, max_samples: int) -> Samples:
-    """Coalesce samples. Each returned sample represents a run of neighbouring samples.
+    """Reduce the number of samples by replacing each run of neighbouring samples by one sample of the run.
 
-    The latest sample of a run is returned. If the latest sample is not a contact, the contact of the run with the
-    largest force is returned instead, so that a short tap is not lost. The returned sample has the flags of all samples
-    of the run, their largest latency, and the sum of their numbers of records. One bit of the flags is set if a sample
-    is a contact. This bit is taken from the returned sample alone.
+    The latest sample of a run is usually chosen. If this sample is not a contact, but the run contains contacts, the
+    contact with the largest force is chosen instead. Short taps are therefore not lost. The chosen sample then gets the
+    flags of all samples of the run, the largest of their latencies, and the sum of their numbers of records. The bit
+    `CONTACT_BIT` of the flags is not combined, but taken from the chosen sample alone.
 
     Args:
         samples: The samples, shape (n,).
-        max_samples: Largest number of samples to return, at least 1.
+        max_samples: Largest number of samples to return, which is at least 1.
 
     Returns:
-        The coalesced samples, shape (max_samples,); the unchanged samples if n is at most `max_samples`.
+        The chosen samples, shape (max_samples,). If n is at most `max_samples`, the given samples are returned.
     """
     if len(samples) <= max_samples:
         return samples
-    # Start of each run, and the end of the last run
-    edges = np.linspace(0, len(samples), max_samples + 1).astype(int)
-    shown: Samples = samples[_shown_positions(samples, edges)]
-    contact_bit = shown["flags"] & CONTACT_BIT
+    # Index of the first sample of each run, and the number of samples as the end of the last run
+    run_edges = np.linspace(0, len(samples), max_samples + 1).astype(int)
+    chosen: Samples = samples[_chosen_indices(samples, run_edges)]
+    contact_bit = chosen["flags"] & CONTACT_BIT
 
-    # `reduceat` combines the values from each start to the next.
-    starts = edges[:-1]
-    run_flags = np.bitwise_or.reduceat(samples["flags"], starts) & ~np.uint32(CONTACT_BIT)
-    shown["flags"] = run_flags | contact_bit
-    shown["records"] = np.add.reduceat(samples["records"], starts)
-    shown["latency_us"] = np.fmax.reduceat(samples["latency_us"], starts)  # ignores latencies that are NaN
-    return shown
+    # `reduceat` combines the values of each run, from its first sample to the first sample of the next run.
+    run_starts = run_edges[:-1]
+    other_flags = np.bitwise_or.reduceat(samples["flags"], run_starts) & ~np.uint32(CONTACT_BIT)
+    chosen["flags"] = other_flags | contact_bit
+    chosen["records"] = np.add.reduceat(samples["records"], run_starts)
+    chosen["latency_us"] = np.fmax.reduceat(samples["latency_us"], run_starts)  # ignores latencies that are NaN
+    return chosen
 
 
-def _shown_positions(samples: Samples, edges: np.ndarray) -> np.ndarray:
-    """Return the index of the sample that represents each run of neighbouring samples, shape (n_run,).
+def _chosen_indices(samples: Samples, run_edges: np.ndarray) -> np.ndarray:
+    """Choose one sample of each run of neighbouring samples.
 
-    The latest sample represents a run. If a contact has ended in the run, its sample with the largest force does.
+    The latest sample of a run is chosen. If the latest sample is not a contact, but the run contains contacts, the
+    contact with the largest force is chosen instead.
 
     Args:
         samples: The samples, shape (n,).
-        edges: Start of each run, and the end of the last run, shape (n_run + 1,).
+        run_edges: Index of the first sample of each run, and n as the end of the last run, shape (n_run + 1,).
+
+    Returns:
+        Index of the chosen sample of each run, shape (n_run,).
     """
     is_contact = (samples["flags"] & CONTACT_BIT) != 0
     known_force_N = np.nan_to_num(samples["force_N"], nan=0.0)
-    force_N = np.where(is_contact, known_force_N, -1.0)  # every contact has a larger value than no contact
-    latest = edges[1:] - 1
-    strongest = np.array([start + int(force_N[start:stop].argmax()) for start, stop in pairwise(edges)])
+    # Samples without contact get a negative value, so that the largest value of a run is a contact if there is one.
+    force_N = np.where(is_contact, known_force_N, -1.0)
+    latest = run_edges[1:] - 1
+    strongest = np.array([start + int(force_N[start:stop].argmax()) for start, stop in pairwise(run_edges)])
     contact_has_ended = ~is_contact[latest] & is_contact[strongest]
     return np.where(contact_has_ended, strongest, latest)
 
 
 HEADER = struct.Struct("<BBHIdII")
-"""Header of a binary message to the page, as the description of this module lists it."""
+"""Header of a binary message to the page. The docstring of this module lists the fields."""
 
 SAMPLES_KIND = 1
-"""Kind of a binary message with samples."""
+"""Value of the field `kind` of a binary message with samples."""
 
 BEGIN_ANEW_OPTION = 1
-"""Option bit of a message with which the page discards all earlier samples."""
+"""Bit of the options that is set if the page must discard all earlier samples."""
 
 MAX_MARKER_CHARACTERS = 80
-"""Largest number of characters of a marker's text."""
+"""Largest number of characters in the text of a marker."""
 
 
 class PageRequest(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
-    """Request of a page."""
+    """Base class of all requests that a page can send."""
 
 
 class Tare(PageRequest):
@@ -230,13 +255,17 @@ class Back(PageRequest):
 
 
 class Record(PageRequest):
-    """Request to begin or end a recording."""
+    """Request to begin or end a recording.
+
+    Attributes:
+        on: True to begin a recording, and False to end the present recording.
+    """
 
     on: bool
 
 
 class Marker(PageRequest):
-    """Request to add a marker at the present time."""
+    """Request to add a marker with a text at the present time of the stream."""
 
     text: str = ""
 
@@ -254,31 +283,39 @@ class Pause(PageRequest):
 
 
 class Seek(PageRequest):
-    """Request to go to a position in the recording, s from its start."""
+    """Request to go to another position in the recording.
+
+    Attributes:
+        value: Time since the start of the recording, s.
+    """
 
     value: Annotated[float, Meta(ge=0.0, le=1e12)]
 
 
 class Speed(PageRequest):
-    """Request to change the speed, relative to the recorded speed."""
+    """Request to change the speed at which the recording is played.
+
+    Attributes:
+        value: Speed relative to the speed at which the recording was made.
+    """
 
     value: Annotated[float, Meta(ge=0.01, le=100.0)]
 
 
 LiveRequest = Tare | Back | Record | Marker
-"""Request of the page of a live stream."""
+"""Requests that the page of a live stream can send."""
 
 ReplayRequest = Play | Pause | Seek | Speed
-"""Request of the page of a recording."""
+"""Requests that the page of a recording can send."""
 
 
 def samples_message(number: int, sent_s: float, samples: Samples, missed: int, *, begin_anew: bool = False) -> bytes:
-    """Return a binary message with samples for the page.
+    """Return a binary message that sends samples to the page.
 
     Args:
         number: Number of the message.
         sent_s: Unix time of sending, s.
-        samples: At most 65535 samples.
+        samples: The samples, shape (n,). At most 65535 samples are allowed.
         missed: Number of records that the page has missed.
         begin_anew: Whether the page discards all earlier samples.
     """
@@ -288,7 +325,10 @@ def samples_message(number: int, sent_s: float, samples: Samples, missed: int, *
 
 
 def confirmed_number(data: bytes) -> int:
-    """Return the number of the message that a page confirms.
+    """Return the number of the message that the page has confirmed.
+
+    Args:
+        data: The confirmation, a binary message of the page.
 
     Raises:
         RequestError: If the confirmation does not have four bytes.
@@ -302,20 +342,20 @@ DEFLECTION_FILE = "deflection.json"
 """Name of the file with the deflection field in a version folder."""
 
 
-def find_field(model: Path, metadata: ModelMetadata) -> DeflectionField | None:
-    """Return the deflection field of the film for which a model was trained; None if there is none.
+def find_field(version_folder: Path, metadata: ModelMetadata) -> DeflectionField | None:
+    """Return the deflection field of the film for which a model was trained, or None if no such field is available.
 
-    The version folder of the model may contain the field. Otherwise the fields that isocharge contains for the films of
-    its released models are searched for a field of this film.
+    If the version folder of the model contains a field, this field is returned. Otherwise the function searches the
+    fields of the films of the released models, which are part of isocharge.
 
     Args:
-        model: Version folder.
+        version_folder: Folder of the version of the model.
         metadata: Metadata of the model.
 
     Raises:
         InputError: If the file in the version folder is damaged.
     """
-    path = model / DEFLECTION_FILE
+    path = version_folder / DEFLECTION_FILE
     if path.is_file():
         return read_deflection_field(path)
     film = metadata.sensor.get("film")
@@ -328,20 +368,24 @@ def find_field(model: Path, metadata: ModelMetadata) -> DeflectionField | None:
 
 
 def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | None) -> dict[str, Any]:
-    """Return the description of a film for the page as a JSON object.
+    """Return the description of a film and its electrodes as a JSON object for the page.
 
     Args:
-        name: Name of the stream.
+        name: Name of the stream, which the page shows.
         metadata: Metadata of the model.
-        field: Deflection field of the film; None if there is none.
+        field: Deflection field of the film, or None if no deflection field is available.
     """
     sensor = metadata.sensor
     film = sensor.get("film")
 
-    # The first polygon of an electrode is its pad. The others, if there are any, are leads.
-    electrode_polygons = _electrode_polygons(sensor, metadata.electrodes)
-    outlines_mm = {electrode: pad for electrode, (pad, *_) in electrode_polygons.items()}
-    leads_mm = {electrode: leads for electrode, (_, *leads) in electrode_polygons.items() if leads}
+    outlines_mm = {}
+    leads_mm = {}
+    for electrode, polygons in _electrode_polygons(sensor, metadata.electrodes).items():
+        pad, *leads = polygons  # the first polygon is the pad; most electrodes have no leads
+        outlines_mm[electrode] = pad
+        if leads:
+            leads_mm[electrode] = leads
+
     description = {
         "name": name,
         "model": metadata.label,
@@ -362,20 +406,22 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
 
 
 def _electrode_polygons(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[list[float]]]]:
-    """Return the polygons of each electrode on the real film, which a calibration may have rotated and shifted.
+    """Return the polygons of each electrode at the position that a calibration of the film has found.
 
-    The first polygon is the pad, and the others are further metal such as leads.
+    The first polygon of an electrode is its pad. All further polygons describe other metal of the electrode, such as
+    leads.
 
     Args:
         sensor: Description of the sensor in the metadata of the model, which may be incomplete.
         electrodes: Names of the electrodes.
 
     Returns:
-        Polygons by electrode, each a list of corners (x, y), mm; empty if the sensor has an unknown form.
+        List of polygons by electrode name. Each polygon is a list of corners (x, y), mm. The result is empty if the
+        description of the sensor has an unknown form.
     """
     try:
-        # A part is a point or a polygon for each electrode, and a number for the side of all square electrodes. The
-        # number is not `Positive`, because msgspec 0.22 crashes on a union of a fixed tuple and a bounded number.
+        # The values are the centre of a square electrode, the polygons of an electrode, and the side of all squares.
+        # The side is not `Positive`, because msgspec 0.22 crashes on a union of a fixed tuple and a bounded number.
         parts = convert(sensor["electrodes"], dict[str, Point | float | _Polygon], "sensor", InputError)
         calibration = sensor.get("calibration") or {}
         return {
@@ -390,7 +436,7 @@ Point = tuple[Finite, Finite]
 
 
 class _Polygon(Struct):
-    """Electrode of a sensor that is described by polygons.
+    """Electrode that the sensor describes by polygons.
 
     Attributes:
         polygon_mm: Corners of the pad, mm.
@@ -402,14 +448,17 @@ class _Polygon(Struct):
 
 
 def _designed_polygons(parts: Mapping[str, Any], name: str) -> list[list[Point]]:
-    """Return the polygons of an electrode in the design, each a list of corners (x, y), mm.
+    """Return the polygons of an electrode as they were designed, without the results of a calibration.
 
-    An electrode without polygons is a square around a point.
+    If the design contains only a point for the electrode, the electrode is a square around this point.
 
     Args:
         parts: Section `electrodes` of a sensor file: a point (x, y) or a polygon for each electrode name, and the side
             of the squares under the key `side_mm`.
         name: Name of the electrode.
+
+    Returns:
+        The polygons, each of which is a list of corners (x, y), mm.
     """
     part = parts[name]
     if isinstance(part, _Polygon):
@@ -424,11 +473,14 @@ def _designed_polygons(parts: Mapping[str, Any], name: str) -> list[list[Point]]
 
 
 def _calibrated_corners(corners: list[Point], calibration: Any) -> list[list[float]]:
-    """Rotate corners about the centre, and then shift them. The angle and the shift are results of a calibration.
+    """Apply the rotation and the shift that a calibration has found to the corners of a polygon.
+
+    The corners are first rotated about the centre of the film, and are then shifted.
 
     Args:
-        corners: Corners (x, y) in the design, mm.
-        calibration: Section `calibration` of a sensor, with `rotation_deg` and `shift_mm`; empty for a design.
+        corners: Corners (x, y) of the designed polygon, mm.
+        calibration: Section `calibration` of the sensor, which contains `rotation_deg` and `shift_mm`. It is empty if
+            the film was not calibrated.
     """
     shift_x, shift_y = calibration.get("shift_mm", (0.0, 0.0))
     angle = math.radians(calibration.get("rotation_deg", 0.0))

@@ -1,8 +1,9 @@
-"""The playground: an HTML file in which a visitor presses a simulated film and sees the contact of a network.
+"""Playground: an HTML page on which a visitor presses a simulated film and sees the contact that a network estimates.
 
-The file contains the networks as compressed ONNX files, the stress of the film as a series, and the scripts. It loads
-no other files. The charges are computed by `isocharge.common.stress_series`, so the playground can show every model of
-a biaxial film that this series describes.
+The page is a single file, which loads no other files. The file contains the scripts, the networks as compressed ONNX
+files, and the stress of the film as a series. The charges are computed from this series (see
+`isocharge.common.stress_series`). The playground can therefore show every model of a biaxial film whose stress the
+series describes.
 """
 
 import base64
@@ -38,20 +39,20 @@ STYLES = ("page/style.css", "playground/playground.css")
 """Style sheets of the page."""
 
 SERIES_FILE = "playground/film-25um.json"
-"""File with the stress of the film of the models."""
+"""File that contains the stress of the film for which the models were trained."""
 
 MODULE_SYNTAX = re.compile(r"^import .*;\n|^export (?=\w)", re.MULTILINE)
-"""Import statements and the word `export`, which are removed when the scripts are joined."""
+"""Pattern of import statements and of the word `export`, which are removed when the scripts are joined."""
 
 QUADRILATERAL = 4
 """Number of corners of an electrode over which the page can integrate the stress."""
 
 
 def playground_html(models: tuple[str, ...] = MODELS) -> str:
-    """Return the playground as a single HTML page, which contains its scripts, its styles and the networks.
+    """Return the playground as a single HTML page that contains its scripts, its style sheets and the networks.
 
     Args:
-        models: Names or paths of the models.
+        models: Names or paths of the models that the page shows.
 
     Raises:
         ModelError: If a model is missing, or its film or electrodes cannot be shown.
@@ -70,7 +71,7 @@ def playground_html(models: tuple[str, ...] = MODELS) -> str:
         "data": _as_json(_page_data(series, models)),
     }
 
-    # The template contains the name of each part in double braces.
+    # The template contains a placeholder for each part, which is the name of the part in double braces.
     html = template
     for name, text in parts.items():
         html = html.replace("{{" + name + "}}", text)
@@ -78,7 +79,7 @@ def playground_html(models: tuple[str, ...] = MODELS) -> str:
 
 
 def _page_data(series: StressSeries, models: tuple[str, ...]) -> dict[str, Any]:
-    """Return the data of the page, which are the stress of the film, the models and the meanings of their flags."""
+    """Return the data of the page, namely the stress of the film, the models, and the meanings of the flags."""
     return {
         "stress": series.to_json(),
         "models": [_describe_model(model, series) for model in models],
@@ -87,7 +88,7 @@ def _page_data(series: StressSeries, models: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _describe_model(name: str, series: StressSeries) -> dict[str, Any]:
-    """Return the description of a model for the page. The description contains the network.
+    """Return the description of a model for the page, including its network.
 
     Args:
         name: Name or path of the model.
@@ -123,5 +124,6 @@ def _describe_model(name: str, series: StressSeries) -> dict[str, Any]:
 
 
 def _as_json(data: dict[str, Any]) -> str:
-    """Return data as JSON that can be put into an HTML script element."""
-    return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    """Encode data as JSON text that can be inserted into an HTML script element."""
+    text = json.dumps(data, separators=(",", ":"))
+    return text.replace("<", "\\u003c")  # otherwise a text such as "</script>" would end the element

@@ -1,6 +1,7 @@
-"""The process that serves the live page.
+"""Process that serves the live page.
 
-This process is separate from the reader, which is the process that reads the port.
+The live page has its own process. The reader, which is the process that reads the port, therefore never waits for the
+page.
 """
 
 import asyncio
@@ -25,13 +26,13 @@ from isocharge.serve.viewer.link import PageEnd
 from isocharge.serve.viewer.server import Access, PageServer
 
 NICE = 10
-"""Increase of the nice value of the process, so that the reader has priority on a busy core."""
+"""Increase of the nice value of the process. The reader therefore has priority if both use the same core."""
 
 START_TIMEOUT_S = 60.0
-"""Longest time until the process listens, s."""
+"""Longest time to wait until the server of the page listens, s."""
 
 STOP_TIMEOUT_S = 5.0
-"""Longest time until the process ends by itself, s. Afterwards it is terminated."""
+"""Longest time to wait until the process ends by itself, s. After this time, the process is terminated."""
 
 BACKLOG = 128
 """Largest number of connections that wait to be accepted."""
@@ -45,9 +46,9 @@ class Page:
         link: Link to the process that reads the port or the recording.
         description: Description of the film, as `describe_film` returns it.
         address: Address on which the page listens.
-        token: Secret that viewers must send; None if no token is required.
+        token: Secret token that viewers must send, or None if viewers need no token.
         is_recording: Whether the stream is a recording.
-        tls: Certificate and key; None for no TLS.
+        tls: Certificate and private key for TLS, or None to serve the page without TLS.
     """
 
     link: PageEnd
@@ -60,9 +61,9 @@ class Page:
 
 @contextmanager
 def page_process(page: Page) -> Iterator[str]:
-    """Serve the page in its own process while the block runs.
+    """Return a context manager that serves the page in a separate process while its block runs.
 
-    The process ends when the reader, which is the calling process, closes its end of `page.link`.
+    The calling process is the reader of the stream. The new process ends when the reader closes its end of the link.
 
     Args:
         page: Settings of the page.
@@ -74,19 +75,20 @@ def page_process(page: Page) -> Iterator[str]:
         InputError: If the token or the TLS files cannot be used.
         ListenError: If the address is in use or cannot be used.
     """
-    # The new process sends its URL, or an error, through a pipe.
+    # The new process sends the URL of the page, or an error, through a pipe.
     context = get_context("spawn")
     url_receiver, url_sender = context.Pipe(duplex=False)
     process = context.Process(target=_run, args=(page, url_sender), name="page", daemon=True)
     with _interrupts_ignored():
         process.start()
-    # The new process has its own copies of these ends. A pipe reports its end only if all copies are closed.
+    # The new process has its own copies of the following two ends. They are closed here, because the other ends only
+    # notice that the new process has ended if no copies are open in this process.
     url_sender.close()
     page.link.close_here()
     try:
         yield _receive_url(url_receiver)
     finally:
-        # The process ends by itself when the link is closed. If it does not, it is terminated.
+        # The reader has closed the link, so the process ends by itself. If it does not, it is terminated.
         process.join(STOP_TIMEOUT_S)
         if process.is_alive():
             process.terminate()
@@ -94,7 +96,7 @@ def page_process(page: Page) -> Iterator[str]:
 
 
 def run_page(page: Page, announce: Callable[[str], object]) -> None:
-    """Serve the page in this process until the reader has ended.
+    """Serve the page in the present process until the reader of the stream has ended.
 
     Args:
         page: Settings of the page.
@@ -104,7 +106,7 @@ def run_page(page: Page, announce: Callable[[str], object]) -> None:
         InputError: If the token or the TLS files cannot be used.
         ListenError: If the address is in use or cannot be used.
     """
-    # The token and the TLS files are read first, so that the server does not listen if they cannot be used.
+    # The token and the TLS files are checked before the server listens, because it must not listen if they are invalid.
     token = None if page.token is None else Token(page.token)
     access = Access(token, page.address.host)
     tls_context = None if page.tls is None else page.tls.context()
@@ -117,26 +119,29 @@ def run_page(page: Page, announce: Callable[[str], object]) -> None:
 
 
 async def _serve(server: PageServer, hub: Hub, listening: socket.socket, tls_context: ssl.SSLContext | None) -> None:
-    """Answer browsers until the reader of the stream has ended.
+    """Answer the requests of browsers until the reader of the stream has ended.
 
     Args:
-        server: The server of the page.
-        hub: The hub, which distributes the samples of the stream to the viewers.
-        listening: Socket that listens.
-        tls_context: Certificate and key; None for HTTP without TLS.
+        server: Server of the page.
+        hub: Hub that distributes the samples of the stream to the viewers.
+        listening: Socket on which the server accepts connections.
+        tls_context: TLS context of the server, or None for HTTP without TLS.
     """
     async with server.listening(listening, tls_context):
         await hub.run()  # ends when the reader has ended
 
 
 def _run(page: Page, url_sender: Connection) -> None:
-    """Serve the page in its own process. Send the URL of the page, or the error that prevents the page from starting.
+    """Serve the page. This function is the target of the separate process of the page.
+
+    The function sends the URL of the page to the process that has started the page. If the page cannot be served, the
+    function sends the error instead.
 
     Args:
         page: Settings of the page.
-        url_sender: Pipe to the process that has started the page.
+        url_sender: End of a pipe to the process that has started the page.
     """
-    with suppress(OSError):  # the page runs with the normal priority if the system does not allow a lower one
+    with suppress(OSError):  # if the system does not allow a lower priority, the page runs with the normal priority
         os.nice(NICE)
     try:
         run_page(page, url_sender.send)
@@ -145,14 +150,14 @@ def _run(page: Page, url_sender: Connection) -> None:
 
 
 def _receive_url(url_receiver: Connection) -> str:
-    """Wait for the URL of the page, and return it.
+    """Wait until the process of the page sends its URL, and return the URL.
 
     Args:
-        url_receiver: Pipe from the process of the page.
+        url_receiver: End of the pipe through which the process of the page sends its URL or an error.
 
     Raises:
         IsochargeError: The error that prevents the page from starting.
-        ListenError: If the process ends or sends nothing within `START_TIMEOUT_S`.
+        ListenError: If the process ends without sending anything, or sends nothing within `START_TIMEOUT_S`.
     """
     result = None
     try:
@@ -169,10 +174,11 @@ def _receive_url(url_receiver: Connection) -> str:
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C during the block. A process that is started in the block also ignores Ctrl-C.
+    """Return a context manager that ignores Ctrl-C while its block runs.
 
-    The process of the page therefore ends only when the reader ends. In another thread than the main thread, the block
-    runs without this change, because Python allows only the main thread to set signal handlers.
+    A process that is started in the block also ignores Ctrl-C, and continues to ignore it after the block. The process
+    of the page therefore ends only when the reader ends. Python allows only the main thread to set signal handlers. If
+    the block runs in another thread, Ctrl-C is therefore not ignored.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

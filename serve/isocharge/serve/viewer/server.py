@@ -1,13 +1,15 @@
-"""Server of the live page: files and the description of the film over HTTP, samples over WebSocket.
+"""Server of the live page.
 
-The server is based on the package `websockets`, which answers one HTTP request for each connection. The package limits
-the size of the request line and headers (8 KiB for each line, 128 lines), the time for a request, and the size of a
-message. The package also sends pings to each viewer. This module limits the number of viewers, the rate at which they
-send data, and the time for which they read nothing.
+The server sends the files of the page and the description of the film over HTTP. It sends the samples over a WebSocket.
 
-A browser sends no Authorization header with a WebSocket. The page therefore sends its token as a subprotocol,
-`bearer.TOKEN` in base64url. Other clients send the header. The module `isocharge.serve.network.browser_check` refuses
-requests from pages of other sites.
+The server is based on the package `websockets`, which answers one HTTP request on each connection. The package limits
+the size of the request line and headers (8 KiB for each line, 128 lines), the duration of a request, and the size of a
+message. The package also sends pings to each viewer. This module limits the number of viewers and the rate at which a
+viewer may send data. This module also disconnects viewers that do not read for too long.
+
+A browser cannot send an Authorization header when it opens a WebSocket. The page therefore sends its token as a
+subprotocol, which is `bearer.` followed by the token in base64url. Other clients send the Authorization header. The
+module `isocharge.serve.network.browser_check` refuses requests from pages of other sites.
 """
 
 import asyncio
@@ -43,46 +45,53 @@ from isocharge.serve.viewer.hub import Hub, Viewer
 from isocharge.serve.viewer.messages import FLAG_BITS, confirmed_number
 
 PROTOCOL = "isocharge.live.1"
-"""Subprotocol of the page."""
+"""WebSocket subprotocol of the live page."""
 
 BEARER = "bearer."
-"""Beginning of the subprotocol that contains the token."""
+"""Prefix of the subprotocol that contains the token."""
 
 
 class Access:
-    """Checks whether a request for data may be answered.
+    """Checks whether the server may answer a request for the description of the film or for samples.
 
     Args:
-        token: Token that requests must contain; None if no token is needed.
+        token: Token that requests must contain, or None if requests need no token.
         host: Name or address on which the page is served.
     """
 
     def __init__(self, token: Token | None = None, host: str = "127.0.0.1") -> None:
-        """Set up the checks. The class describes the arguments."""
+        """Store the token and create the check of browsers. The docstring of the class describes the arguments."""
         self._token = token
         self._browser_check = BrowserCheck(host, any_host=token is not None)
 
     def check(self, headers: Mapping[bytes, bytes], subprotocols: Iterable[str] = ()) -> None:
-        """Check a request for data.
+        """Check whether a request may be answered.
 
         Args:
-            headers: Values by name in lower case.
-            subprotocols: Subprotocols that a WebSocket offers.
+            headers: Value of each header by the name of the header in lower case.
+            subprotocols: Subprotocols that the client offers if the request opens a WebSocket.
 
         Raises:
-            OriginError: If a page of another site sent the request.
+            OriginError: If the request was sent by a page of another site.
             TokenError: If the request does not contain the token.
         """
         self._browser_check.check("GET", headers)
         if self._token is not None:
-            self._token.check(headers.get(b"authorization", b"") or _bearer(subprotocols))
+            self._token.check(headers.get(b"authorization", b"") or _authorization_from(subprotocols))
 
 
-def _bearer(subprotocols: Iterable[str]) -> bytes:
-    """Return the Authorization header that corresponds to the subprotocol with the token; empty if there is none.
+def _authorization_from(subprotocols: Iterable[str]) -> bytes:
+    """Return the Authorization header that corresponds to the subprotocol with the token.
 
-    A browser cannot set headers when it opens a WebSocket. The page therefore sends the token as a subprotocol, encoded
-    in base64 for URLs without padding.
+    A browser cannot set headers when it opens a WebSocket. The page therefore sends the token as a subprotocol. The
+    token is encoded in base64url, without padding characters.
+
+    Args:
+        subprotocols: Subprotocols that the client offers.
+
+    Returns:
+        The value of the header. It is empty if no subprotocol contains a token, and `Bearer` without a token if the
+        token is not valid base64url.
     """
     for subprotocol in subprotocols:
         if subprotocol.startswith(BEARER):
@@ -91,39 +100,39 @@ def _bearer(subprotocols: Iterable[str]) -> bytes:
             try:
                 return b"Bearer " + base64.b64decode(text + padding, altchars=b"-_", validate=True)
             except (binascii.Error, ValueError):
-                return b"Bearer"  # a header without a token, which is refused as a wrong token
+                return b"Bearer"  # a header without a token is refused in the same way as a wrong token
     return b""
 
 
 SESSION_PATH = "/session.json"
-"""Path of the description of the film."""
+"""Path under which the server sends the description of the stream and its film."""
 
 LIVE_PATH = "/live"
-"""Path of the WebSocket."""
+"""Path under which a client opens a WebSocket."""
 
 MAX_VIEWERS = 32
-"""Largest number of viewers."""
+"""Largest number of viewers that are connected at the same time."""
 
 MAX_BURST_BYTES = 1 << 16
-"""Largest amount of data that a connection may send at once, bytes. No request of the page is larger."""
+"""Largest amount of data that a client may send at once, bytes. No request of the page is larger."""
 
 MAX_BYTES_PER_S = 1 << 14
-"""Largest mean rate at which a connection may send data, bytes/s. The page sends about 1 kB/s."""
+"""Largest mean rate at which a client may send data, bytes/s. The page sends about 1 kB/s."""
 
 MAX_MESSAGE_BYTES = 1 << 12
 """Largest size of a message from a viewer, bytes."""
 
 REQUEST_TIMEOUT_S = 10.0
-"""Longest time for an HTTP request, s."""
+"""Longest time in which a client must complete its HTTP request, s."""
 
 PING_INTERVAL_S = 20.0
-"""Time between two pings, and longest time until the response to a ping, s."""
+"""Time between two pings, s. It is also the longest time within which a viewer must answer a ping."""
 
 SEND_TIMEOUT_S = 30.0
 """Longest time for which a viewer may read nothing, s."""
 
 CLOSE_TIMEOUT_S = 2.0
-"""Longest time for closing a connection, s."""
+"""Longest time to wait while a connection is being closed, s."""
 
 CONTENT_TYPES = {
     ".html": b"text/html; charset=utf-8",
@@ -138,38 +147,38 @@ CONTENT_SECURITY_POLICY = (
     b"default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
     b"base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""Content security policy: a browser may load only the files of this server."""
+"""Content security policy of the page. With this policy, a browser loads only files of this server."""
 
 SILENT_LOGGER = logging.getLogger("isocharge.serve.viewer.websockets")
-"""Logger for the package `websockets`. Errors of clients are sent to the clients and not logged."""
+"""Logger for the package `websockets`. The errors that a client causes are sent to this client and are not logged."""
 SILENT_LOGGER.setLevel(logging.CRITICAL)
 
 
 class RateLimit:
-    """Limit of the data that a client may send (token bucket).
+    """Limit on the amount of data that a client may send, implemented as a token bucket.
 
     Args:
-        burst_bytes: Largest amount of data at once, bytes.
-        bytes_per_s: Largest mean rate, bytes/s.
-        now_s: Present time on a clock that does not jump, s.
+        burst_bytes: Largest amount of data that the client may send at once, bytes.
+        bytes_per_s: Largest mean rate at which the client may send data, bytes/s.
+        now_s: Present time on a monotonic clock, s.
     """
 
     def __init__(self, burst_bytes: float, bytes_per_s: float, now_s: float) -> None:
-        """Begin with the full amount of data. The class describes the arguments."""
+        """Begin with the full allowance of `burst_bytes`. The docstring of the class describes the arguments."""
         self._burst_bytes = burst_bytes
         self._bytes_per_s = bytes_per_s
         self._available_bytes = burst_bytes
         self._latest_s = now_s
 
     def allows(self, count: int, now_s: float) -> bool:
-        """Count received data, and return whether their amount is within the limit.
+        """Count received data, and return whether the client has stayed within the limit.
 
-        The limit is a token bucket: an allowance of bytes grows at a constant rate up to a largest value, and received
-        data reduce it.
+        The allowance of the client grows by `bytes_per_s` up to at most `burst_bytes`. Received data reduce the
+        allowance. The client has exceeded the limit if the allowance becomes negative.
 
         Args:
-            count: Size of the data, bytes.
-            now_s: Time on a monotonic clock, s.
+            count: Size of the received data, bytes.
+            now_s: Present time on the same monotonic clock, s.
         """
         elapsed_s = max(now_s - self._latest_s, 0.0)
         refilled_bytes = min(self._burst_bytes, self._available_bytes + elapsed_s * self._bytes_per_s)
@@ -179,42 +188,45 @@ class RateLimit:
 
 
 class PageConnection(ServerConnection):
-    """A connection that is ended if its client sends too much data. The data include control frames such as pings."""
+    """Connection that is ended if its client sends too much data.
+
+    The limit counts all received data, including control frames such as pings.
+    """
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Create the data limit of the connection when the connection begins."""
+        """Create the limit on received data when the connection begins."""
         self._rate_limit = RateLimit(MAX_BURST_BYTES, MAX_BYTES_PER_S, time.monotonic())
         super().connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        """Process received data, or end the connection if the client sends too much.
+        """Process received data, or end the connection if the client has sent too much data.
 
-        While the client does not read the responses, writing is paused. Reading is then paused, too, because the
-        responses to further data would fill the memory.
+        If the client does not read the responses, asyncio pauses writing. This method then also pauses reading, because
+        the responses to further data would fill the memory.
         """
         if not self._rate_limit.allows(len(data), time.monotonic()):
             self.transport.abort()
             return
         super().data_received(data)
-        if self.paused:  # writing is paused
+        if self.paused:  # asyncio has paused writing
             self.transport.pause_reading()
 
     def resume_writing(self) -> None:
-        """Resume reading when the client reads again."""
+        """Resume reading, because the client has read the responses."""
         super().resume_writing()
         self.transport.resume_reading()
 
 
 class PageServer:
-    """Serves the files of the page, the description of the film, and the samples.
+    """Server of the files of the page, the description of the film, and the samples.
 
     Args:
-        hub: The stream.
-        access: Checks the requests for the description and the samples.
+        hub: Hub of the stream that the page shows.
+        access: Object that checks the requests for the description of the film and for samples.
     """
 
     def __init__(self, hub: Hub, access: Access) -> None:
-        """Read the files of the page. The class describes the arguments."""
+        """Read the files of the page into memory. The docstring of the class describes the arguments."""
         self._hub = hub
         self._access = access
         self._files = page_files()
@@ -224,11 +236,11 @@ class PageServer:
     async def listening(
         self, listening: socket.socket, tls_context: ssl.SSLContext | None = None
     ) -> AsyncIterator[None]:
-        """Answer requests on a listening socket while the block runs.
+        """Return an asynchronous context manager that answers requests on a socket while its block runs.
 
         Args:
-            listening: The socket.
-            tls_context: TLS context of the server; None for no TLS.
+            listening: Socket on which the server accepts connections.
+            tls_context: TLS context of the server, or None for HTTP without TLS.
         """
         async with serve(
             self._serve_viewer,
@@ -249,10 +261,11 @@ class PageServer:
             yield
 
     def _http_response(self, _connection: ServerConnection, request: http11.Request) -> http11.Response | None:
-        """Return the response to an HTTP request; None if the request opens a WebSocket.
+        """Return the response to an HTTP request, or None if the request opens a WebSocket.
 
-        The files of the page need no token. The description of the session and the WebSocket need the token, which is
-        either in the Authorization header or, from a browser that opens a WebSocket, in a subprotocol.
+        A request for a file of the page needs no token. A request for the description of the stream, or for a
+        WebSocket, must contain the token in its Authorization header. A browser that opens a WebSocket sends the token
+        in a subprotocol instead.
 
         Args:
             _connection: Connection of the request, which is not used.
@@ -266,7 +279,7 @@ class PageServer:
                 raise UnknownPath(f"nothing is served under {path[:200]!r}; the page is /")
             items = request.headers.raw_items()
             headers = {name.lower().encode(): value.encode("ascii", "surrogateescape") for name, value in items}
-            # The subprotocols may be in several headers, and each header may list several of them.
+            # A request may have several headers with subprotocols, and each header may list several subprotocols.
             subprotocol_list = ",".join(request.headers.get_all("Sec-WebSocket-Protocol"))
             subprotocols = [subprotocol.strip() for subprotocol in subprotocol_list.split(",")]
             self._access.check(headers, subprotocols)
@@ -279,7 +292,7 @@ class PageServer:
             return _last_response(error_response(error))
 
     def _session(self) -> Response:
-        """Return the description of the stream, which the page reads before the first sample."""
+        """Return the response with the description of the stream, which the page reads before the first sample."""
         response = json_response(
             {
                 "id": self._id,
@@ -292,7 +305,7 @@ class PageServer:
         return response
 
     async def _serve_viewer(self, connection: ServerConnection) -> None:
-        """Send samples to a viewer and carry out its requests until it disconnects."""
+        """Send samples to a viewer, and carry out the requests of the viewer, until the viewer disconnects."""
         viewer = Viewer(self._hub)
         self._hub.viewers.add(viewer)
         sender = asyncio.create_task(self._send(viewer, connection))
@@ -306,16 +319,16 @@ class PageServer:
             sender.cancel()
 
     async def _send(self, viewer: Viewer, connection: ServerConnection) -> None:
-        """Send messages to a viewer until the stream ends. A viewer that does not read is disconnected.
+        """Send messages to a viewer until the stream ends, and disconnect a viewer that does not read them.
 
         Args:
-            viewer: The viewer, whose event `wake` is set when there may be something to send.
+            viewer: The viewer. Its event `wake` is set when there may be messages to send.
             connection: Connection of the viewer.
         """
         try:
             while not self._hub.has_ended:
                 await viewer.wake.wait()
-                viewer.wake.clear()
+                viewer.wake.clear()  # before the messages are collected, so that no later event is missed
                 async with asyncio.timeout(SEND_TIMEOUT_S):
                     for message in viewer.messages(time.time()):
                         await connection.send(message)
@@ -326,12 +339,12 @@ class PageServer:
             pass
 
     async def _handle_message(self, viewer: Viewer, connection: ServerConnection, message: str | bytes) -> None:
-        """Handle a confirmation or a request of the page. The response to an invalid message is the error.
+        """Handle a confirmation or a request of the page. If the message is invalid, the error is sent to the page.
 
         Args:
             viewer: The viewer that has sent the message.
             connection: Connection of the viewer.
-            message: Bytes for a confirmation, text for a request.
+            message: The message. A confirmation is of the type bytes, and a request is text.
         """
         try:
             if isinstance(message, bytes):
@@ -345,19 +358,22 @@ class PageServer:
 
 
 def _select_subprotocol(_connection: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
-    """Return the subprotocol of the page if the client offers it."""
+    """Return the subprotocol of the page if the client offers this subprotocol, and otherwise None."""
     return Subprotocol(PROTOCOL) if PROTOCOL in offered else None
 
 
 def _last_response(response: Response) -> http11.Response:
-    """Convert a response to the type of the package `websockets`. The connection is closed after this response."""
+    """Convert a response to the type of the package `websockets`. The connection is closed after the response."""
     headers = Headers([(name.decode(), value.decode()) for name, value in response.headers])
     headers["Connection"] = "close"
     return http11.Response(response.status, HTTPStatus(response.status).phrase, headers, response.body)
 
 
 def page_files() -> dict[str, Response]:
-    """Return the response to each path of the page. The path `/` is the page itself."""
+    """Return a dictionary that contains the response to a request for each file of the page, by path.
+
+    The path `/` is the HTML file.
+    """
     folder = Path(__file__).with_name("page")
     paths = [path for path in folder.rglob("*") if path.is_file()]
     responses = {f"/{path.relative_to(folder).as_posix()}": _file_response(path) for path in paths}
@@ -366,11 +382,11 @@ def page_files() -> dict[str, Response]:
 
 
 def _file_response(path: Path) -> Response:
-    """Return the response with the content of a file of the page."""
+    """Return the response that contains a file of the page."""
     response = response_of(200, CONTENT_TYPES[path.suffix], path.read_bytes())
     response.headers.append((b"content-security-policy", CONTENT_SECURITY_POLICY))
     response.headers.append((b"cache-control", b"no-cache"))
     for name, value in PAGE_HEADERS:
-        if name != b"content-security-policy":  # this page has its own policy
+        if name != b"content-security-policy":  # the live page has its own policy, which was added above
             response.headers.append((name, value))
     return response

@@ -1,6 +1,6 @@
-"""Virtual sensor, which is a pseudo-terminal that sends the frames of a board.
+"""Virtual sensor, which sends the frames of a simulated board through a pseudo-terminal.
 
-Presses and faults are scripted or random.
+The presses are random or given by a script. A script can also contain faults of the transmission.
 
 May import: frames.
 """

@@ -1,6 +1,7 @@
 """Scripts of a virtual sensor.
 
-A script contains the position and force of the press in each frame, and faults of the transmission.
+A script file contains presses and faults of the transmission. A `Script` contains the position and the force of the
+press in each frame.
 """
 
 from dataclasses import dataclass
@@ -41,7 +42,7 @@ BITS_PER_BYTE = 8
 
 @dataclass(frozen=True)
 class Script:
-    """Position and force of the press in each frame.
+    """Position and force of the press in each frame of a virtual sensor.
 
     Attributes:
         x_mm: Position, shape (n,), mm; NaN while nothing touches.
@@ -68,7 +69,7 @@ class Script:
 
     @property
     def touching(self) -> Booleans:
-        """Whether something touches in each frame, shape (n,)."""
+        """Whether something touches the film in each frame, shape (n,)."""
         return self.force_N > 0.0
 
 
@@ -94,24 +95,36 @@ class Faults(Settings, frozen=True, kw_only=True):
     clock_ppm: Annotated[float, Meta(gt=-1e6, lt=1e6)] = 0.0
 
     def is_silent(self, t_s: float) -> bool:
-        """Return whether a time since the start of the script, s, lies in a gap or in an outage of the port."""
+        """Return whether the sensor sends nothing at a given time, because of a gap or an outage of the port.
+
+        Args:
+            t_s: Time since the start of the script, s.
+        """
         return _is_in_interval(t_s, self.gap_every_s, self.gap_s) or self.is_unplugged(t_s)
 
     def is_unplugged(self, t_s: float) -> bool:
-        """Return whether a time since the start of the script, s, lies in an outage of the port."""
+        """Return whether a given time lies in an outage of the port.
+
+        Args:
+            t_s: Time since the start of the script, s.
+        """
         return _is_in_interval(t_s, self.unplug_every_s, self.unplug_s)
 
 
 def _is_in_interval(t_s: float, period_s: float, length_s: float) -> bool:
-    """Return whether a time lies in a periodic interval. The first interval begins after one period.
+    """Return whether a time lies in one of the intervals that begin periodically.
 
-    A period of 0 means that there are no intervals.
+    Args:
+        t_s: The time, s.
+        period_s: Time between the beginnings of two intervals, s; 0 if there are no intervals. The first interval
+            begins after one period.
+        length_s: Length of each interval, s.
     """
     return period_s > 0.0 and t_s >= period_s and t_s % period_s < length_s
 
 
 class VirtualScript(Settings, frozen=True):
-    """Content of the file for `isocharge serve virtual --script`.
+    """Content of a script file, which is given by `isocharge serve virtual --script`.
 
     Attributes:
         presses: Rows (seconds, x_mm, y_mm, force_N), which are interpolated linearly. Nothing touches while the force
@@ -129,31 +142,38 @@ class VirtualScript(Settings, frozen=True):
     limit_pC: Annotated[float, Meta(ge=1.0)] | None = None
 
     def __post_init__(self) -> None:
-        seconds = [row[0] for row in self.presses]
-        if self.presses and (len(seconds) < 2 or any(a >= b for a, b in pairwise(seconds))):
+        times_s = [row[0] for row in self.presses]
+        is_rising = all(time_s < next_time_s for time_s, next_time_s in pairwise(times_s))
+        if self.presses and not (len(times_s) >= 2 and is_rising):
             raise WrongKey("presses", "two rows or more with growing seconds", self.presses)
 
     def script(self, rate_Hz: float) -> Script | None:
-        """Interpolate the presses at a frame rate; return None if the presses are random.
+        """Create a script by linear interpolation between the rows of `presses` at the time of each frame.
 
         Args:
             rate_Hz: Number of frames per second, Hz.
+
+        Returns:
+            The script; None if the file has no rows, which means that the presses are random.
 
         Raises:
             SceneError: If there are too many frames.
         """
         if not self.presses:
             return None
-        row_s, row_x_mm, row_y_mm, row_force_N = np.array(self.presses).T
+        row_s, row_x_mm, row_y_mm, row_force_N = np.array(self.presses).T  # each of shape (rows,)
         start_s = row_s[0]
         end_s = row_s[-1]
         duration_s = end_s - start_s
-        if not duration_s * rate_Hz <= MAX_SCRIPT_FRAMES:
+        is_short_enough = duration_s * rate_Hz <= MAX_SCRIPT_FRAMES  # false for a rate of NaN
+        if not is_short_enough:
             raise SceneError(
                 f"script: expected at most {MAX_SCRIPT_FRAMES} frames, got {duration_s:g} s at {rate_Hz:g} Hz"
             )
         frame_s = np.arange(start_s, end_s, 1.0 / rate_Hz)
         force_N = np.interp(frame_s, row_s, row_force_N)
+
+        # A position is only defined while something touches.
         is_touch = force_N > 0.0
         x_mm = np.where(is_touch, np.interp(frame_s, row_s, row_x_mm), np.nan)
         y_mm = np.where(is_touch, np.interp(frame_s, row_s, row_y_mm), np.nan)
@@ -177,7 +197,7 @@ def wander(
     radius_mm: float = DEFAULT_RADIUS,
     force_range_N: tuple[float, float] = DEFAULT_PLAYED_FORCE_RANGE,
 ) -> Script:
-    """Create a script of random presses that move over the film. There are pauses between the presses.
+    """Create a script of random presses that move over the film, with a pause after each press.
 
     The position and the logarithm of the force vary smoothly within a press. The forces stay within the given range,
     because a forward map is only valid in a range of forces.
@@ -202,16 +222,20 @@ def wander(
         )
     rng = np.random.default_rng(seed)
     t_s = np.arange(round(seconds * rate_Hz)) / rate_Hz
-    position_mm = np.full(t_s.size, complex(np.nan, np.nan))  # x + i y
+    position_mm = np.full(t_s.size, complex(np.nan, np.nan))  # x + i y; NaN while nothing touches
     force_N = np.zeros(t_s.size)
+
+    # Each pass of the loop adds one press and the pause after this press.
     start_s = INITIAL_REST_S
     while start_s < seconds:
         end_s = start_s + rng.uniform(*PRESS_DURATION_S)
-        is_press = (t_s >= start_s) & (t_s < end_s)
-        press_s = t_s[is_press] - start_s
-        position_mm[is_press] = radius_mm * _random_path(rng, press_s)
-        force_level = _force_level(rng, press_s, end_s - start_s)  # from 0 to 1 on a logarithmic scale
-        force_N[is_press] = min_force_N * (max_force_N / min_force_N) ** force_level
+        is_in_press = (t_s >= start_s) & (t_s < end_s)
+        time_in_press_s = t_s[is_in_press] - start_s
+        position_mm[is_in_press] = radius_mm * _random_path(rng, time_in_press_s)
+
+        # A level of 0 is the smallest force, and a level of 1 is the largest force. The scale is logarithmic.
+        force_level = _force_level(rng, time_in_press_s, end_s - start_s)
+        force_N[is_in_press] = min_force_N * (max_force_N / min_force_N) ** force_level
         start_s = end_s + rng.uniform(*PAUSE_DURATION_S)
     return Script(position_mm.real, position_mm.imag, force_N, rate_Hz)
 
@@ -219,8 +243,8 @@ def wander(
 def _random_path(rng: np.random.Generator, t_s: Array) -> Complexes:
     """Draw a smooth random path inside the unit disk.
 
-    The path is the sum of a random starting point and three circular movements. The circles pass through the origin and
-    have random directions. Each movement begins at the origin and has a random speed.
+    The path is the sum of a random starting point and three circular movements. Each movement begins at the origin and
+    follows a circle through the origin. The direction of the centre of the circle and the speed are random.
 
     Args:
         rng: Source of the random numbers.
@@ -233,53 +257,65 @@ def _random_path(rng: np.random.Generator, t_s: Array) -> Complexes:
     start = start_distance * np.exp(2j * np.pi * rng.uniform())
 
     turns_per_s = rng.uniform(-0.5, 0.5, size=(3, 1))
-    circles = 0.25 * (np.exp(2j * np.pi * turns_per_s * t_s) - 1.0)  # shape (3, n)
-    directions = np.exp(2j * np.pi * rng.uniform(size=(3, 1)))
-    path = start + (directions * circles).sum(axis=0)
+    circles = 0.25 * (np.exp(2j * np.pi * turns_per_s * t_s) - 1.0)  # movements on circles of radius 0.25, shape (3, n)
+    rotations = np.exp(2j * np.pi * rng.uniform(size=(3, 1)))  # a factor of magnitude 1 rotates a circle
+    path = start + (rotations * circles).sum(axis=0)
 
-    # A distance r becomes r / (1 + r^8)^(1/8), which is less than 1, and nearly r if r is small.
+    # The path may leave the unit disk. The division changes a distance r from the centre into r / (1 + r^8)^(1/8),
+    # which is less than 1, and nearly r if r is small.
     divisor = (1.0 + np.abs(path) ** 8) ** (1 / 8)
     return np.asarray(path / divisor)
 
 
 def _force_level(rng: np.random.Generator, t_s: Array, duration_s: float) -> Array:
-    """Draw the force of a press as a level from 0 (smallest force) to 1 (largest force), shape (n,).
+    """Draw the force of a random press as a level from 0 (smallest force) to 1 (largest force).
+
+    The level is a slow sine around a random mean, multiplied by a smooth ramp at the beginning and at the end.
 
     Args:
         rng: Source of the random numbers.
         t_s: Times since the start of the press, shape (n,), s.
         duration_s: Duration of the press, s.
+
+    Returns:
+        Level at each time, shape (n,), dimensionless.
     """
-    # A slow sine around a random level, with a smooth ramp at the beginning and at the end of the press.
     mean_level = rng.uniform()
     frequency_Hz = rng.uniform(0.3, 1.0)
     phase_turns = rng.uniform()
     level = mean_level + 0.15 * np.sin(2.0 * np.pi * (frequency_Hz * t_s + phase_turns))
-    ramp = np.clip(np.minimum(t_s, duration_s - t_s) / RAMP_S, 0.0, 1.0)
-    smooth_ramp = ramp * ramp * (3.0 - 2.0 * ramp)
+
+    # The ramp rises from 0 to 1 within `RAMP_S` after the beginning, and falls within `RAMP_S` before the end.
+    time_to_edge_s = np.minimum(t_s, duration_s - t_s)  # time since the beginning or until the end
+    ramp = np.clip(time_to_edge_s / RAMP_S, 0.0, 1.0)
+    smooth_ramp = ramp * ramp * (3.0 - 2.0 * ramp)  # a cubic polynomial with the slope 0 at both ends
     return np.clip(level, 0.0, 1.0) * smooth_ramp
 
 
 def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
-    """Return bytes of which a fraction is damaged.
+    """Damage a random fraction of the bytes, in the same way as a faulty cable.
 
     A damaged byte has one flipped bit, is dropped, or is followed by a random byte, each with the same probability.
 
     Args:
-        data: The bytes.
+        data: The bytes before the damage.
         fraction: Mean fraction of the bytes that are damaged, dimensionless.
         rng: Source of the random numbers.
+
+    Returns:
+        The bytes after the damage.
     """
     pieces = [bytes([byte]) for byte in data]
-    for position in np.flatnonzero(rng.random(len(data)) < fraction).tolist():
+    is_damaged = rng.random(len(data)) < fraction
+    for position in np.flatnonzero(is_damaged).tolist():
         byte = data[position]
-        damage = int(rng.integers(3))
+        kind_of_damage = int(rng.integers(3))
         random_byte = int(rng.integers(256))
-        if damage == 0:
+        if kind_of_damage == 0:  # one bit is flipped
             flipped_bit = 1 << (random_byte % BITS_PER_BYTE)
             pieces[position] = bytes([byte ^ flipped_bit])
-        elif damage == 1:
+        elif kind_of_damage == 1:  # the byte is dropped
             pieces[position] = b""
-        else:
+        else:  # the byte is followed by a random byte
             pieces[position] = bytes([byte, random_byte])
     return b"".join(pieces)

@@ -1,13 +1,13 @@
-"""Virtual sensor, which is a pseudo-terminal that sends the frames of a board. The charges come from any forward map.
+"""Virtual sensor, which sends the frames of a simulated board through a pseudo-terminal.
 
-The touch charges of the whole script are computed before the first frame is sent. The amplifier, whose output depends
-on earlier charges, processes the charges block by block. Frames are written at absolute times, so the frame rate does
-not drift. If the computer is too busy to write a frame in time, all later frames are postponed, as if the board had
-paused. Otherwise the delayed frames would be sent in one burst, which overflows the buffer of the port and looks like a
-higher frame rate.
+A forward map computes the touch charges of the whole script before the first frame is sent. The amplifier then
+processes these charges block by block in the order of time, because its output depends on earlier charges. Frames are
+written at absolute times, so the frame rate does not drift. If the computer is too busy to write a frame in time, all
+later frames are postponed, as if the board had paused. If the later frames were not postponed, the late frames would be
+sent in one burst, which would overflow the buffer of the port and look like a higher frame rate.
 
-The sensor never waits for a reader. A frame that does not fit into the buffer of the port is discarded and counted, and
-the reader receives a gap in the frame numbers.
+The sensor never waits for a reader. A frame that does not fit into the buffer of the port is discarded and counted. The
+reader then receives frames with a gap in the frame numbers.
 """
 
 import array
@@ -51,25 +51,32 @@ class PseudoPort:
             PortError: If the operating system has no pseudo-terminals. Windows has none.
         """
         tty, self._fcntl, self._termios = posix_modules()
-        # The reader's end also stays open here, so that the port is not hung up when a reader closes it.
+        # The file descriptor of the reader's end also stays open here. Otherwise the operating system would hang up the
+        # port when a reader closes it.
         self._writer, self._reader = os.openpty()
-        tty.setraw(self._reader)
-        os.set_blocking(self._writer, False)
+        tty.setraw(self._reader)  # in raw mode, the operating system passes all bytes on unchanged
+        os.set_blocking(self._writer, False)  # a full buffer raises BlockingIOError instead of delaying the sensor
         self.url = os.ttyname(self._reader)
 
     def write_whole(self, data: bytes) -> bool:
-        """Write data without waiting. If the buffer has not enough room for all data, nothing is written.
+        """Write data without waiting. If the buffer does not have enough room for all data, nothing is written.
+
+        Args:
+            data: The bytes of one frame.
 
         Returns:
-            Whether the data were written.
+            Whether all data were written.
         """
-        waiting_bytes = array.array("i", [0])
-        self._fcntl.ioctl(self._reader, self._termios.FIONREAD, waiting_bytes)
-        if waiting_bytes[0] + len(data) > PORT_BUFFER_BYTES:
+        # The operating system writes the number of bytes that the reader has not read yet into this array.
+        unread_bytes = array.array("i", [0])
+        self._fcntl.ioctl(self._reader, self._termios.FIONREAD, unread_bytes)
+        if unread_bytes[0] + len(data) > PORT_BUFFER_BYTES:
             return False
-        with contextlib.suppress(BlockingIOError):
-            return os.write(self._writer, data) == len(data)
-        return False
+        try:
+            written_bytes = os.write(self._writer, data)
+        except BlockingIOError:  # the buffer is full
+            return False
+        return written_bytes == len(data)
 
     def received(self) -> bytes:
         """Return the bytes that the reader has sent since the last call, without waiting."""
@@ -78,7 +85,7 @@ class PseudoPort:
         return b""
 
     def close(self) -> None:
-        """Close the pseudo-terminal. For the reader, closing the port has the same effect as unplugging the cable."""
+        """Close the pseudo-terminal. For the reader, closing the port is the same as unplugging the cable."""
         os.close(self._writer)
         os.close(self._reader)
 
@@ -116,9 +123,9 @@ Encode = Callable[[Frame], bytes]
 """Frame format: function from a frame to its bytes."""
 
 MAX_LATENESS_S = 0.05
-"""Largest delay of a frame after which the next frames are sent at their times nevertheless, s.
+"""Largest delay of a frame that does not postpone the later frames, s.
 
-After a larger delay, all later frames are postponed by this delay.
+After a larger delay, all later frames are postponed by the delay.
 """
 
 BLOCK_S = 0.5
@@ -231,7 +238,7 @@ class VirtualSensor:
         self.unplugged = 0
         self.paused_s = 0.0
         self._frame_count = 0
-        self._script_start = 0  # number of the frame with which the script began
+        self._first_frame_of_script = 0  # number of the frame with which the script began
         self._sent_s = np.full(SEQ_MODULUS, np.nan)  # time at which the latest frame with each counter was sent
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
@@ -256,7 +263,7 @@ class VirtualSensor:
         return self._frame_count - self.withheld - self.lost
 
     def use(self, charges: Charges, script: Script, charges_per_K: Charges | None = None) -> None:
-        """Continue with another script of the same frame rate, from its start. The amplifier keeps its state.
+        """Play another script of the same frame rate from its start. The amplifier keeps its state.
 
         The change takes effect within `BLOCK_S`.
 
@@ -273,87 +280,92 @@ class VirtualSensor:
         self._next_script = (script, _clean_charges(charges, script), clean_pC_per_K)
 
     def frames(self) -> Iterator[bytes]:
-        """Yield the bytes of each frame without waiting for its time.
+        """Compute the frames of the script, and yield the bytes of each frame without waiting until the frame is due.
 
-        The bytes are empty if the frame is lost by a fault.
+        The bytes are empty if the frame is lost because of a fault.
 
-        The frames are computed in blocks. A new script takes effect at the beginning of a block, and the last script is
-        repeated without end.
+        The charges are computed in blocks of frames. A new script takes effect at the beginning of a block. The script
+        is repeated without end until another script is given.
         """
         self.lost = 0
         self.corrupted = 0
-        self._script_start = 0
+        self._first_frame_of_script = 0
         block_size = max(1, round(BLOCK_S * self._script.rate_Hz))
-        for first_number in itertools.count(step=block_size):
+        for first_frame_of_block in itertools.count(step=block_size):
             if self._next_script is not None:
                 self._script, self._clean_pC, self._clean_pC_per_K = self._next_script
                 self._next_script = None
-                self._script_start = first_number
-            first_row = first_number - self._script_start
+                self._first_frame_of_script = first_frame_of_block
+            first_row = first_frame_of_block - self._first_frame_of_script
             rows = range(first_row, first_row + block_size)
-            clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")  # begins again after the last row
-            measured_pC = self._measured(clean_pC, rows)
-            sent_pC = measured_pC + self._offset_pC
-            for number, charge_pC in enumerate(sent_pC.tolist(), first_number):
-                yield self._frame(number, tuple(charge_pC))
+            sent_pC = self._measured_charges(rows) + self._offset_pC
+            for frame_number, charge_pC in enumerate(sent_pC.tolist(), start=first_frame_of_block):
+                yield self._frame_bytes(frame_number, tuple(charge_pC))
 
-    def _measured(self, clean_pC: Array, rows: range) -> Array:
-        """Return the measured charges of a block of frames, shape (n, electrodes), pC.
+    def _measured_charges(self, rows: range) -> Array:
+        """Return the output of the amplifier for a block of frames, shape (n, electrodes), pC.
 
         Args:
-            clean_pC: Touch charges of the block, shape (n, electrodes), pC.
-            rows: Rows of the script, which is repeated without end.
+            rows: Rows of the script for the n frames. After its last row, the script begins again at row 0.
         """
+        clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")  # touch charges without noise
         if self._noise is None:
             return clean_pC
         if self._clean_pC_per_K is None:
             return self._noise(clean_pC, self._rng)
-        return self._noise(clean_pC, self._rng, self._clean_pC_per_K.take(rows, axis=0, mode="wrap"))
+        clean_pC_per_K = self._clean_pC_per_K.take(rows, axis=0, mode="wrap")  # their changes per kelvin
+        return self._noise(clean_pC, self._rng, clean_pC_per_K)
 
-    def _frame(self, number: int, charge_pC: tuple[float, ...]) -> bytes:
-        """Return the bytes of a frame after the faults; empty if a fault loses the frame.
+    def _frame_bytes(self, frame_number: int, charge_pC: tuple[float, ...]) -> bytes:
+        """Encode a frame, and apply the faults of the transmission to its bytes.
 
         Args:
-            number: Number of the frame since the start.
-            charge_pC: Charges, pC.
+            frame_number: Number of the frame since the start of the sensor.
+            charge_pC: Charge of each electrode, pC.
+
+        Returns:
+            The bytes that the sensor sends; empty if the frame is lost because of a fault.
         """
         faults = self._faults
-        is_silent = faults.is_silent(self._script_time_s(number))
-        # No random number is drawn if no frames are lost, so that the noise of the seed stays the same.
+        is_silent = faults.is_silent(self._script_time_s(frame_number))
+        # If no frames are to be lost, no random number is drawn here, because this would change the noise that belongs
+        # to the seed.
         if is_silent or (faults.lose_share and self._rng.random() < faults.lose_share):
             self.lost += 1
             return b""
         device_us_per_s = 1e6 + faults.clock_ppm  # an error of 1 ppm is 1 us in a second
-        t_us = round(number / self._script.rate_Hz * device_us_per_s) % self._t_us_modulus
-        seq = number if self._request is None else self._answer_count
-        data = self._encode(Frame(seq % self._seq_modulus, t_us, charge_pC))
+        t_us = round(frame_number / self._script.rate_Hz * device_us_per_s) % self._t_us_modulus
+        # A board that waits for requests only counts the frames that it sends as answers.
+        counter = frame_number if self._request is None else self._answer_count
+        data = self._encode(Frame(counter % self._seq_modulus, t_us, charge_pC))
         if not faults.corrupt_share:
             return data
-        damaged = corrupt(data, faults.corrupt_share, self._rng)
-        if damaged != data:
+        damaged_data = corrupt(data, faults.corrupt_share, self._rng)
+        if damaged_data != data:
             self.corrupted += 1
-        return damaged
+        return damaged_data
 
-    def _script_time_s(self, number: int) -> float:
+    def _script_time_s(self, frame_number: int) -> float:
         """Return the time of a frame since the start of the script, s."""
-        return (number - self._script_start) / self._script.rate_Hz
+        return (frame_number - self._first_frame_of_script) / self._script.rate_Hz
 
     def truth(self, seq: int) -> Truth:
-        """Return the true press in the latest frame with a frame counter.
+        """Return the true press in the latest frame with a given frame counter.
 
         Args:
-            seq: Number of the frame since the start, modulo `SEQ_MODULUS`.
+            seq: The frame counter: number of the frame since the start, modulo `SEQ_MODULUS`.
 
         Raises:
             SceneError: If no frame with this counter has been played.
         """
+        # Several frames may have this counter, because the counter wraps. Find the latest of these frames.
         latest_number = self._frame_count - 1
         frames_since = (latest_number - seq) % SEQ_MODULUS
-        number = latest_number - frames_since
-        if number < 0 or not 0 <= seq < SEQ_MODULUS:
+        frame_number = latest_number - frames_since
+        if frame_number < 0 or not 0 <= seq < SEQ_MODULUS:
             raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest_number, SEQ_MODULUS - 1)}")
         script = self._script
-        row = (number - self._script_start) % len(script)
+        row = (frame_number - self._first_frame_of_script) % len(script)  # the script is repeated without end
         return Truth(
             x_mm=float(script.x_mm[row]),
             y_mm=float(script.y_mm[row]),
@@ -363,7 +375,7 @@ class VirtualSensor:
         )
 
     def __enter__(self) -> Self:
-        """Open the port and start to play.
+        """Open the port, and start the thread that writes the frames.
 
         Raises:
             InputError: If the link cannot be created.
@@ -374,6 +386,7 @@ class VirtualSensor:
         self.paused_s = 0.0
         self._unanswered = b""
         self._answer_count = 0
+        # After an outage, the port has another name. The reader therefore needs a link whose name stays the same.
         if self._link is None and self._faults.unplug_every_s > 0.0:
             self._folder = tempfile.TemporaryDirectory(prefix="isocharge-")
             self._link = Path(self._folder.name) / "film"
@@ -384,35 +397,45 @@ class VirtualSensor:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop playing and close the port."""
+        """Stop the thread that writes the frames, close the port, and remove a temporary link."""
         self._stop.set()
         if self._writer is not None:
             self._writer.join()
         self._close_port()
         self._writer = None
-        if self._folder is not None:
+        if self._folder is not None:  # the folder contains the temporary link
             self._folder.cleanup()
             self._folder = None
             self._link = None
 
     def _play(self) -> None:
-        """Write each frame at its time until the sensor is stopped."""
+        """Write each frame when it is due, until the sensor is stopped.
+
+        A frame that is late by more than `MAX_LATENESS_S` postpones all later frames. During an outage, the port is
+        closed and the frames are discarded.
+        """
         start_s = time.perf_counter()
-        for number, data in enumerate(self.frames()):
-            due_s = start_s + self.paused_s + number / self._script.rate_Hz
-            if self._stop.wait(max(0.0, due_s - time.perf_counter())):
+        for frame_number, data in enumerate(self.frames()):
+            due_s = start_s + self.paused_s + frame_number / self._script.rate_Hz
+            is_stopped = self._stop.wait(max(0.0, due_s - time.perf_counter()))
+            if is_stopped:
                 return
             lateness_s = time.perf_counter() - due_s
             if lateness_s > MAX_LATENESS_S:
                 self.paused_s += lateness_s
-            self._sent_s[number % SEQ_MODULUS] = time.perf_counter()
+
             # Count the frame before it is written, because a reader may ask for its truth as soon as it has the frame.
-            self._frame_count = number + 1
-            if self._faults.is_unplugged(self._script_time_s(number)):
+            self._sent_s[frame_number % SEQ_MODULUS] = time.perf_counter()
+            self._frame_count = frame_number + 1
+
+            # Close the port at the beginning of an outage, and open it again at the end.
+            if self._faults.is_unplugged(self._script_time_s(frame_number)):
                 self._close_port()
             elif self._port is None:
                 self._open_port()
                 self.unplugged += 1
+
+            # Read the requests even if the frame is lost (empty data), so that they do not fill the buffer of the port.
             is_requested = self._port is not None and self._take_request(self._port)
             if not data or self._port is None:
                 continue
@@ -427,24 +450,35 @@ class VirtualSensor:
         return self._request
 
     def _take_request(self, port: PseudoPort) -> bool:
-        """Read what the reader has sent, and return whether it contains a request since the last call.
+        """Read the bytes that the reader has sent, and return whether they complete a request since the last call.
 
-        A sensor that sends all frames ignores what the reader sends, and the result is true.
+        Several requests since the last call count as one request. For a sensor that sends all frames without requests,
+        the bytes are ignored, and the result is true.
+
+        Args:
+            port: The open port.
         """
-        received = port.received()  # otherwise the buffer would become full, and a reader that sends would wait forever
-        if self._request is None:
+        # The bytes are read even if no request is needed. Otherwise the buffer would become full, and a reader that
+        # sends bytes would wait forever.
+        received = port.received()
+        request = self._request
+        if request is None:
             return True
         self._unanswered += received
-        start = self._unanswered.rfind(self._request)
-        if start < 0:
-            self._unanswered = self._unanswered[-len(self._request) :]
+        request_start = self._unanswered.rfind(request)
+        is_found = request_start >= 0
+        if not is_found:
+            self._unanswered = self._unanswered[-len(request) :]  # may contain the beginning of a request
             return False
-        self._unanswered = self._unanswered[start + len(self._request) :]
+        self._unanswered = self._unanswered[request_start + len(request) :]
         self._answer_count += 1
         return True
 
     def _open_port(self) -> PseudoPort:
-        """Open the port, create the link, and return the port.
+        """Open a new port. If the sensor has a link, let the link point to the new port.
+
+        Returns:
+            The open port.
 
         Raises:
             InputError: If the link cannot be created.
@@ -462,7 +496,7 @@ class VirtualSensor:
         return port
 
     def _close_port(self) -> None:
-        """Remove the link and close the port. If the port is closed already, do nothing."""
+        """Remove the link to the port, and close the port. If the port is closed already, do nothing."""
         if self._port is None:
             return
         if self._link:
@@ -472,18 +506,21 @@ class VirtualSensor:
 
 
 def _clean_charges(forward: Charges, script: Script) -> Array:
-    """Compute the touch charges of a script, shape (n, electrodes), pC. They are zero while nothing touches.
+    """Compute the touch charges of a script without noise.
 
     Args:
-        forward: Forward map: charges of contacts.
-        script: The presses.
+        forward: Forward map: function from contacts (x, y, force), shape (k, 3), to charges, shape (k, electrodes), pC.
+        script: Position and force in each of n frames.
+
+    Returns:
+        Charges, shape (n, electrodes), pC; zero in frames in which nothing touches.
 
     Raises:
         SceneError: If the forward map returns charges of another shape, or charges that are not finite.
     """
     is_touch = script.touching
     touch_count = int(is_touch.sum())
-    contacts = np.column_stack([script.x_mm, script.y_mm, script.force_N])
+    contacts = np.column_stack([script.x_mm, script.y_mm, script.force_N])  # shape (n, 3)
     touch_pC = forward(contacts[is_touch])
     has_expected_shape = touch_pC.ndim == 2 and len(touch_pC) == touch_count
     if not has_expected_shape or not np.isfinite(touch_pC).all():

@@ -1,1 +1,1 @@
-"""Commands of `isocharge simulate`, one module for each command."""
+"""Commands of the group `isocharge simulate`, with one module for each command."""

@@ -1,4 +1,4 @@
-"""The command group `isocharge simulate`. The module of a command is imported when the command is called."""
+"""Command group `isocharge simulate`, which imports the module of a command only when the command is called."""
 
 from isocharge.cli.shared.lazy import LazyCommand, lazy_group
 
@@ -22,7 +22,7 @@ simulate_app = lazy_group(
         ),
         "design": LazyCommand(
             "isocharge.cli.simulate.design:design_command",
-            "Search the electrode positions with the smallest position errors.",
+            "Search for the electrode positions with the smallest position errors.",
             extra="design",
         ),
     },

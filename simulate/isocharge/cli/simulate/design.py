@@ -1,4 +1,4 @@
-"""Command `isocharge simulate design`: search of the electrode positions."""
+"""Command `isocharge simulate design`, which searches for electrode positions with small position errors."""
 
 from typing import Annotated
 
@@ -86,13 +86,14 @@ def design_command(
     workers: WorkersOption = None,
     fresh: FreshOption = False,
 ) -> None:
-    """Search the electrode positions with the smallest position errors. Write a sensor file, drawings and the errors.
+    """Search for the electrode positions with the smallest position errors.
 
-    The errors are Cramer-Rao limits in mm, with probe radius, pretension and gains as nuisance parameters. If the
-    search is interrupted, the same command resumes it.
+    The command writes a sensor file, drawings and the errors into a new folder. The errors are Cramer-Rao limits in mm.
+    Probe radius, pretension and gains are uncertain unless --known is given. If the search is interrupted, the same
+    command resumes the search.
 
-    With --guard, the position of one further square is searched, and the errors in the folder are those of the noise
-    alone. The folder then also contains pictures of the mirror region without and with this square.
+    With --guard, the command searches for the position of one further square. The errors in the folder are then caused
+    by the noise alone. The folder also contains pictures of the mirror region without and with this square.
 
     Example: isocharge simulate design four-25um-biaxial --electrodes 4 --radius 15 -o over-15mm
 
@@ -126,7 +127,8 @@ def design_command(
     )
     warn_of_stress(case.sensor.film, [footprint], force, stress_limit)
 
-    # Search, and write the files. An interrupted search is only resumed if all values of `identity` are unchanged.
+    # Search for the positions, and write the files. An interrupted search is resumed only if all values of `identity`
+    # are unchanged.
     identity = {
         "made_by": code_fingerprint(),
         "sensor": sensor_to_dict(case.sensor),
@@ -158,7 +160,9 @@ def design_command(
 
 
 def refuse_search_options(*, electrodes: int | None, keep: str | None, goal: str, known: bool) -> None:
-    """Refuse options that have no meaning with `--guard`, which keeps all electrodes and minimises another quantity.
+    """Raise an error if options are given that have no meaning together with `--guard`.
+
+    With `--guard`, all electrodes are kept, and the search minimises the share of presses that are not noticed.
 
     Args:
         electrodes: Value of `--electrodes`; None if it was not given.
@@ -185,16 +189,21 @@ def refuse_search_options(*, electrodes: int | None, keep: str | None, goal: str
 
 
 def _guard_table(guard_design: GuardDesign) -> str:
-    """Return a table with the position of the guard electrode.
+    """Return the table that the command prints for a guard electrode.
 
-    The table also lists the share of the presses outside the working area that are not noticed, and the limits of the
-    position error inside it, without and with this electrode.
+    The table contains the position of the guard electrode. For the sensor without and with the guard electrode, the
+    table also contains the share of the presses outside the working area that are not noticed, and the limits of the
+    position error in the working area.
+
+    Args:
+        guard_design: Result of the search for a guard electrode.
     """
     x, y = guard_design.guard.centre
     lines = [
         f"{guard_design.guard.name:<10} {x:9.3f} {y:9.3f} mm",
         "                 not noticed   position error limit, mm: worst      rms",
     ]
+    # The widths of the columns align the numbers with the words of the first two lines.
     for title, region, limits in (
         ("without guard", guard_design.region_before, guard_design.limits_before),
         ("with guard", guard_design.region_after, guard_design.limits_after),
@@ -205,20 +214,22 @@ def _guard_table(guard_design: GuardDesign) -> str:
 
 
 def _table(result: Design) -> str:
-    """Return a table of the electrode positions, and of the errors before and after the design.
+    """Return the table that the command prints for a new layout.
+
+    The table contains the positions of the electrodes, and the position errors of the initial and the new layout. The
+    errors of an initial sensor with fewer than three electrodes are unknown and are omitted.
 
     Args:
-        result: Result of the search. It has no errors before the design if the initial sensor has fewer than three
-            electrodes.
+        result: Result of the design.
     """
     lines = []
     for electrode in result.sensor.electrodes:
         x, y = electrode.centre
         lines.append(f"{electrode.name:<10} {x:9.3f} {y:9.3f} mm")
 
-    # The errors have one line for the noise alone, and one line for noise and nuisances.
+    # Each layout has one line with the errors of the noise alone, and one line with the errors of noise and nuisances.
     lines.append("position error limit, mm     worst      rms")
-    for name, errors in (("before", result.before), ("after", result.after)):
+    for name, errors in (("before", result.errors_before), ("after", result.errors_after)):
         if errors is None:
             continue
         for condition, statistics in errors.to_dict().items():
@@ -230,9 +241,12 @@ def _table(result: Design) -> str:
 
 
 def _error_text(error: float, radius: float) -> str:
-    """Format a position error (mm) of presses within a disk whose radius (mm) is given.
+    """Return a position error as text, or "folds" if the error is not smaller than the radius of the disk.
 
-    If the error is not smaller than the radius, the charges do not determine the position, because the charge map has a
-    fold.
+    With such a large error, the charges do not determine the position, because the charge map has a fold.
+
+    Args:
+        error: Position error of presses within the disk, mm.
+        radius: Radius of the disk, mm.
     """
     return f"{error:.3f}" if error < radius else "folds"

@@ -1,4 +1,4 @@
-"""Command `isocharge simulate identify`: error limits, folds and working area of a sensor."""
+"""Command `isocharge simulate identify`, which computes error limits, folds and the working area of a sensor."""
 
 import json as json_module
 from math import inf
@@ -56,8 +56,8 @@ def identify_command(
     """Compute how well the charges determine a press: error limits over the film, ambiguities and working area.
 
     The errors are Cramer-Rao limits, in mm for the position and in percent for the force. No unbiased method has
-    smaller errors. The mirror region lies outside the working area. A press in the mirror region has the same charges
-    as a press inside the working area, so that the charges do not show where the press is.
+    smaller errors. The command also computes the mirror region, which lies outside the working area. A press in the
+    mirror region has the same charges as a press inside the working area and therefore cannot be noticed.
 
     Example: isocharge simulate identify three-25um-biaxial --probe circle:1.0 --error 0.5 -o limits
     """
@@ -66,7 +66,7 @@ def identify_command(
     if not 0.0 < error < inf:
         raise InputError(f"--error: expected a positive number of mm, got {error}")
     described_sensor = load_sensor(sensor)
-    footprint = parse_probe(probe)  # the shape of the contact area
+    footprint = parse_probe(probe)  # the probe, whose footprint is the area of contact
     noise_level = noise_model(noise)
     with shown_progress(), executor_for(workers, None) as pool:
         identification = identify(
@@ -94,7 +94,7 @@ def identify_command(
 
 
 def _table(results: dict[str, Any]) -> str:
-    """Return a table of the error statistics within the working area. Each force has one line.
+    """Return the table that the command prints, with the error statistics within the working area for each force.
 
     Args:
         results: Result of `Identification.to_dict`.
@@ -104,7 +104,7 @@ def _table(results: dict[str, Any]) -> str:
     for errors in results["limits_in_working_area"]:
         force = f"{errors['force_N']:8g} N"
 
-        # The widths align the numbers with the words median, rms and worst of the header.
+        # The widths of the columns align the numbers with the words "median", "rms" and "worst" of the first line.
         position_median = f"{errors['position_median_mm']:25.3f}"
         position_rms = f"{errors['position_rms_mm']:6.3f}"
         position_worst = f"{errors['position_worst_mm']:6.3f}"

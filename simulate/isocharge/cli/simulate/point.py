@@ -1,4 +1,4 @@
-"""Command `isocharge simulate point`: charges and deflection of one press."""
+"""Command `isocharge simulate point`, which computes the charges and the deflection of one press."""
 
 from dataclasses import replace
 from math import isfinite
@@ -124,9 +124,14 @@ def point_command(
 
 
 def _cautions(equilibrium: Equilibrium, accuracy: float) -> list[str]:
-    """Return a list with a warning if the estimated error of the charges exceeds the required accuracy.
+    """Return warnings about the estimated error of the charges of a press.
 
-    Otherwise the list is empty.
+    Args:
+        equilibrium: Equilibrium of the film under the press.
+        accuracy: Required relative error of the charges, dimensionless.
+
+    Returns:
+        A list with one warning if the estimated error exceeds the required error; otherwise an empty list.
     """
     error = estimated_error(equilibrium)
     if not isfinite(error):
@@ -137,7 +142,11 @@ def _cautions(equilibrium: Equilibrium, accuracy: float) -> list[str]:
 
 
 def _table(report: dict[str, Any]) -> str:
-    """Return the text that the command prints about a press: charges, side force, deflection, theory and solver."""
+    """Return the text that the command prints: charges, side force, deflection, theory and solver.
+
+    Args:
+        report: Results by the names of the JSON output. The side force is contained only if it is not zero.
+    """
     lines = [f"charge {name:<10} {charge:10.2f} pC" for name, charge in report["charge_pC"].items()]
     if "side_force_N" in report:
         side_x, side_y = report["side_force_N"]
@@ -152,5 +161,5 @@ def _table(report: dict[str, Any]) -> str:
 
 
 def _percent(error: float | None) -> str:
-    """Format a relative error in percent; None stands for an unknown error."""
+    """Return a relative error as text in percent, or "unknown" if the error is None."""
     return "unknown" if error is None else f"{error:.2%}"

@@ -1,4 +1,4 @@
-"""Command `isocharge simulate sweep`: dataset of many presses."""
+"""Command `isocharge simulate sweep`, which writes a dataset of many simulated presses."""
 
 import json as json_module
 from enum import StrEnum
@@ -30,26 +30,30 @@ from isocharge.simulate import Dataset, Sweep, load_sensor, parse_probe, read_da
 from isocharge.simulate.sensor.probe import PROBE_HELP
 
 TABLES = (".csv", ".parquet")
-"""Suffixes of tables of presses."""
+"""Suffixes of the files that contain a table of presses."""
 
 SOLVER_POSITION_STD_mm = 0.01
-"""Standard deviation of the position in tables of simulated presses, mm. It corresponds to a solver error of 0.05 % of
-the charge."""
+"""Standard deviation of the position in tables of simulated presses, mm.
+
+This value corresponds to an error of the solver of 0.05 % of the charge.
+"""
 
 SOLVER_FORCE_STD = 1e-3
-"""Relative standard deviation of the force in tables of simulated presses, dimensionless. It corresponds to a solver
-error of 0.05 % of the charge."""
+"""Relative standard deviation of the force in tables of simulated presses, dimensionless.
+
+This value corresponds to an error of the solver of 0.05 % of the charge.
+"""
 
 
 class Orientation(StrEnum):
-    """Orientation of the probe in the presses of a sweep."""
+    """Values of the option `--orientation`, for the orientation of the probe in the presses of a sweep."""
 
     fixed = "fixed"
     random = "random"
 
 
 class Sampling(StrEnum):
-    """Sampling of the positions and forces of a sweep."""
+    """Values of the option `--sampling`, for the sampling of the positions and forces of a sweep."""
 
     sobol = "sobol"
     random = "random"
@@ -90,8 +94,8 @@ def sweep_command(
 ) -> None:
     """Simulate many presses at different positions and forces, and write their charges as a dataset for training.
 
-    If the run is interrupted, its finished parts remain in DIR.part. The same command then resumes the run and writes
-    the same bytes as an uninterrupted run.
+    If the run is interrupted, its finished parts remain in DIR.part. The same command then resumes the run. The
+    resulting files have the same bytes as those of a run without interruption.
 
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
@@ -123,12 +127,12 @@ def sweep_command(
 
 
 def _check_table(table: Path, folder: Path, samples: int, *, has_one_orientation: bool) -> None:
-    """Check before the sweep that its presses can be written as a table.
+    """Raise an error if the presses of a sweep cannot be written as a table, before the sweep starts.
 
     Args:
-        table: CSV or Parquet file.
-        folder: Folder of the dataset beside the table.
-        samples: Number of presses.
+        table: Path of the table, a CSV or Parquet file.
+        folder: Folder of the dataset, which is written beside the table.
+        samples: Number of presses of the sweep.
         has_one_orientation: Whether all presses have the same probe in the same orientation.
 
     Raises:
@@ -154,7 +158,10 @@ def _check_table(table: Path, folder: Path, samples: int, *, has_one_orientation
 
 
 def _presses(dataset: Dataset) -> MeasuredPresses:
-    """Convert the presses of a dataset into the form of measured presses."""
+    """Convert the simulated presses of a dataset into measured presses with small uncertainties.
+
+    The row numbers start at 1.
+    """
     samples = dataset.samples
     count = len(samples)
     return MeasuredPresses(

@@ -1,1 +1,1 @@
-"""Drawings of electrode layouts as DXF and SVG files, straight leads, and a reader of DXF drawings with electrodes."""
+"""Writer of drawings of electrode layouts (DXF and SVG), and reader of electrodes from DXF drawings."""

@@ -1,4 +1,4 @@
-"""Writer of the folder of a design: the sensor file, the drawings, the numerical results and a picture."""
+"""Writer of the folder of a design, which contains the sensor file, the drawings, the results and pictures."""
 
 import json
 from pathlib import Path
@@ -17,20 +17,21 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 
 
 def write_design(design: Design, folder: Path) -> None:
-    """Write the files `sensor.toml`, `layout.svg`, `layout.dxf`, `design.json` and `design.png` into a new folder.
+    """Write a designed layout into a new folder.
 
-    The files of two equal designs are equal byte by byte.
+    The files are `sensor.toml`, `layout.svg`, `layout.dxf`, `design.json`, and the picture `design.png` of the position
+    errors. Equal designs result in files with equal bytes.
 
     Args:
-        design: Design to write.
-        folder: Folder to create.
+        design: Result of the design.
+        folder: Folder that is created.
 
     Raises:
         OutputExists: If the folder already exists.
         OutputError: If the files cannot be written.
     """
     case = design.case
-    errors = design.after.to_dict()["with_nuisances"]  # of the new layout
+    errors = design.errors_after.to_dict()["with_nuisances"]
     sensor_comment = [
         f"Positions searched for {case.electrodes} electrodes over {case.radius:g} mm, goal {case.goal_name}:",
         f"lower limit of the position error {errors['worst_mm']:.3f} mm at worst, {errors['rms_mm']:.3f} mm rms.",
@@ -46,8 +47,8 @@ def write_guard_design(design: GuardDesign, folder: Path) -> None:
     `mirror.png` of the mirror region without and with the guard electrode.
 
     Args:
-        design: Design to write.
-        folder: Folder to create.
+        design: Result of the search for a guard electrode.
+        folder: Folder that is created.
 
     Raises:
         OutputExists: If the folder already exists.
@@ -73,11 +74,11 @@ def _write_folder(
     The drawings also show the leads, which are the conductors from the electrodes to the rim of the film.
 
     Args:
-        folder: Folder to create.
+        folder: Folder that is created.
         sensor: The designed sensor.
         sensor_comment: Comment lines at the beginning of the sensor file.
-        results: Content of `design.json`, to which a sentence about the leads is added.
-        pictures: PNG files, by file name.
+        results: Content of `design.json` without the sentence about the leads, which this function adds.
+        pictures: Contents of PNG files by file name.
     """
     leads = straight_leads(sensor)
     drawing = draw_layout(sensor, leads)
@@ -89,6 +90,7 @@ def _write_folder(
         "design.json": (json.dumps(all_results, indent=1, allow_nan=False) + "\n").encode(),
         **pictures,
     }
-    with new_folder(folder) as temporary_folder:  # is renamed when all files are complete
+    # The files are written into a temporary folder, which is renamed to `folder` when all files are complete.
+    with new_folder(folder) as temporary_folder:
         for name, content in files.items():
             write_whole(temporary_folder / name, content)

@@ -1,4 +1,7 @@
-"""Drawing of a layout in millimetres with one layer for each kind of object, written as DXF and as SVG."""
+"""Drawing of an electrode layout, and conversion of the drawing into DXF and SVG files.
+
+The unit of the drawing is the millimetre. There is one layer for each kind of object, such as electrodes and leads.
+"""
 
 import io
 from collections.abc import Iterator
@@ -20,13 +23,16 @@ with require("design"):
     from ezdxf.document import Drawing
 
 LAYERS = {"FILM": 7, "ELECTRODES": 1, "LEADS": 30, "RULER": 8, "NAMES": 8}
-"""Layers of the drawing and their colours in the AutoCAD colour index."""
+"""Names of the layers of a drawing, and their colours in the AutoCAD colour index."""
 
 BACK_COLOUR = 5
-"""Colour of the layer BACK, which exists only if the sensor file describes the metal of the back."""
+"""Colour of the layer BACK in the AutoCAD colour index.
+
+This layer exists only if the sensor file describes the metal of the back.
+"""
 
 RULER_LENGTH = 50.0
-"""Length of the ruler, mm. The ruler shows whether a print is to scale."""
+"""Length of the ruler in a drawing, mm. The ruler shows whether a print has the correct scale."""
 
 TICK_DISTANCE = 10.0
 """Distance between the ticks of the ruler, mm."""
@@ -38,35 +44,38 @@ RULER_OFFSET = 4.0
 """Distance of the ruler from the rim of the film, mm."""
 
 TEXT_HEIGHT = 2.0
-"""Height of the letters, mm."""
+"""Height of the letters in a drawing, mm."""
 
 MARGIN = 5.0
-"""Margin of the SVG drawing, mm."""
+"""Margin around an SVG drawing, mm."""
 
 
 def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
-    """Draw the film, the electrodes, their leads and names, and a ruler.
+    """Create a drawing of the film, the electrodes with their leads and names, and a ruler.
 
-    The electrodes are closed polylines at their nominal positions, and the leads are polylines with a width.
+    The electrodes are closed polylines at their nominal positions. The leads are polylines with a width.
 
     Args:
         sensor: Sensor with the layout.
         leads: Leads of the electrodes.
+
+    Returns:
+        The drawing as a DXF document.
     """
-    # Empty drawing in mm with one layer for each kind of object
+    # Create an empty drawing in mm with one layer for each kind of object.
     with _fixed_metadata():
         document = ezdxf.new("R2010")
     document.units = units.MM
     for name, colour in LAYERS.items():
         document.layers.add(name, color=colour)
 
-    # Film and leads
+    # Draw the film and the leads.
     space = document.modelspace()
     space.add_circle((0.0, 0.0), sensor.film.radius, dxfattribs={"layer": "FILM"})
     for path in leads.paths.values():
         space.add_lwpolyline(path.tolist(), dxfattribs={"layer": "LEADS", "const_width": leads.width})
 
-    # Electrodes may share the metal of the back, so equal polygons are drawn once.
+    # Draw the metal of the back. Electrodes may share it, so equal polygons are drawn only once.
     back_polygons = dict.fromkeys(polygon for electrode in sensor.electrodes for polygon in electrode.back)
     if back_polygons:
         document.layers.add("BACK", color=BACK_COLOUR)
@@ -84,15 +93,17 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
 
 
 def _draw_name(space: Any, electrode: Electrode) -> None:
-    """Write the name of an electrode at its rightmost corner. Letters that cannot be printed are replaced.
+    """Write the name of an electrode at the rightmost corner of its pad.
+
+    Characters that are not printable are replaced.
 
     Args:
         space: Model space of the drawing.
-        electrode: The electrode.
+        electrode: Electrode whose name is written.
     """
     letters = [letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in electrode.name]
     text = space.add_text("".join(letters), height=TEXT_HEIGHT, dxfattribs={"layer": "NAMES"})
-    rightmost_corner = max(electrode.corners)  # corners are compared by x first
+    rightmost_corner = max(electrode.corners)  # tuples (x, y) are compared by x first
     text.set_placement(rightmost_corner)
 
 
@@ -114,13 +125,14 @@ def _draw_ruler(space: Any, y: float) -> None:
     label = space.add_text(
         f"{RULER_LENGTH:g} mm along x, the drawn direction", height=TEXT_HEIGHT, dxfattribs=attributes
     )
-    # The label is placed by its baseline, and the space between ticks and letters is half the height of a letter.
+    # The position of the label is that of its baseline. The gap between the ticks and the letters is half the height of
+    # a letter.
     label_y = y - TICK_LENGTH - 1.5 * TEXT_HEIGHT
     label.set_placement((left_end, label_y))
 
 
 def to_dxf(document: Drawing) -> str:
-    """Return a drawing as the text of a DXF file. Equal drawings give equal texts."""
+    """Convert a drawing into the text of a DXF file. Equal drawings result in equal texts."""
     stream = io.StringIO()
     with _fixed_metadata():
         document.write(stream)
@@ -128,13 +140,13 @@ def to_dxf(document: Drawing) -> str:
 
 
 def to_svg(document: Drawing) -> str:
-    """Return the text of an SVG file that shows a drawing to scale. Letters are drawn as outlines."""
+    """Convert a drawing into the text of an SVG file with the correct scale. Letters become outlines."""
     backend = SVGBackend()
     configuration = Configuration(background_policy=BackgroundPolicy.WHITE)
     frontend = Frontend(RenderContext(document), backend, config=configuration)
     frontend.draw_layout(document.modelspace())
 
-    # A page without width and height gets the size of the drawing. The drawing is not scaled to fit the page.
+    # A width and a height of 0 mean that the page has the size of the drawing. The drawing is not scaled to the page.
     page = Page(0.0, 0.0, Units.mm, margins=Margins.all(MARGIN))
     text: str = backend.get_string(page, settings=Settings(fit_page=False))
     return text
@@ -142,7 +154,10 @@ def to_svg(document: Drawing) -> str:
 
 @contextmanager
 def _fixed_metadata() -> Iterator[None]:
-    """Write fixed dates and identifiers instead of current ones, so that equal drawings give equal files."""
+    """Return a context manager within which ezdxf writes fixed dates and identifiers.
+
+    Equal drawings therefore result in equal files.
+    """
     options: Any = ezdxf.options
     previous_setting = options.write_fixed_meta_data_for_testing
     options.write_fixed_meta_data_for_testing = True

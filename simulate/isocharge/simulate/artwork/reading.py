@@ -1,4 +1,4 @@
-"""Reader of electrodes from the layers of a DXF drawing."""
+"""Reader of electrodes from a DXF drawing."""
 
 from itertools import chain
 from pathlib import Path
@@ -19,30 +19,31 @@ with require("design"):
     from ezdxf.units import conversion_factor
 
 LINE_TYPES = ("LWPOLYLINE", "POLYLINE", "CIRCLE", "ELLIPSE", "SPLINE")
-"""DXF entities that may outline metal. Only the width of an LWPOLYLINE is read."""
+"""Types of DXF entities that may be outlines of metal. A width is only read from entities of the type LWPOLYLINE."""
 
 TEXT_TYPES = ("TEXT", "MTEXT")
-"""DXF entities that may name an electrode."""
+"""Types of DXF entities that may be the name of an electrode."""
 
 TOUCHING_DISTANCE = 1e-3
-"""Distance below which two polygons belong to the same electrode, mm."""
+"""Largest distance between two polygons that belong to the same electrode, mm."""
 
 ARC_TOLERANCE = 0.01
-"""Largest distance of an arc from the polygon that replaces it, mm."""
+"""Largest distance between an arc and the chords that replace the arc, mm."""
 
 
 def read_artwork(path: str | Path, layer: str = "ELECTRODES", back: str = "") -> tuple[Electrode, ...]:
-    """Read the electrodes of a DXF drawing, such as a drawing of `isocharge simulate design`.
+    """Read the electrodes of a DXF drawing, such as a drawing that `isocharge simulate design` wrote.
 
-    Closed lines are polygons, and open polylines with a width are traces. Polygons and traces that touch or overlap
-    form one electrode. The name of an electrode is the text that is nearest to the electrode. If two electrodes have
-    the same nearest text, the electrodes are named A, B, C and so on. A drawing without a unit is assumed to be in mm.
+    Closed lines are polygons of metal, and open polylines with a width are traces. Polygons and traces that touch or
+    overlap form one electrode. The name of an electrode is the text that is nearest to its first polygon. If two
+    electrodes have the same nearest text, all electrodes are named A, B, C and so on. If a drawing has no unit, its
+    unit is assumed to be mm.
 
     Args:
-        path: DXF file.
+        path: Path of the DXF file.
         layer: Name of the layer with the metal of the front.
-        back: Name of the layer with the metal of the back, which all electrodes share. If it is empty, the back is
-            covered with metal everywhere.
+        back: Name of the layer with the metal of the back, which all electrodes share. If it is empty, the whole back
+            is covered with metal.
 
     Raises:
         SensorError: If the file or a layer cannot be read, or if an object of a layer is not a line, crosses itself, or
@@ -52,11 +53,11 @@ def read_artwork(path: str | Path, layer: str = "ELECTRODES", back: str = "") ->
         document: Any = ezdxf.readfile(path)
     except (OSError, ezdxf.DXFError) as error:
         raise SensorError(f"{path}: expected a DXF file: {error}") from error
-    unit = InsertUnits(document.units or InsertUnits.Millimeters)  # zero means that the drawing has no unit
-    scale = conversion_factor(unit, InsertUnits.Millimeters)
+    unit = InsertUnits(document.units or InsertUnits.Millimeters)  # `units` is zero if the drawing has no unit
+    scale = conversion_factor(unit, InsertUnits.Millimeters)  # length of a unit of the drawing, mm
     groups = _touching_groups(_polygons(document, layer, scale, path))
 
-    # All electrodes share the polygons of the back.
+    # Read the polygons of the back, which all electrodes share.
     back_corners: tuple[Corners, ...] = ()
     if back:
         back_corners = tuple(polygon.corners for polygon in _polygons(document, back, scale, path))
@@ -70,37 +71,45 @@ def read_artwork(path: str | Path, layer: str = "ELECTRODES", back: str = "") ->
 
 
 def _touching_groups(polygons: list[Electrode]) -> list[list[Electrode]]:
-    """Group polygons that touch or overlap, directly or through other polygons of the group.
+    """Divide polygons into groups of polygons that are connected.
 
-    The groups are returned in the order of their first polygons.
+    Polygons that touch or overlap are connected, directly or through other polygons.
+
+    Args:
+        polygons: Polygons, each as an electrode of its own.
+
+    Returns:
+        The groups, in the order of their first polygons.
     """
     groups: list[list[Electrode]] = []
     for polygon in polygons:
-        touching = []
-        separate = []
+        # Join all groups that the polygon touches with the polygon.
+        touched_groups = []
+        separate_groups = []
         for group in groups:
             if any(polygon.overlaps(other, TOUCHING_DISTANCE) for other in group):
-                touching.append(group)
+                touched_groups.append(group)
             else:
-                separate.append(group)
-        joined_group = [*chain(*touching), polygon]
-        groups = [*separate, joined_group]
+                separate_groups.append(group)
+        joined_group = [*chain(*touched_groups), polygon]
+        groups = [*separate_groups, joined_group]
 
-    # Joined groups were appended at the end, so the original order is restored.
+    # The joined groups were appended at the end. Sort all groups by the index of their first polygon.
     return sorted(groups, key=lambda group: polygons.index(group[0]))
 
 
 def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list[Electrode]:
-    """Read the polygons of a layer, each as an electrode of its own.
+    """Read the polygons of a layer, and return each polygon as a separate electrode.
 
     Args:
         document: DXF document.
-        layer: Name of the layer.
+        layer: Name of the layer. Upper and lower case are not distinguished.
         scale: Length of a unit of the drawing, mm.
-        path: File name for error messages.
+        path: Path of the file for error messages.
 
     Returns:
-        The closed lines, followed by the traces. The name of each electrode describes its line for error messages.
+        The closed lines, followed by the traces. The name of each electrode states where its line is in the drawing,
+        for error messages.
 
     Raises:
         SensorError: If the layer has no lines, or an object of the layer cannot be an electrode.
@@ -117,7 +126,7 @@ def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list
         path_of_shape = make_path(shape)
         is_closed = shape.closed if shape.dxftype() == "LWPOLYLINE" else path_of_shape.is_closed
 
-        # Points of the line in mm. Arcs are replaced by chords.
+        # Compute points of the line in mm. Arcs are replaced by chords.
         chord_ends = path_of_shape.flattening(ARC_TOLERANCE / scale)
         points = tuple((scale * point.x, scale * point.y) for point in chord_ends)
         width = scale * _width(shape)
@@ -126,7 +135,7 @@ def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list
             check_polygon(where, corners)
             pads.append(Electrode(where, corners))
         elif width > 0.0:
-            # `with_trace` converts the centre line into the polygon of the trace, which it appends to the empty `more`.
+            # `with_trace` converts the centre line into the polygon of the trace, which is the only item of `more`.
             (trace_corners,) = Electrode(where, ()).with_trace(points, width).more
             traces.append(Electrode(where, trace_corners))
         else:
@@ -138,22 +147,27 @@ def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list
 
 
 def _anticlockwise_corners(points: Corners) -> Corners:
-    """Return the corners of a closed line in anticlockwise order, each corner once.
+    """Return the corners of a closed line in anticlockwise order, without the repetition of the first corner.
 
     Args:
-        points: Points (x, y) of the line, mm. The last point repeats the first one.
+        points: Points (x, y) of the line, mm. The last point is equal to the first point.
     """
     is_anticlockwise = area_of(np.array(points)) > 0.0  # the area of a clockwise polygon is negative
     if is_anticlockwise:
         return points[:-1]
-    return points[:0:-1]  # from the last point back to the second point
+    return points[:0:-1]  # reversed order, from the last point to the second point
 
 
 def _width(line: Any) -> float:
-    """Return the width of a polyline in the unit of the drawing; 0 if there is none or if it varies."""
+    """Return the width of a polyline in the unit of the drawing.
+
+    The width is 0 if the polyline has no width or a width that varies.
+    """
     if line.dxftype() != "LWPOLYLINE":
         return 0.0
-    # The code "se" selects the start width and the end width of each section. A constant width has priority over them.
+
+    # The code "se" selects the start width and the end width of each section. If the polyline has a constant width, the
+    # constant width replaces both.
     start_and_end_widths = chain(*line.get_points("se"))
     different_widths = {line.dxf.const_width or width for width in start_and_end_widths}
     has_constant_width = len(different_widths) == 1
@@ -161,16 +175,19 @@ def _width(line: Any) -> float:
 
 
 def _names(document: Any, groups: list[list[Electrode]], scale: float) -> list[str]:
-    """Return a name for each group of polygons. Each group becomes an electrode.
+    """Return names for groups of polygons, each of which becomes an electrode.
 
     The name of a group is the text of the drawing that is nearest to the first polygon of the group. If two groups have
-    the same text, or the drawing has no texts, the names are the letters from A to Z, followed by numbers. In this
-    case, there may be more names than groups.
+    the same nearest text, or if the drawing has no texts, the names are the letters from A to Z, followed by numbers.
 
     Args:
-        document: The drawing.
+        document: DXF document.
         groups: Polygons of each group.
         scale: Length of a unit of the drawing, mm.
+
+    Returns:
+        At least one name for each group, in the order of the groups. If the names are letters and numbers, there may be
+        more names than groups.
     """
     text_positions = {  # x + iy, mm
         text.plain_text(): scale * complex(*text.dxf.insert.vec2)

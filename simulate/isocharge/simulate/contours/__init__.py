@@ -1,1 +1,1 @@
-"""Isocharge contours and triangulation, computed from a charge map or by the graphical method of the paper."""
+"""Isocharge contours, and triangulation of presses from these contours."""

@@ -1,4 +1,4 @@
-"""Candidates for the point at which contours meet, and the grid of positions at which the search for candidates starts.
+"""Candidates for the position at which contours meet, and a grid from which the starting points of a search are chosen.
 
 The module `triangulation` improves several candidates for each of many presses at once.
 """
@@ -13,29 +13,33 @@ from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.numerics.disk import INNER_RADIUS, onto_disk
 
 NODE_SPACING = 0.6
-"""Distance between neighbouring nodes of the grid, mm. Contours are almost straight on this scale."""
+"""Distance between neighbouring nodes of the grid, mm. Contours are almost straight over this distance."""
 
 FORCES = 24
-"""Number of forces at which the charges of each node are tabulated, equally spaced in ln F."""
+"""Number of forces at which the charges of each node are tabulated. Their logarithms are equally spaced."""
 
 MIN_SLOPE = 0.02
-"""Lower bound for the slope of a charge, relative to the median slope of the electrode, dimensionless.
+"""Lower bound of the slope of a charge, relative to the median slope of the electrode, dimensionless.
 
-It keeps the distance = difference / slope finite where the charge has an extremum.
+The distance from a contour is estimated as a difference of charges divided by the slope. The bound keeps this distance
+finite where the charge has an extremum.
 """
 
 RANGE_MARGIN = 0.02
-"""Margin by which a charge may exceed the range of the charges of all nodes, relative to the range, dimensionless."""
+"""Margin by which a charge may lie outside the range of the charges at all nodes, divided by the width of the range."""
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Possible positions of presses. Each press may have any number of candidates.
+    """Possible contacts (candidates) of several presses. Each press may have any number of candidates.
+
+    The spread of a candidate is a length that measures how far the contours of the press are from meeting at the
+    candidate.
 
     Attributes:
-        press: Number of the press, shape (n,).
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        spread: Spread of the contours at the contact, shape (n,), mm; infinite before the search.
+        press: Index of the press to which each candidate belongs, shape (n,).
+        contact: Contact (x, y, F) of each candidate, shape (n, 3), mm and N.
+        spread: Spread of each candidate, shape (n,), mm; infinite if it has not been computed yet.
     """
 
     press: Integers
@@ -43,79 +47,82 @@ class Candidates:
     spread: Array
 
     @classmethod
-    def begin(cls, press: Integers, contact: Array) -> "Candidates":
-        """Create candidates from the starting points of a search.
+    def from_starting_points(cls, press: Integers, contact: Array) -> "Candidates":
+        """Create candidates with an infinite spread from the starting points of a search.
 
         Args:
-            press: Number of the press of each starting point, shape (n,).
+            press: Index of the press to which each starting point belongs, shape (n,).
             contact: Starting points (x, y, F), shape (n, 3), mm and N.
         """
         return cls(press, contact, np.full(press.size, np.inf))
 
     def __getitem__(self, rows: np.ndarray) -> "Candidates":
-        """Return the candidates that a mask or an array of row indices selects."""
+        """Return the candidates that a mask or an array of indices selects."""
         return Candidates(self.press[rows], self.contact[rows], self.spread[rows])
 
-    def joined(self, other: "Candidates") -> "Candidates":
-        """Return these candidates followed by other candidates."""
+    def joined_with(self, other: "Candidates") -> "Candidates":
+        """Return candidates that contain these candidates, followed by the candidates of another object."""
         return Candidates(
             press=np.concatenate([self.press, other.press]),
             contact=np.concatenate([self.contact, other.contact]),
             spread=np.concatenate([self.spread, other.spread]),
         )
 
-    def improved(self, contact: Array, spread: Array) -> "Candidates":
-        """Replace the contact of each candidate whose new contact has a smaller spread.
+    def replaced_where_better(self, contact: Array, spread: Array) -> "Candidates":
+        """Replace the contact of each candidate by a new contact if the new contact has a smaller spread.
 
         Args:
-            contact: New contact of each candidate, shape (n, 3), mm and N.
-            spread: Spread of the contours at the new contact, shape (n,), mm.
+            contact: New contact (x, y, F) for each candidate, shape (n, 3), mm and N.
+            spread: Spread at each new contact, shape (n,), mm.
         """
         is_better = spread < self.spread
-        contact = np.where(is_better[:, None], contact, self.contact)
-        return Candidates(self.press, contact, np.where(is_better, spread, self.spread))
+        better_contact = np.where(is_better[:, None], contact, self.contact)
+        smaller_spread = np.where(is_better, spread, self.spread)
+        return Candidates(self.press, better_contact, smaller_spread)
 
-    def distinct(self, tolerance: float) -> "Candidates":
-        """Sort the candidates by press and spread, and remove duplicates.
+    def without_duplicates(self, tolerance: float) -> "Candidates":
+        """Sort the candidates by press and then by spread, and remove duplicates.
 
-        A candidate is a duplicate if a remaining candidate of the same press with a smaller spread is near.
+        A candidate is a duplicate if it is near a candidate of the same press that has a smaller spread and is not a
+        duplicate itself.
 
         Args:
-            tolerance: Distance from a better candidate of the same press below which a candidate is removed, mm.
+            tolerance: Largest distance at which two candidates are near to each other, mm.
 
         Returns:
-            The remaining candidates.
+            The remaining candidates in the new order.
         """
         ordered = self[np.lexsort((self.spread, self.press))]
         first_row_of_press = np.searchsorted(ordered.press, ordered.press)
         rank = np.arange(ordered.press.size) - first_row_of_press  # 0 for the best candidate of a press
         is_distinct = np.ones(rank.size, dtype=bool)
         worst_rank = int(rank.max(initial=0))
+
+        # Compare the candidates of each rank with the better candidates of their press, for all presses at once. The
+        # candidates of a press are in consecutive rows, in the order of their ranks.
         for candidate_rank in range(1, worst_rank + 1):
-            # Compare the candidates of this rank, of all presses together, with those of each better rank.
             rows = np.flatnonzero(rank == candidate_rank)
             for rank_difference in range(1, candidate_rank + 1):
-                better_rows = rows - rank_difference  # the candidates of a press are in consecutive rows
+                better_rows = rows - rank_difference
                 offset = (ordered.contact[rows] - ordered.contact[better_rows])[:, :2]
                 is_near = np.linalg.norm(offset, axis=1) <= tolerance
-                # A candidate remains if it is near a better candidate that is a duplicate itself.
                 is_distinct[rows] &= ~(is_near & is_distinct[better_rows])
         return ordered[np.flatnonzero(is_distinct)]
 
 
 @dataclass(frozen=True)
 class SeedGrid:
-    """Charges on the nodes of a square grid over the disk. The logarithms of the forces are equally spaced.
+    """Charges at the nodes of a square grid over a disk, from which the starting points of a search are chosen.
 
     Attributes:
-        position: Positions of the nodes, shape (n_node, 2), mm.
+        position: Positions (x, y) of the nodes, shape (n_node, 2), mm.
         index: Index of each node in the flattened square grid, shape (n_node,).
         side: Number of nodes along a side of the square grid.
-        log_forces: Logarithms of the forces (N), ascending, shape (n_force,).
-        node_charges: Charges, shape (n_force, n_node, n_electrode), pC.
-        slope: Magnitude of the gradient of each charge with respect to the position at the middle force, bounded below
-            by `MIN_SLOPE`, shape (n_node, n_electrode), pC/mm.
-        relative_size: Root mean square of all charges at each force, relative to that at the middle force, shape
+        log_forces: Natural logarithms of the tabulated forces in N, equally spaced and ascending, shape (n_force,).
+        node_charges: Charges at each node for each force, shape (n_force, n_node, n_electrode), pC.
+        slope: Magnitude of the gradient of each charge with respect to the position at the middle force, shape (n_node,
+            n_electrode), pC/mm. It is at least `MIN_SLOPE` times its median over the nodes.
+        relative_size: Root mean square of all charges at each force, divided by that at the middle force, shape
             (n_force,), dimensionless.
     """
 
@@ -129,14 +136,14 @@ class SeedGrid:
 
     @classmethod
     def of(cls, charge_map: ChargeMap) -> "SeedGrid":
-        """Create the grid over the domain of a charge map, including the edge of the disk.
+        """Create a grid over the domain of a charge map, and compute the charges at its nodes.
 
         Args:
-            charge_map: Charges as a function of the contact.
+            charge_map: Map that computes the charges of contacts.
         """
         side, index, position = _nodes_on_disk(charge_map.domain.radius)
 
-        # Charges of the nodes for each force, shape (n_force, n_node, n_electrode)
+        # Compute the charges of the nodes for each force, shape (n_force, n_node, n_electrode).
         min_force, max_force = charge_map.domain.force_range
         n_force = FORCES if max_force > min_force else 1
         log_forces = np.linspace(np.log(min_force), np.log(max_force), n_force)
@@ -144,7 +151,7 @@ class SeedGrid:
         contacts = [np.column_stack([position, np.full(len(position), force)]) for force in forces]
         node_charges = np.stack([charge_map.charges(contact) for contact in contacts])
 
-        # Slopes at the middle force, with a lower bound, and root mean square of all charges at each force
+        # Compute the slopes at the middle force, and the root mean square of all charges at each force.
         middle = forces.size // 2
         gradient = charge_map.derivatives(contacts[middle])[..., :2]  # with respect to x and y
         gradient_length = np.linalg.norm(gradient, axis=2)
@@ -160,74 +167,91 @@ class SeedGrid:
             relative_size=rms_charge / rms_charge[middle],
         )
 
-    def growth(self, force: Array) -> Array:
-        """Interpolate the relative size of the charges at forces (N) of any shape."""
+    def relative_size_at(self, force: Array) -> Array:
+        """Interpolate the size of the charges at given forces, relative to their size at the middle force.
+
+        Args:
+            force: Forces, any shape, N.
+
+        Returns:
+            Relative sizes, of the shape of `force`, dimensionless.
+        """
         return np.interp(np.log(force), self.log_forces, self.relative_size)
 
     def charge(self, force: Array) -> Array:
-        """Interpolate the charges at all nodes between the tabulated forces.
+        """Interpolate the charges at all nodes for given forces, linearly in ln F.
 
         Args:
-            force: Forces, shape (n, 1) or (n, n_node), N.
+            force: One force for each of n presses, shape (n, 1), or one for each press and node, shape (n, n_node), N.
 
         Returns:
             Charges, shape (n, n_node, n_electrode), pC.
         """
-        # Linear interpolation in ln F between the tabulated forces below and above
+        # Find the tabulated forces below and above each force. A grid with a single force has only one tabulated force.
         n_force = self.log_forces.size
         fractional_index = np.interp(np.log(force), self.log_forces, np.arange(n_force))
         index_below = np.minimum(fractional_index.astype(int), max(n_force - 2, 0))
         index_above = np.minimum(index_below + 1, n_force - 1)
         node = np.arange(len(self.position))
         weight_above = (fractional_index - index_below)[..., None]
-        # The index of the node selects the second axis, so the results have the shape (n, n_node, n_electrode).
+
+        # The two index arrays are broadcast to the shape (n, n_node), so the charges have the shape (n, n_node,
+        # n_electrode).
         charge_below = self.node_charges[index_below, node]
         charge_above = self.node_charges[index_above, node]
         return np.asarray((1.0 - weight_above) * charge_below + weight_above * charge_above)
 
     def matching_force(self, charge: Array) -> Array:
-        """Find the force at which the total charge of each node is equal to the total of given charges.
+        """Find the force at which the total charge of each node is equal to the total charge of each press.
+
+        The total charge is the sum of the charges of all electrodes.
 
         Args:
-            charge: Charges, shape (n, n_electrode), pC.
+            charge: Charges of the presses, shape (n, n_electrode), pC.
 
         Returns:
-            Forces, shape (n, n_node), N.
+            Force for each press and node, shape (n, n_node), N.
         """
         total = charge.sum(axis=1)  # shape (n,)
         node_totals = self.node_charges.sum(axis=2)  # shape (n_force, n_node)
 
-        # `np.interp` needs ascending totals. With negative coefficients, the charges decrease with the force.
+        # `np.interp` needs ascending totals. If the piezoelectric coefficients are negative, the totals decrease with
+        # the force, so their sign is reversed.
         sign = np.sign(node_totals.sum())
         ascending_totals = sign * node_totals.T  # shape (n_node, n_force)
         log_forces = [np.interp(sign * total, node_total, self.log_forces) for node_total in ascending_totals]
         return np.asarray(np.exp(np.stack(log_forces, axis=1)))
 
     def distance(self, charge: Array, force: Array) -> Array:
-        """Estimate the root mean square distance of each node from the contours of given charges.
+        """Estimate the distance of each node from the contours of each press (root mean square over the contours).
 
         Args:
-            charge: Charges, shape (n, n_electrode), pC.
-            force: Forces, shape (n, 1) or (n, n_node), N.
+            charge: Charges of the presses, shape (n, n_electrode), pC.
+            force: One force for each press, shape (n, 1), or one for each press and node, shape (n, n_node), N.
 
         Returns:
             Distances, shape (n, n_node), mm.
         """
-        slope = self.growth(force)[..., None] * self.slope
+        # To first order, the distance from a contour is the difference of the charges divided by the slope. The slope
+        # increases with the force like the charges.
+        slope = self.relative_size_at(force)[..., None] * self.slope
         distance = (self.charge(force) - charge[:, None]) / slope
         return np.asarray(np.sqrt(np.mean(distance**2, axis=2)))
 
-    def lowest(self, distance: Array, max_count: int) -> tuple[Integers, Integers]:
-        """Select the nodes that have a smaller distance than their neighbours.
+    def local_minima(self, distance: Array, max_count: int) -> tuple[Integers, Integers]:
+        """Select the nodes at which the distance from the contours of a press has its smallest local minima.
+
+        A node is a local minimum if none of its eight neighbours on the grid has a smaller distance.
 
         Args:
-            distance: Distance of each node for each press, shape (n, n_node), mm.
-            max_count: Largest number of nodes for each press.
+            distance: Distance of each node from the contours of each press, shape (n, n_node), mm.
+            max_count: Largest number of selected nodes for each press.
 
         Returns:
-            Indices of the presses and indices of the nodes, each of shape (m,).
+            Index of the press and index of the node for each selected node, each of shape (m,).
         """
-        # Compare each node with its neighbours on the square grid. Nodes outside the disk have an infinite distance.
+        # Arrange the distances on the square grid, in which nodes outside the disk have an infinite distance. The
+        # filter returns the smallest distance among each node and its neighbours.
         n_press = len(distance)
         flat_grid = np.full((n_press, self.side**2), np.inf)
         flat_grid[:, self.index] = distance
@@ -235,7 +259,8 @@ class SeedGrid:
         neighbourhood_minimum = scipy.ndimage.minimum_filter(square_grid, (1, 3, 3), mode="constant", cval=np.inf)
         is_minimum = (square_grid == neighbourhood_minimum).reshape(n_press, -1)[:, self.index]
 
-        # Take the `max_count` nodes with the smallest distances of each press, and remove those that are no minimum.
+        # Select the `max_count` local minima with the smallest distances of each press. If a press has fewer minima,
+        # the selected nodes that are not minima have an infinite distance and are removed.
         distance_of_minimum = np.where(is_minimum, distance, np.inf)
         node = np.argpartition(distance_of_minimum, max_count, axis=1)[:, :max_count]
         selected_distance = np.take_along_axis(distance_of_minimum, node, axis=1)
@@ -243,27 +268,32 @@ class SeedGrid:
         return press, node[press, column]
 
     def is_out_of_range(self, charge: Array, force: Array | None) -> Booleans:
-        """Return whether each press has a charge outside the range of the charges at the nodes.
+        """Return whether at least one charge of each press lies outside the range of the charges at the nodes.
 
         Args:
-            charge: Charges, shape (n, n_electrode), pC.
+            charge: Charges of the presses, shape (n, n_electrode), pC.
             force: Force of each press, shape (n,), N. If it is None, the range includes the charges at all forces.
 
         Returns:
-            Whether each press has such a charge, shape (n,).
+            Whether a charge of each press lies outside the range, shape (n,).
         """
-        if force is None:  # the charges at all nodes and forces, which are the same for all presses
+        if force is None:
+            # All presses share the charges at all nodes and forces, shape (1, n_force * n_node, n_electrode).
             node_charges = self.node_charges.reshape(1, -1, charge.shape[1])
         else:
             node_charges = self.charge(force[:, None])
-        low = node_charges.min(axis=1)
-        high = node_charges.max(axis=1)
-        margin = RANGE_MARGIN * (high - low)
-        return np.asarray(((charge < low - margin) | (charge > high + margin)).any(axis=1))
+        smallest_charge = node_charges.min(axis=1)
+        largest_charge = node_charges.max(axis=1)
+        margin = RANGE_MARGIN * (largest_charge - smallest_charge)
+        is_too_small = charge < smallest_charge - margin
+        is_too_large = charge > largest_charge + margin
+        return np.asarray((is_too_small | is_too_large).any(axis=1))
 
 
 def _nodes_on_disk(radius: float) -> tuple[int, Integers, Array]:
-    """Select the nodes of a square grid that lie on a disk or slightly outside, and move the latter onto its edge.
+    """Select the nodes of a square grid that lie in a disk or slightly outside it.
+
+    The nodes slightly outside the disk are moved onto its edge.
 
     Args:
         radius: Radius of the disk, mm.

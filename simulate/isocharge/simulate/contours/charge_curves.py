@@ -1,8 +1,9 @@
-"""Charge as a function of the distance along lines from an electrode (Mirbagheri and others 2007, figures 2, 4, 7).
+"""Charges along lines from an electrode (Mirbagheri and others 2007, figures 2, 4, 7).
 
-This is the mapping scheme of the paper. The lines start at the centre of an electrode. All angles between neighbouring
-lines are equal. All distances between neighbouring presses on a line are equal. The paper fits a polynomial to the
-charge along each line. The module `graphical_method` draws contours through the roots of these polynomials.
+The mapping scheme of the paper consists of presses on lines that start at the centre of an electrode. The angles
+between neighbouring lines are equal, and so are the distances between neighbouring presses on a line. The paper fits a
+polynomial to the charge as a function of the distance along each line. The module `graphical_method` draws contours
+through the points at which these polynomials have a given charge.
 """
 
 from collections.abc import Sequence
@@ -17,30 +18,31 @@ from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.sensor.sensor import Sensor, electrode_index
 
 STEP = 4.0
-"""Default distance between presses on a line, mm, as in the paper."""
+"""Default distance between neighbouring presses on a line, mm. The value is that of the paper."""
 
 LENGTH = 20.0
 """Default length of the lines, mm. The paper does not state a length."""
 
 ANGLE_STEP = np.deg2rad(10.0)
-"""Default angle between lines, rad, as in the paper."""
+"""Default angle between neighbouring lines, rad. The value is that of the paper."""
 
 HALF_ANGLE = np.deg2rad(70.0)
-"""Default of the largest angle between a line and the direction of the centre of the film, rad.
+"""Default value of the largest angle between a line and the direction to the centre of the film, rad.
 
-The paper does not state an angle.
+The paper does not state this angle.
 """
 
 
 @dataclass(frozen=True)
 class Mapping:
-    """Mapping scheme: presses at equal distances on lines from an electrode.
+    """Mapping scheme, which consists of presses at equal distances on lines from an electrode.
 
     Attributes:
         electrode: Name of the electrode at which the lines start.
         origin: Centre (x, y) of this electrode, mm.
         angle: Angle of each line from the drawn direction, anticlockwise, shape (n_line,), rad.
-        distance: Distances of the presses from the origin, ascending, the same on each line, shape (n_step,), mm.
+        distance: Distances of the presses from the origin in ascending order, which are the same on all lines, shape
+            (n_step,), mm.
     """
 
     electrode: str
@@ -58,21 +60,24 @@ class Mapping:
         step: float = STEP,
         length: float = LENGTH,
     ) -> "Mapping":
-        """Create lines at equal angles.
+        """Create a mapping scheme with lines at equal angles.
 
-        The last angle always has a line, even if its distance to the previous line is smaller than the step.
+        The last line always has the last angle, even if the angle between the last two lines is then smaller than
+        `angle_step`.
 
         Args:
-            sensor: Sensor, whose calibration determines the positions of the electrodes.
+            sensor: Sensor whose calibration determines the positions of the electrodes.
             electrode: Name of the electrode at which the lines start.
-            angles: First and last angle, rad; `HALF_ANGLE` to both sides of the centre of the film if absent.
-            angle_step: Angle between lines, rad.
-            step: Distance between presses on a line, and of the first press from the centre of the electrode, mm.
+            angles: First and last angle of the lines, rad. If None, the lines cover `HALF_ANGLE` on both sides of the
+                direction to the centre of the film.
+            angle_step: Angle between neighbouring lines, rad.
+            step: Distance between neighbouring presses on a line, and distance of the first press from the centre of
+                the electrode, mm.
             length: Length of the lines, mm.
 
         Raises:
-            SensorError: If there is no such electrode.
-            SceneError: If there are no presses for the angles, steps and length.
+            SensorError: If the sensor has no such electrode.
+            SceneError: If an angle, a step or the length is not valid.
         """
         centre = sensor.electrodes[electrode_index(sensor, electrode)].centre
         x, y = sensor.calibration.place(np.array(centre))
@@ -87,9 +92,11 @@ class Mapping:
                 f"{np.rad2deg(last_angle):g} degrees in steps of {np.rad2deg(angle_step):g}, and lines of {length:g} "
                 f"mm in steps of {step:g} mm"
             )
-        angles_before_last = np.arange(first_angle, last_angle - 1e-9, angle_step)  # never contains the last angle
+
+        # Rounding must neither duplicate the last angle nor remove the last press of a line.
+        angles_before_last = np.arange(first_angle, last_angle - 1e-9, angle_step)
         angle = np.append(angles_before_last, last_angle)
-        presses_per_line = int(length / step * (1.0 + 1e-9))  # the factor allows for rounding of the quotient
+        presses_per_line = int(length / step * (1.0 + 1e-9))
         distance: Array = step * np.arange(1.0, presses_per_line + 1.0)
         return cls(electrode, (float(x), float(y)), angle, distance)
 
@@ -103,12 +110,16 @@ class Mapping:
     def radius(self) -> float:
         """Distance of the farthest press from the centre of the film, mm.
 
-        The radius of a charge map must not be smaller.
+        A charge map that computes the charges of the presses must have at least this radius.
         """
         return float(np.linalg.norm(self.points, axis=-1).max())
 
     def finer(self, count: int) -> "Mapping":
-        """Return the same lines with `count` equally spaced presses from the first to the last press of each line."""
+        """Return a mapping scheme with the same lines and another number of presses on each line.
+
+        Args:
+            count: Number of presses on each line. They are equally spaced from the first to the last press.
+        """
         distance = np.linspace(self.distance[0], self.distance[-1], count)
         return Mapping(self.electrode, self.origin, self.angle, distance)
 
@@ -120,8 +131,8 @@ class Curves:
     Attributes:
         mapping: Positions of the presses.
         electrodes: Names of the electrodes in the order of the charges.
-        force: Force of each press, N.
-        charge: Touch charges, shape (n_line, n_step, n_electrode), pC.
+        force: Force of all presses, N.
+        charge: Touch charges of the presses, shape (n_line, n_step, n_electrode), pC.
     """
 
     mapping: Mapping
@@ -131,12 +142,12 @@ class Curves:
 
     @classmethod
     def of(cls, charge_map: ChargeMap, mapping: Mapping, force: float) -> "Curves":
-        """Evaluate a charge map on the lines.
+        """Compute the charges along the lines of a mapping scheme.
 
         Args:
-            charge_map: Charges as a function of the contact.
+            charge_map: Map that computes the charges of contacts.
             mapping: Positions of the presses.
-            force: Force of each press, N.
+            force: Force of all presses, N.
 
         Raises:
             SceneError: If a press or the force is outside the domain of the map.
@@ -152,13 +163,15 @@ class Curves:
         return np.asarray(self.charge[..., self.electrodes.index(self.mapping.electrode)])
 
     def polynomials(self, degree: int) -> Sequence[Polynomial]:
-        """Fit a polynomial to the charge of the electrode at which the lines start, as in the paper.
+        """Fit a polynomial to the charge along each line, as in the paper.
+
+        The charge is that of the electrode at which the lines start.
 
         Args:
             degree: Degree of the polynomials.
 
         Returns:
-            Charge (pC) as a polynomial of the distance (mm) for each line.
+            For each line, a polynomial that computes the charge (pC) from the distance (mm).
 
         Raises:
             SceneError: If a line has fewer presses than the polynomial has coefficients.
@@ -168,4 +181,4 @@ class Curves:
             raise SceneError(
                 f"degree: expected 1 to {distance.size - 1} for {distance.size} presses on a line, got {degree}"
             )
-        return [Polynomial.fit(distance, line, degree) for line in self.own_charge]
+        return [Polynomial.fit(distance, line_charge, degree) for line_charge in self.own_charge]

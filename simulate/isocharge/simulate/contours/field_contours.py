@@ -1,7 +1,8 @@
-"""Isocharge contours: curves on which all presses with the same force cause the same charge on an electrode.
+"""Computation of isocharge contours from a charge map.
 
-Contours are traced by marching squares on a grid. The module `graphical_method` draws the same contours by the method
-of Mirbagheri and others (2007).
+An isocharge contour is a curve on the film along which presses of constant force cause a constant charge on one
+electrode. The contours are traced on a grid by the method of marching squares. In contrast to this module, the module
+`graphical_method` draws contours by the method of Mirbagheri and others (2007).
 """
 
 from dataclasses import dataclass
@@ -17,19 +18,19 @@ from isocharge.simulate.forward.charge_map import ChargeMap, check_forces
 GRID_SPACING = 0.2
 """Largest distance between neighbouring points of the grid, mm.
 
-The deviation of a contour from a straight line within this distance is a few micrometres.
+Over this distance, a contour deviates from a straight line by a few micrometres.
 """
 
 TRACED_RADIUS = 1.0 - 5e-4
-"""Radius within which contours are traced, in units of the radius of the charge map, dimensionless."""
+"""Radius of the disk in which contours are traced, divided by the radius of the charge map, dimensionless."""
 
 
 @dataclass(frozen=True)
 class ContourField:
-    """Contours over the domain of a charge map for presses with one force.
+    """Charges of presses with one force on a grid over the domain of a charge map, from which contours are traced.
 
     Attributes:
-        charge_map: Charges as a function of the contact. Splines are faster than a forward map.
+        charge_map: Map that computes the charges of contacts. Splines are faster than a forward map.
         force: Force of the presses, N.
 
     Raises:
@@ -43,23 +44,24 @@ class ContourField:
         check_forces(self.force, self.charge_map.domain.force_range, "charge map")
 
     def contours(self, electrode: str, charge: float) -> tuple[Array, ...]:
-        """Trace the contour of one electrode.
+        """Trace the contour on which one electrode has a given charge.
 
         Args:
             electrode: Name of the electrode.
-            charge: Charge on the contour, pC.
+            charge: Charge of the electrode on the contour, pC.
 
         Returns:
-            Separate curves of the contour, each with points (x, y) in order, shape (n, 2), mm. The first point of a
-            closed curve is repeated at its end. The tuple is empty if no press gives the charge.
+            Separate curves of the contour. Each curve is an array of successive points (x, y), shape (n, 2), mm. The
+            last point of a closed curve is equal to its first point. The tuple is empty if no press causes the charge.
 
         Raises:
-            SensorError: If there is no such electrode.
+            SensorError: If the map has no such electrode.
             SceneError: If the charge is not finite.
         """
         if not np.isfinite(charge):
             raise SceneError(f"charge of {electrode!r}: expected a finite number, got {charge:g} pC")
-        # The contour is traced with charges of order one, so that it does not depend on the size of the charges.
+
+        # The charges are divided by the largest charge, so that the result does not depend on their order of magnitude.
         x, y = self._grid
         charges = self._charges(electrode)
         largest_charge = np.abs(charges).max()
@@ -72,34 +74,36 @@ class ContourField:
         return float(values.min()), float(values.max())
 
     def even_charges(self, electrode: str, count: int) -> list[float]:
-        """Return charges between the smallest and the largest charge of an electrode.
+        """Return evenly spaced charges between the smallest and the largest charge of an electrode on the grid.
 
-        The charges have equal ratios, or equal differences if the charge changes its sign.
+        If all charges of the electrode have the same sign, the ratios of successive returned charges are equal. If the
+        charges have different signs, the differences of successive returned charges are equal.
 
         Args:
             electrode: Name of the electrode.
-            count: Number of charges.
+            count: Number of returned charges.
 
         Returns:
-            Charges in pC, without the smallest and the largest one.
+            Charges in ascending order, pC. The smallest and the largest charge of the electrode are not included.
         """
         low, high = self.charge_range(electrode)
         has_one_sign = low * high > 0.0
         spacing = np.geomspace if has_one_sign else np.linspace
-        charges = spacing(low, high, count + 2)  # with both ends
+        charges = spacing(low, high, count + 2)  # includes the smallest and the largest charge
         return [float(charge) for charge in charges[1:-1]]
 
     @cached_property
     def _grid(self) -> tuple[Array, Array]:
-        """Coordinates x and y of a square grid that is mapped onto the disk, each of shape (n, n), mm.
+        """Coordinates x and y of the points of a square grid that is mapped onto the disk, each of shape (n, n), mm.
 
-        The boundary of the mapped grid is the edge of the disk, so that contours that leave the disk end on its edge.
+        The boundary of the mapped grid is the edge of the disk. Contours that leave the disk therefore end on its edge.
         """
         radius = TRACED_RADIUS * self.charge_map.domain.radius
-        n_spacings = 2 * int(np.ceil(radius / GRID_SPACING))  # along a diameter
+        n_spacings = 2 * int(np.ceil(radius / GRID_SPACING))  # number of grid spacings along a diameter
         line = np.linspace(-1.0, 1.0, n_spacings + 1)
         square_x, square_y = np.meshgrid(line, line)
-        # Elliptical grid mapping of the square [-1, 1] x [-1, 1] onto the unit disk (Nowell 2005)
+
+        # Map the square [-1, 1] x [-1, 1] onto the unit disk (elliptical grid mapping, Nowell 2005).
         disk_x = square_x * np.sqrt(1.0 - 0.5 * square_y**2)
         disk_y = square_y * np.sqrt(1.0 - 0.5 * square_x**2)
         return radius * disk_x, radius * disk_y
@@ -112,7 +116,14 @@ class ContourField:
         return self.charge_map.charges(contact).reshape(*x.shape, -1)
 
     def _charges(self, electrode: str) -> Array:
-        """Return the charges of one electrode on the grid, shape (n, n), pC."""
+        """Return the charges of one electrode at the points of the grid, shape (n, n), pC.
+
+        Args:
+            electrode: Name of the electrode.
+
+        Raises:
+            SensorError: If the map has no such electrode.
+        """
         names = self.charge_map.electrodes
         if electrode not in names:
             raise SensorError(f"no electrode {electrode!r}: the map has {', '.join(names)}")

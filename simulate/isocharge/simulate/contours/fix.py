@@ -1,4 +1,4 @@
-"""Result of a triangulation: the positions of presses, and for each press without a position the reason."""
+"""Result of a triangulation: the position of each press, or the reason why no position was found."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -9,21 +9,26 @@ from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import SceneError, SensorError
 
 TOLERANCE = 1.0
-"""Default of the largest distance of three crossings from their mean at which contours count as meeting, mm."""
+"""Default value of the tolerance, mm.
+
+Three contours meet if each of their three crossings lies within the tolerance of the mean of the crossings.
+"""
 
 MIN_DISTANCE = 0.2
-"""Distance below which two meetings of contours count as the same, mm."""
+"""Distance below which two positions at which contours meet count as the same position, mm."""
 
 AMBIGUOUS_RATIO = 2.0
-"""Ratio of the spread of the second-best meeting to that of the best meeting up to which a fix is ambiguous,
-dimensionless."""
+"""Ratio of the second-smallest to the smallest spread up to which a position is ambiguous, dimensionless.
+
+The spreads are those of the two best positions at which the contours of a press meet.
+"""
 
 AMBIGUOUS_SPREAD = 0.01
-"""Spread of the second-best meeting up to which a fix is ambiguous in any case, mm."""
+"""Spread of the second-best position up to which a position is always ambiguous, mm."""
 
 
 class Meeting(IntEnum):
-    """Result of the search for the point at which the contours of one press meet."""
+    """Status of one press after the search for the position at which its contours meet."""
 
     met = 0
     no_contour = 1
@@ -32,7 +37,7 @@ class Meeting(IntEnum):
 
     @property
     def summary(self) -> str:
-        """Description of the result."""
+        """Description of the status for users."""
         return {
             Meeting.met: "the contours meet",
             Meeting.no_contour: "no press within the radius gives one of the charges",
@@ -43,13 +48,16 @@ class Meeting(IntEnum):
 
 @dataclass(frozen=True)
 class Fix:
-    """Positions of presses. Presses without a position have NaN, and `status` contains the reason.
+    """Positions of presses that a triangulation found.
+
+    If no position was found for a press, its position is NaN, and `status` contains the reason.
 
     Attributes:
-        contact: Contacts (x, y, F), shape (n, 3), mm and N. The force is the given force or the estimated force.
-        spread: Measure of the disagreement of the contours, shape (n,), mm. If the force is given, this is the largest
-            distance of a crossing from the mean of its triple. If the force is estimated, it is the root mean square
-            distance of the contours from the position.
+        contact: Contact (x, y, F) of each press, shape (n, 3), mm and N. The force is given or estimated.
+        spread: Length that measures how far the contours are from meeting in one point, shape (n,), mm. If the force is
+            given, the spread is the largest distance between a crossing of two contours and the mean of three
+            crossings. If the force is estimated, the spread is the root mean square distance of the contours from the
+            position.
         status: Value of `Meeting` for each press, shape (n,).
     """
 
@@ -64,13 +72,13 @@ class Fix:
 
 
 def check_triangulation(electrodes: tuple[str, ...], tolerance: float) -> None:
-    """Check the number of electrodes and the tolerance of a triangulation.
+    """Raise an error if the number of electrodes or the tolerance of a triangulation is not valid.
 
     At least three electrodes are necessary, because two contours may cross in several points.
 
     Args:
         electrodes: Names of the electrodes.
-        tolerance: Largest distance of three crossings from their mean, mm.
+        tolerance: Largest distance between a crossing of two contours and the mean of three crossings, mm.
 
     Raises:
         SensorError: If there are fewer than three electrodes.

@@ -1,10 +1,12 @@
 """Contours and triangulation by the graphical method of Mirbagheri and others (2007).
 
-A polynomial is fitted to the charge along each line of a mapping scheme. The root of the polynomial is one point of the
-contour. The points are joined by a cubic spline with free ends and the chord length as its parameter, like the SPLINE
-of AutoCAD. The crossings of the splines are computed. The position is the mean of the three crossings that are nearest
-to each other. The modules `field_contours` and `triangulation` compute contours and positions directly from the charge
-map, and therefore without errors of the drawing.
+A polynomial is fitted to the charge along each line of a mapping scheme. The point of the line at which the polynomial
+has the given charge is one point of the contour. A cubic spline connects the points of all lines. The spline has free
+ends and is parametrised by the chord length, like the command SPLINE of AutoCAD. The splines of three electrodes form
+three pairs, and the two splines of a pair cross. The position of a press is the mean of three crossings, one for each
+pair. If two splines cross several times, the three crossings that are nearest to each other are used. In contrast to
+the graphical method, the modules `field_contours` and `triangulation` compute contours and positions directly from the
+charge map.
 """
 
 from collections.abc import Sequence
@@ -24,14 +26,17 @@ from isocharge.simulate.forward.charge_map import as_charges
 DEGREE = 4
 """Default degree of the polynomial along a line.
 
-The paper does not state a degree; polynomials of lower degree do not describe the charge near the electrode.
+The paper does not state a degree. Polynomials of a lower degree do not describe the charge near the electrode.
 """
 
 NOWHERE = np.full(2, np.nan)
 """Position of a press whose contours do not meet."""
 
 CHORDS_PER_SPAN = 8
-"""Number of chords for each span of the spline. The search for a crossing of splines starts at a crossing of chords."""
+"""Number of chords by which the spline between two neighbouring knots is approximated.
+
+The search for a crossing of two splines starts at a crossing of their chords.
+"""
 
 NEWTON_STEPS = 4
 """Number of steps of Newton's method from a crossing of chords to the crossing of the splines."""
@@ -39,12 +44,13 @@ NEWTON_STEPS = 4
 
 @dataclass(frozen=True)
 class DrawnContour:
-    """Contour of the graphical method: a spline through the roots on the lines.
+    """Contour that is drawn by the graphical method, as a spline through one point on each line of a mapping scheme.
 
     Attributes:
         electrode: Name of the electrode.
         charge: Charge of the electrode on the contour, pC.
-        knots: Roots on the lines in the order of the angles of the lines, shape (n, 2), mm, with n >= 2.
+        knots: Points (x, y) on the lines at which the electrode has this charge, shape (n, 2), mm, with n >= 2. The
+            points are in the order of the angles of the lines.
     """
 
     electrode: str
@@ -53,19 +59,19 @@ class DrawnContour:
 
     @property
     def points(self) -> Array:
-        """Points along the spline, shape (n, 2), mm."""
+        """Points (x, y) along the spline, which are the ends of its chords, shape (n, 2), mm."""
         return np.asarray(self._spline(self._parameters))
 
     @cached_property
     def _spline(self) -> "scipy.interpolate.CubicSpline":
-        """Spline from the cumulative chord length (mm) to the position (mm)."""
+        """Spline that computes the position (x, y), mm, from the cumulative chord length of the knots, mm."""
         chord_lengths = np.linalg.norm(np.diff(self.knots, axis=0), axis=1)
         parameter = np.concatenate([[0.0], np.cumsum(chord_lengths)])
         return scipy.interpolate.CubicSpline(parameter, self.knots, bc_type="natural")
 
     @property
     def _parameters(self) -> Array:
-        """Parameters of the ends of the chords, ascending, shape (n,), mm."""
+        """Parameters of the spline at the ends of its chords in ascending order, shape (n,), mm."""
         knots = self._spline.x
         inner = np.linspace(knots[:-1], knots[1:], CHORDS_PER_SPAN, endpoint=False, axis=1).ravel()
         return np.asarray(np.append(inner, knots[-1]))
@@ -73,8 +79,7 @@ class DrawnContour:
     def crossings(self, other: "DrawnContour") -> Array:
         """Find the positions at which this contour crosses another contour.
 
-        The splines are first approximated by chords. Each crossing of two chords is then improved by Newton's method,
-        which solves spline(p) = other_spline(q) for the parameters p and q of both splines.
+        Both splines are first approximated by chords. Each crossing of two chords is then improved by Newton's method.
 
         Args:
             other: The other contour.
@@ -89,11 +94,13 @@ class DrawnContour:
         return np.array(crossings).reshape(-1, 2)
 
     def _crossing_near(self, other: "DrawnContour", start: Array) -> Array:
-        """Find the crossing with another contour by Newton's method.
+        """Find the crossing with another contour by Newton's method, which starts near this crossing.
+
+        Newton's method solves the equation own_spline(p) = other_spline(q) for the parameters p and q of both splines.
 
         Args:
             other: The other contour.
-            start: Parameters of both splines at which the search starts, shape (2,), mm.
+            start: Parameters of the own spline and of the other spline at which the search starts, shape (2,), mm.
 
         Returns:
             Position (x, y), shape (2,), mm.
@@ -102,10 +109,10 @@ class DrawnContour:
         for _ in range(NEWTON_STEPS):
             own_parameter, other_parameter = parameters
             gap = self._spline(own_parameter) - other._spline(other_parameter)
-            own_tangent = self._spline(own_parameter, 1)  # first derivative
+            own_tangent = self._spline(own_parameter, 1)  # 1 stands for the first derivative
             other_tangent = other._spline(other_parameter, 1)
             jacobian = np.stack([own_tangent, -other_tangent], axis=1)
-            # Tangents may be parallel, so the step is the least-squares solution.
+            # If the tangents are parallel, the matrix is singular. Therefore the step is the least-squares solution.
             step, *_ = np.linalg.lstsq(jacobian, gap, rcond=None)
             parameters = parameters - step
         own_parameter, _ = parameters
@@ -113,22 +120,27 @@ class DrawnContour:
 
 
 def _chord_crossings(first: Array, second: Array) -> Integers:
-    """Find the pairs of chords of two polylines that cross. A chord connects two successive points of a polyline.
+    """Find the pairs of chords of two polylines that cross.
+
+    A chord connects two successive points of a polyline.
 
     Args:
-        first: Points (x, y) of the first polyline, shape (n_first, 2).
-        second: Points (x, y) of the second polyline, shape (n_second, 2).
+        first: Points (x, y) of the first polyline, shape (n_first, 2), mm.
+        second: Points (x, y) of the second polyline, shape (n_second, 2), mm.
 
     Returns:
-        Indices of the chord of the first and of the second polyline, shape (n, 2).
+        For each crossing, the index of the chord of the first polyline and the index of the chord of the second
+        polyline, shape (n, 2).
     """
-    # Combine every chord of the first polyline with every chord of the second, shape (n_first - 1, n_second - 1, 2).
+    # Combine every chord of the first polyline (axis 0) with every chord of the second polyline (axis 1). The shapes
+    # broadcast to (n_first - 1, n_second - 1, 2).
     first_chord = np.diff(first, axis=0)[:, None]
     second_chord = np.diff(second, axis=0)[None]
-    start_difference = second[None, :-1] - first[:-1, None]  # from the start of the first chord to that of the second
+    start_difference = second[None, :-1] - first[:-1, None]  # start of the second chord minus that of the first chord
 
-    # The crossing lies at these fractions of the lengths of both chords (Cramer's rule).
-    with np.errstate(divide="ignore", invalid="ignore"):  # parallel chords do not cross
+    # Compute the fractions of the lengths of both chords at which their lines cross (Cramer's rule). For parallel
+    # chords, the determinant is zero, and the fractions are infinite or NaN. Such chords do not cross.
+    with np.errstate(divide="ignore", invalid="ignore"):
         determinant = _cross_product(first_chord, second_chord)
         first_fraction = _cross_product(start_difference, second_chord) / determinant
         second_fraction = _cross_product(start_difference, first_chord) / determinant
@@ -138,28 +150,36 @@ def _chord_crossings(first: Array, second: Array) -> Integers:
 
 
 def _cross_product(first: Array, second: Array) -> Array:
-    """Return the cross products x1 y2 - y1 x2, shape (...), of plane vectors, shape (..., 2)."""
+    """Compute the cross products x1 y2 - y1 x2 of vectors (x1, y1) and (x2, y2) in the plane.
+
+    Args:
+        first: First vectors, shape (..., 2).
+        second: Second vectors, shape (..., 2).
+
+    Returns:
+        Cross products, shape (...).
+    """
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 
 def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnContour | None:
-    """Draw a contour of the electrode at which the lines of the mapping start.
+    """Draw a contour of the electrode at which the lines of a mapping scheme start.
 
-    The charges along each line are approximated by a polynomial. The contour passes through the points at which the
-    polynomials have the given charge.
+    The charge along each line is approximated by a polynomial. The contour passes through the points of the lines at
+    which the polynomials have the given charge.
 
     Args:
-        curves: Charges along the lines of a mapping.
-        charge: Charge on the contour, pC.
+        curves: Charges along the lines of the mapping scheme.
+        charge: Charge of the electrode on the contour, pC.
         degree: Degree of the polynomial along each line.
 
     Returns:
-        The contour, or None if the charge occurs on fewer than two lines.
+        The contour; None if the charge occurs on fewer than two lines.
 
     Raises:
         SceneError: If a line has too few presses for the degree.
     """
-    # Distance from the electrode on each line; NaN if the charge does not occur on the line
+    # Find the distance from the electrode on each line; NaN if the charge does not occur on the line.
     mapping = curves.mapping
     distances = np.array([_root(polynomial, charge, mapping.distance) for polynomial in curves.polynomials(degree)])
     direction = np.stack([np.cos(mapping.angle), np.sin(mapping.angle)], axis=1)  # unit vectors, shape (n_line, 2)
@@ -169,19 +189,21 @@ def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnCo
 
 
 def _root(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) -> float:
-    """Find the smallest distance at which the polynomial of a line has the charge.
+    """Find the smallest distance on a line at which the polynomial of the line has a given charge.
+
+    The distance must lie between half of the distance of the first press and the distance of the last press. Outside
+    this range, the polynomial does not describe the charge.
 
     Args:
-        polynomial: Charge (pC) as a function of the distance (mm).
-        charge: Charge, pC.
-        distance: Distances of the presses on the line, ascending, mm. The root must lie between half of the first and
-            the last distance, because the polynomial does not describe the charge elsewhere.
+        polynomial: Polynomial that computes the charge (pC) from the distance (mm).
+        charge: Given charge, pC.
+        distance: Distances of the presses on the line in ascending order, shape (n_step,), mm.
 
     Returns:
-        Distance, mm; NaN if there is no root.
+        Distance, mm; NaN if the charge does not occur in this range.
     """
     roots = (polynomial - charge).roots()
-    is_real = np.abs(roots.imag) < 1e-9 * np.abs(distance[-1])  # up to rounding errors
+    is_real = np.abs(roots.imag) < 1e-9 * np.abs(distance[-1])  # allows for rounding errors
     real_roots = roots.real[is_real]
     is_on_line = (real_roots >= 0.5 * distance[0]) & (real_roots <= distance[-1])
     roots_on_line = real_roots[is_on_line]
@@ -189,12 +211,13 @@ def _root(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) 
 
 
 class _Location(NamedTuple):
-    """Location of one press, or of the point at which three contours meet.
+    """Position of one press, or of the point at which three contours meet.
 
     Attributes:
-        position: Position (x, y), shape (2,), mm; NaN if there is none.
-        spread: Largest distance of a crossing from the mean of its triple, mm; NaN if there is no position.
-        status: Result of the search.
+        position: Position (x, y), shape (2,), mm; NaN if no position was found.
+        spread: Largest distance between a crossing of two contours and the mean of three crossings, mm; NaN if no
+            position was found.
+        status: Whether a position was found, and otherwise the reason.
     """
 
     position: Array
@@ -204,12 +227,14 @@ class _Location(NamedTuple):
 
 @dataclass(frozen=True)
 class DrawnTriangulation:
-    """Triangulation with contours of the graphical method.
+    """Estimator of the positions of presses from contours that are drawn by the graphical method.
 
     Attributes:
-        curves: Curves for each electrode, whose lines start at this electrode, in the order of the charges.
-        degree: Degree of the polynomials.
-        tolerance: Largest distance of three crossings from their mean at which contours count as meeting, mm.
+        curves: Charges along lines that start at the first electrode, at the second electrode, and so on, in the order
+            of the charges.
+        degree: Degree of the polynomials along the lines.
+        tolerance: Largest distance between a crossing of two contours and the mean of three crossings at which the
+            contours meet, mm.
     """
 
     curves: Sequence[Curves]
@@ -225,20 +250,30 @@ class DrawnTriangulation:
         return tuple(curves.mapping.electrode for curves in self.curves)
 
     def contours(self, charge: Array) -> tuple[DrawnContour | None, ...]:
-        """Draw the contour of each charge, shape (n_electrode,), pC. A contour that cannot be drawn is None."""
+        """Draw the contours of all electrodes for the charges of one press.
+
+        Args:
+            charge: Touch charges, shape (n_electrode,), pC.
+
+        Returns:
+            The contour of each electrode; None for a contour that cannot be drawn.
+        """
         return tuple(
             draw_contour(curves, float(electrode_charge), self.degree)
             for curves, electrode_charge in zip(self.curves, charge, strict=True)
         )
 
     def locate(self, charge: Array) -> Fix:
-        """Locate presses whose force is that of the curves.
+        """Estimate the positions of presses that have the same force as the presses of the curves.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
 
+        Returns:
+            Position of each press; NaN where the status is not `Meeting.met`.
+
         Raises:
-            ChargeError: If the charges are not finite, or their number is not that of the electrodes.
+            ChargeError: If there is not one finite charge for each electrode.
         """
         charge = as_charges(charge, self.electrodes)
         locations = [self._locate_one(press_charge) for press_charge in charge]
@@ -251,17 +286,23 @@ class DrawnTriangulation:
         )
 
     def _locate_one(self, charge: Array) -> _Location:
-        """Locate one press from its charges, shape (n_electrode,), pC.
+        """Estimate the position of one press.
 
-        The position is the mean over all triples of contours that meet, and the spread is the largest of their spreads.
+        Each triple of contours that meets results in a position with a spread. The position of the press is the mean of
+        the positions of all triples. The spread of the press is the largest spread of a triple.
+
+        Args:
+            charge: Touch charges, shape (n_electrode,), pC.
         """
         contours = [contour for contour in self.contours(charge) if contour is not None]
         if len(contours) < len(charge):
             return _Location(NOWHERE, np.nan, Meeting.no_contour)
 
-        # Three contours meet if the crossings of their three pairs are close together.
+        # A triple of contours has three pairs. It meets if one crossing of each pair is close to the other two.
         indices = range(len(contours))
-        crossings = {(i, j): contours[i].crossings(contours[j]) for i, j in combinations(indices, 2)}  # with i < j
+        crossings = {}
+        for first, second in combinations(indices, 2):
+            crossings[first, second] = contours[first].crossings(contours[second])
         meetings = []
         for triple in combinations(indices, 3):
             crossings_of_pairs = [crossings[pair] for pair in combinations(triple, 2)]
@@ -269,29 +310,32 @@ class DrawnTriangulation:
 
         met = [meeting for meeting in meetings if meeting.status is Meeting.met]
         if not met:
-            status = max(meeting.status for meeting in meetings)  # `twice` has priority over `apart`
+            status = max(meeting.status for meeting in meetings)  # `Meeting.twice` is larger than `Meeting.apart`
             return _Location(NOWHERE, np.nan, status)
         mean_position = np.mean([meeting.position for meeting in met], axis=0)
         largest_spread = max(meeting.spread for meeting in met)
         return _Location(mean_position, largest_spread, Meeting.met)
 
     def _meeting(self, crossings_of_pairs: list[Array]) -> _Location:
-        """Find the three crossings, one for each pair of contours, that are nearest to each other.
+        """Find the point at which three contours meet.
+
+        For each of the three pairs of contours, one crossing is chosen, such that the three crossings are nearest to
+        each other. The point at which the contours meet is the mean of these crossings.
 
         Args:
-            crossings_of_pairs: Crossings of each of the three pairs of contours, each of shape (m, 2), mm.
+            crossings_of_pairs: Crossings (x, y) of each of the three pairs of contours, each of shape (m, 2), mm.
 
         Returns:
-            Mean of the three crossings, their largest distance from the mean, and the status.
+            The point with its spread, or the reason why there is no such point.
         """
-        # All combinations of one crossing of each pair, shape (n_combination, 3, 2)
+        # Create all combinations of one crossing of each pair, shape (n_combination, 3, 2).
         combined_crossings = np.array(list(product(*crossings_of_pairs))).reshape(-1, 3, 2)
         mean = combined_crossings.mean(axis=1)
         spread = np.linalg.norm(combined_crossings - mean[:, None], axis=2).max(axis=1)
         if spread.min(initial=np.inf) > self.tolerance:
             return _Location(NOWHERE, np.nan, Meeting.apart)
 
-        # The meeting is ambiguous if crossings at another position are nearly as close together.
+        # The point is ambiguous if three crossings at another position are nearly as close together.
         best = spread.argmin()
         is_elsewhere = np.linalg.norm(mean - mean[best], axis=1) > MIN_DISTANCE
         second_smallest_spread = spread[is_elsewhere].min(initial=np.inf)

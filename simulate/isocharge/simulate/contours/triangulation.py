@@ -1,13 +1,13 @@
-"""Triangulation: position of a press from the point at which contours meet (Mirbagheri and others 2007, figures 9, 10).
+"""Triangulation of presses. The position of a press is the point at which its contours meet (Mirbagheri et al. 2007).
 
-Each charge restricts the position of the press to an isocharge contour. The contours of three electrodes have three
-crossings near the press, and the paper uses the mean of these crossings as the position. With four electrodes, the
-paper averages over the four triples of electrodes. `Triangulation.locate` computes the same mean. This module searches
-for positions near all contours, and finds the crossing of each pair of contours by Newton's method. `Fix.status` states
-whether a press has no position, or more than one.
+The charge of an electrode restricts the position of the press to an isocharge contour (figures 9 and 10 of the paper).
+The contours of three electrodes have three crossings near the press, and the paper uses the mean of these crossings as
+the position. With four electrodes, the paper averages over the four triples of electrodes. `Triangulation.locate`
+computes the same mean. The method `locate` searches for positions near all contours, and finds the crossing of each
+pair of contours by Newton's method. `Fix.status` states whether a press has no position, or more than one position.
 
-If the force is unknown, the contours depend on it. `Triangulation.locate_with_force` finds the position and the force
-with the smallest mean square distance from the contours.
+The contours of a press depend on its force. If the force is unknown, `Triangulation.locate_with_force` finds the
+position and the force for which the mean square distance of the position from the contours is smallest.
 """
 
 from dataclasses import dataclass
@@ -32,13 +32,13 @@ from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.numerics.disk import INNER_RADIUS, onto_disk
 
 SECOND_START_DISTANCE = 2.0
-"""Distance from a meeting at which the search for a second meeting starts, in units of the tolerance, dimensionless."""
+"""Distance between a solution and the starting point of the search for a second solution, in units of the tolerance."""
 
 MAX_SEEDS = 4
-"""Largest number of starting points for each press."""
+"""Largest number of starting points on the grid for each press."""
 
 STEPS = 25
-"""Number of Newton steps."""
+"""Number of Newton or Gauss-Newton steps of a search."""
 
 CONVERGED_DISTANCE = 1e-5
 """Distance from a contour below which a point counts as lying on the contour, mm."""
@@ -47,20 +47,21 @@ MAX_STEP = 1.0
 """Largest length of a Gauss-Newton step, mm."""
 
 DAMPING = 1e-10
-"""Damping of the Gauss-Newton step, dimensionless. It keeps the step finite where contours touch."""
+"""Damping of the Gauss-Newton step, dimensionless. The damping keeps the step finite where contours touch."""
 
 CHUNK = 512
-"""Number of presses that are located together, which limits the memory to about 100 MB."""
+"""Number of presses that are located together, which limits the required memory to about 100 MB."""
 
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Estimator of positions from the points at which contours meet.
+    """Estimator of the positions of presses from the points at which their contours meet.
 
     Attributes:
-        charge_map: Charges as a function of the contact. A forward map is replaced by splines, which takes some
-            seconds.
-        tolerance: Largest distance of three crossings from their mean at which contours count as meeting, mm.
+        charge_map: Map that computes the charges of contacts. A forward map is replaced by splines, whose fit takes a
+            few seconds.
+        tolerance: Largest distance between a crossing of two contours and the mean of three crossings at which the
+            contours meet, mm.
 
     Raises:
         SensorError: If there are fewer than three electrodes.
@@ -74,17 +75,17 @@ class Triangulation:
         check_triangulation(self.charge_map.electrodes, self.tolerance)
 
     def locate(self, charge: Array, force: Array | float) -> Fix:
-        """Locate presses whose force is known.
+        """Estimate the positions of presses whose forces are known.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
             force: Force of each press, shape (n,), or one force for all presses, N.
 
         Returns:
-            Positions, which are NaN where `status` is not `Meeting.met`.
+            Position of each press; NaN where the status is not `Meeting.met`.
 
         Raises:
-            ChargeError: If the charges are not finite, or their number is not that of the electrodes.
+            ChargeError: If there is not one finite charge for each electrode.
             SceneError: If a force is outside the range of the charge map.
         """
         charge = as_charges(charge, self.charge_map.electrodes)
@@ -93,21 +94,21 @@ class Triangulation:
         return self._in_chunks(charge, force)
 
     def locate_with_force(self, charge: Array) -> Fix:
-        """Locate presses whose force is unknown, and estimate their force.
+        """Estimate the positions and the forces of presses.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
 
         Returns:
-            Positions and forces, which are NaN where `status` is not `Meeting.met`.
+            Position and force of each press; NaN where the status is not `Meeting.met`.
 
         Raises:
-            ChargeError: If the charges are not finite, or their number is not that of the electrodes.
+            ChargeError: If there is not one finite charge for each electrode.
         """
         return self._in_chunks(as_charges(charge, self.charge_map.electrodes), None)
 
     def _in_chunks(self, charge: Array, force: Array | None) -> Fix:
-        """Locate presses in chunks of `CHUNK`, which limits the memory.
+        """Locate presses in chunks of `CHUNK` presses, which limits the required memory.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
@@ -116,8 +117,9 @@ class Triangulation:
         Returns:
             Positions of all presses in the order of the charges.
         """
+        # The list starts with an empty result, because at least one array is needed for the concatenation.
         no_press = Fix(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.intp))
-        fixes = [no_press]  # without charges, there are no chunks, but arrays to concatenate are needed
+        fixes = [no_press]
         for start in range(0, len(charge), CHUNK):
             chunk = slice(start, start + CHUNK)
             chunk_force = force[chunk] if force is not None else None
@@ -131,8 +133,8 @@ class Triangulation:
     def _locate_chunk(self, charge: Array, force: Array | None) -> Fix:
         """Locate the presses of one chunk.
 
-        The search first finds the contacts at which the contours of a press meet, and then chooses one of these
-        contacts. If the force is given, the contours are known curves, and the position is the mean of their crossings.
+        The method first finds the contacts near which the contours of each press meet, and then chooses one of these
+        contacts. If the force is given, the position is the mean of the crossings of the contours near the contact.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
@@ -142,19 +144,19 @@ class Triangulation:
             Position of each press.
         """
         is_force_fixed = force is not None
-        seeds = self._seeds(charge, force)
-        first_meetings = self._approach(charge, seeds, is_force_fixed=is_force_fixed)
+        starts = self._starting_points(charge, force)
+        first_contacts = self._minimise_distances(charge, starts, is_force_fixed=is_force_fixed)
 
-        # Near a fold, there may be a second meeting beside each meeting.
-        second_seeds = self._second_seeds(first_meetings, is_force_fixed=is_force_fixed)
-        second_meetings = self._approach(charge, second_seeds, is_force_fixed=is_force_fixed)
-        candidates = first_meetings.joined(second_meetings).distinct(MIN_DISTANCE)
+        # Near a fold, the contours may also meet at a second contact beside each of these contacts.
+        second_starts = self._second_starting_points(first_contacts, is_force_fixed=is_force_fixed)
+        second_contacts = self._minimise_distances(charge, second_starts, is_force_fixed=is_force_fixed)
+        candidates = first_contacts.joined_with(second_contacts).without_duplicates(MIN_DISTANCE)
         if is_force_fixed:
-            candidates = self._cross(charge, candidates)
+            candidates = self._replace_by_crossings(charge, candidates)
         return self._choose(charge, force, candidates)
 
     def _choose(self, charge: Array, force: Array | None, candidates: Candidates) -> Fix:
-        """Choose the best candidate of each press, unless the second candidate is almost as good.
+        """Choose the best candidate of each press, unless another candidate is almost as good.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
@@ -167,24 +169,24 @@ class Triangulation:
         n_press = len(charge)
         n_candidates = np.bincount(candidates.press, minlength=n_press)
 
-        # The candidates are ordered, so the best candidate of a press is in its first row. The row after the last
-        # candidate is valid, too, because presses without candidates may refer to it.
+        # The candidates are ordered, so the first row of a press contains its best candidate, and the next row contains
+        # the second-best one. One row is appended, to which the index of a press without candidates may point.
         spread = np.append(candidates.spread, np.inf)
         first_row = np.searchsorted(candidates.press, np.arange(n_press))
         second_row = np.minimum(first_row + 1, candidates.press.size)
         smallest_spread = np.where(n_candidates > 0, spread[first_row], np.nan)
         second_spread = np.where(n_candidates > 1, spread[second_row], np.inf)
 
-        # Presses without candidates are `apart`, or `no_contour` if the map does not contain their charges.
+        # The contours of a press without candidates are `apart`, or do not exist if the map has no such charges.
         status = np.where(n_candidates > 0, int(Meeting.met), int(Meeting.apart))
         has_no_contour = (n_candidates == 0) & self._grid.is_out_of_range(charge, force)
         status[has_no_contour] = Meeting.no_contour
 
-        # A press is ambiguous if its second candidate is almost as good as the best one, or fits almost exactly.
+        # A press is ambiguous if its second-best candidate is almost as good as the best one, or has a tiny spread.
         is_ambiguous = second_spread <= np.maximum(AMBIGUOUS_RATIO * smallest_spread, AMBIGUOUS_SPREAD)
         status[is_ambiguous] = Meeting.twice
 
-        # Ambiguous presses have no contact either.
+        # Only presses with the status `met` have a contact. The contacts of all other presses are NaN.
         is_met = status == Meeting.met
         contact = np.full((n_press, 3), np.nan)
         contact[is_met] = candidates.contact[first_row[is_met]]
@@ -196,120 +198,127 @@ class Triangulation:
 
     @cached_property
     def _charges(self) -> ChargeMap:
-        """Charge map with fast derivatives."""
+        """Charge map that computes derivatives fast."""
         return with_fast_derivatives(self.charge_map)
 
     @cached_property
     def _grid(self) -> SeedGrid:
-        """Grid of positions at which the search starts."""
+        """Grid of positions from which the starting points of the search are chosen."""
         return SeedGrid.of(self._charges)
 
-    def _seeds(self, charge: Array, force: Array | None) -> Candidates:
-        """Select the nodes of the grid that are nearer to the contours than their neighbours.
+    def _starting_points(self, charge: Array, force: Array | None) -> Candidates:
+        """Choose the nodes of the grid that are nearer to the contours of a press than their neighbours.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
-            force: Force of each press, shape (n,), N; None if the best force of each node is to be used.
+            force: Force of each press, shape (n,), N. If None, the force is chosen at each node such that the total
+                charge of all electrodes is correct.
 
         Returns:
             Starting points, at most `MAX_SEEDS` for each press.
         """
-        # One force for each press and node, shape (n, n_node), or one force for each press, shape (n, 1)
+        # There is one force for each press and node, shape (n, n_node), or one force for each press, shape (n, 1).
         grid = self._grid
         forces = grid.matching_force(charge) if force is None else force[:, None]
-        press, node = grid.lowest(grid.distance(charge, forces), MAX_SEEDS)
-        seed_force = forces[press, node] if force is None else force[press]
-        return Candidates.begin(press, np.column_stack([grid.position[node], seed_force]))
+        press, node = grid.local_minima(grid.distance(charge, forces), MAX_SEEDS)
+        start_force = forces[press, node] if force is None else force[press]
+        return Candidates.from_starting_points(press, np.column_stack([grid.position[node], start_force]))
 
-    def _second_seeds(self, meetings: Candidates, *, is_force_fixed: bool) -> Candidates:
-        """Create starting points of a search for a second meeting of the contours beside each meeting.
+    def _second_starting_points(self, solutions: Candidates, *, is_force_fixed: bool) -> Candidates:
+        """Choose the starting points of a search for a second solution beside each solution.
 
-        Near a fold of the charge map, two contacts that are close together have the same charges. They lie in the
-        direction in which the distances from the contours change least. Two starting points are therefore placed in
-        this direction, on opposite sides of each meeting.
+        A solution is a contact near which the contours of a press meet. Near a fold of the charge map, two contacts
+        that are close together have the same charges. The difference between the two contacts has the direction in
+        which the distances from the contours change least. Two starting points are therefore placed in this direction,
+        on opposite sides of each solution.
 
         Args:
-            meetings: Meetings of the contours that have been found.
+            solutions: Solutions that have been found.
             is_force_fixed: Whether the force keeps its value.
 
         Returns:
-            Two starting points for each meeting.
+            Two starting points for each solution.
         """
         any_charge = 0.0  # the derivatives do not depend on the charge
-        _, derivatives = self._distances(meetings.contact, any_charge, is_force_fixed=is_force_fixed)
+        _, derivatives = self._distances(solutions.contact, any_charge, is_force_fixed=is_force_fixed)
         _, _, right_singular_vectors = np.linalg.svd(derivatives)
-        weakest_direction = right_singular_vectors[:, -1]  # of the smallest singular value, shape (n, n_unknown)
+        weakest_direction = right_singular_vectors[:, -1]  # belongs to the smallest singular value; (n, n_unknown)
         step = SECOND_START_DISTANCE * self.tolerance * weakest_direction
-        backward = Candidates.begin(meetings.press, self._moved(meetings.contact, -step))
-        forward = Candidates.begin(meetings.press, self._moved(meetings.contact, step))
-        return backward.joined(forward)
+        backward = Candidates.from_starting_points(solutions.press, self._move(solutions.contact, -step))
+        forward = Candidates.from_starting_points(solutions.press, self._move(solutions.contact, step))
+        return backward.joined_with(forward)
 
     # Search from the starting points
 
-    def _approach(self, charge: Array, seeds: Candidates, *, is_force_fixed: bool) -> Candidates:
-        """Minimise the mean square distance from the contours by the Gauss-Newton method.
+    def _minimise_distances(self, charge: Array, starts: Candidates, *, is_force_fixed: bool) -> Candidates:
+        """Minimise the mean square distance of contacts from the contours by the Gauss-Newton method.
 
         Args:
             charge: Charges of all presses, shape (n, n_electrode), pC.
-            seeds: Starting points.
+            starts: Starting points of the searches.
             is_force_fixed: Whether the force keeps its value.
 
         Returns:
-            The best contact of each starting point whose distance from the contours is within the tolerance, without
-            duplicates.
+            The best contact of each search, without duplicates. Searches whose root mean square distance exceeds the
+            tolerance are omitted.
         """
-        contact = seeds.contact
-        best = seeds
+        contact = starts.contact
+        best = starts
         for _ in range(STEPS):
-            distance, derivatives = self._distances(contact, charge[seeds.press], is_force_fixed=is_force_fixed)
+            distance, derivatives = self._distances(contact, charge[starts.press], is_force_fixed=is_force_fixed)
             rms_distance = np.sqrt(np.mean(distance**2, axis=1))
-            best = best.improved(contact, rms_distance)
-            contact = self._moved(contact, gauss_newton_step(derivatives, distance))
-        return best[best.spread <= self.tolerance].distinct(MIN_DISTANCE)
+            best = best.replaced_where_better(contact, rms_distance)
+            contact = self._move(contact, gauss_newton_step(derivatives, distance))
+        return best[best.spread <= self.tolerance].without_duplicates(MIN_DISTANCE)
 
-    def _cross(self, charge: Array, candidates: Candidates) -> Candidates:
+    def _replace_by_crossings(self, charge: Array, candidates: Candidates) -> Candidates:
         """Replace each candidate by the mean of the crossings of the contours near this candidate.
 
-        Three contours have three crossings of two contours. The contours meet if all three crossings lie within the
-        tolerance of their mean. The new position of a candidate is the average of this mean over all triples of
-        contours that meet near the candidate.
+        A triple of contours has three crossings, one for each pair of contours. The triple meets if all three crossings
+        lie within the tolerance of their mean. The new position of a candidate is the average of this mean over all
+        triples that meet near the candidate.
 
         Args:
-            charge: Touch charges, shape (n, n_electrode), pC.
+            charge: Touch charges of all presses, shape (n, n_electrode), pC.
             candidates: Candidates near which crossings are searched for.
 
         Returns:
-            The candidates near which at least one triple meets, without duplicates.
+            The candidates near which at least one triple meets, with their new positions and without duplicates. The
+            spread is the largest distance between a crossing and the mean of its triple.
         """
         n_electrode = len(self.charge_map.electrodes)
-        crossings = {pair: self._crossing(charge, candidates, pair) for pair in combinations(range(n_electrode), 2)}
+        pairs = combinations(range(n_electrode), 2)
+        crossings = {pair: self._crossings_of_pair(charge, candidates, pair) for pair in pairs}
 
-        # Sum of the means, largest spread and number of the triples that meet near each candidate
+        # Accumulate the sum of the means, the number of triples that meet, and the largest spread for each candidate.
         position_sum = np.zeros((len(candidates.press), 2))
         n_meeting = np.zeros_like(candidates.press)
         spread = np.zeros_like(candidates.spread)
         for triple in combinations(range(n_electrode), 3):
-            corners = np.stack([crossings[pair] for pair in combinations(triple, 2)], axis=1)  # (n_candidate, 3, 2)
-            mean = corners.mean(axis=1)
-            distance = np.linalg.norm(corners - mean[:, None], axis=2).max(axis=1)
+            triple_crossings = np.stack([crossings[pair] for pair in combinations(triple, 2)], axis=1)
+            mean = triple_crossings.mean(axis=1)  # mean over the three crossings, shape (n_candidate, 2)
+            distance = np.linalg.norm(triple_crossings - mean[:, None], axis=2).max(axis=1)
             is_meeting = distance <= self.tolerance  # False if a pair does not cross, because its distance is NaN
             position_sum[is_meeting] += mean[is_meeting]
             spread[is_meeting] = np.maximum(spread[is_meeting], distance[is_meeting])
             n_meeting += is_meeting
         position = position_sum / np.maximum(n_meeting, 1)[:, None]  # mean over the triples that meet
         contact = np.column_stack([position, candidates.contact[:, 2]])
-        return Candidates(candidates.press, contact, spread)[n_meeting > 0].distinct(MIN_DISTANCE)
+        return Candidates(candidates.press, contact, spread)[n_meeting > 0].without_duplicates(MIN_DISTANCE)
 
-    def _crossing(self, charge: Array, candidates: Candidates, pair: tuple[int, int]) -> Array:
-        """Find the crossing of two contours by Newton's method from each candidate. The force keeps its value.
+    def _crossings_of_pair(self, charge: Array, candidates: Candidates, pair: tuple[int, int]) -> Array:
+        """Find the crossing of the contours of two electrodes near each candidate, by Newton's method.
+
+        The force of a candidate keeps its value.
 
         Args:
             charge: Charges of all presses, shape (n, n_electrode), pC.
-            candidates: Candidates from which the search starts.
+            candidates: Candidates from which the searches start.
             pair: Indices of the two electrodes.
 
         Returns:
-            Positions, shape (n_candidate, 2), mm; NaN if the contours do not cross.
+            Position (x, y) of the crossing near each candidate, shape (n_candidate, 2), mm; NaN if Newton's method does
+            not converge, for example because the contours do not cross.
         """
         contact = candidates.contact.copy()
         crossing = np.full((len(candidates.press), 2), np.nan)
@@ -320,7 +329,7 @@ class Triangulation:
             pair_distances = distances[:, pair]
             pair_derivatives = derivatives[:, pair]  # shape (n_active, 2, 2)
 
-            # Store the contacts that lie on both contours, and continue with the others.
+            # Store the positions that lie on both contours, and continue with the other candidates.
             is_moving = np.abs(pair_distances).max(axis=1) >= CONVERGED_DISTANCE
             converged = active[~is_moving]
             crossing[converged] = contact[converged, :2]
@@ -330,46 +339,49 @@ class Triangulation:
 
             # For two equations with two unknowns, the Gauss-Newton step is the Newton step.
             step = gauss_newton_step(pair_derivatives[is_moving], pair_distances[is_moving])
-            contact[active] = self._moved(contact[active], step)
+            contact[active] = self._move(contact[active], step)
         return crossing
 
     def _distances(self, contact: Array, charge: Array | float, *, is_force_fixed: bool) -> tuple[Array, Array]:
-        """Estimate the signed distances from contacts to the contours of given charges, and their derivatives.
+        """Estimate the signed distance of each contact from the contour of each electrode, and its derivatives.
+
+        To first order, the distance is the difference of the charges divided by the length of the gradient of the
+        charge. The unknowns are x, y and, unless the force is fixed, ln F times the radius of the domain. All unknowns
+        are therefore lengths.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            charge: Charges of the contours, shape (n, n_electrode), pC.
-            is_force_fixed: Whether the derivative with respect to the force is omitted.
+            charge: Charges of the electrodes on their contours, shape (n, n_electrode), pC.
+            is_force_fixed: Whether the derivative with respect to the third unknown is omitted.
 
         Returns:
-            Distances, shape (n, n_electrode), mm. Dimensionless derivatives of the distances, shape (n, n_electrode, 2
-            or 3): with respect to x and y, and with respect to ln F times the radius unless the force is fixed.
+            Distances, shape (n, n_electrode), mm. Derivatives of the distances with respect to the unknowns, shape (n,
+            n_electrode, 2) if the force is fixed and (n, n_electrode, 3) otherwise, dimensionless.
         """
         predicted, charge_derivatives = linearised(self._charges, contact)
 
-        # The slope is the length of the gradient. Its lower bound keeps the distance finite where the charge has an
-        # extremum. The typical slope increases with the force like the charges.
-        typical_slope = np.median(self._grid.slope, axis=0) * self._grid.growth(contact[:, 2])[:, None]
+        # The slope is the length of the gradient. Its lower bound, a fraction of the typical slope, keeps the distance
+        # finite where the charge has an extremum. The typical slope increases with the force like the charges.
+        typical_slope = np.median(self._grid.slope, axis=0) * self._grid.relative_size_at(contact[:, 2])[:, None]
         gradient_length = np.linalg.norm(charge_derivatives[..., :2], axis=2)
         slope = np.maximum(gradient_length, MIN_SLOPE * typical_slope)  # pC/mm
 
-        # To first order, the distance from a contour is the difference of the charges over the slope.
         distance = (predicted - charge) / slope
-        unknown_scales = np.array([1.0, 1.0, self.charge_map.domain.radius])  # the third unknown is ln F times radius
+        unknown_scales = np.array([1.0, 1.0, self.charge_map.domain.radius])  # the unknowns over (x, y, ln F)
         distance_derivatives = charge_derivatives / (slope[..., None] * unknown_scales)
         if is_force_fixed:
             distance_derivatives = distance_derivatives[..., :2]
         return distance, distance_derivatives
 
-    def _moved(self, contact: Array, step: Array) -> Array:
-        """Move contacts by a step, and keep them within the domain of the charge map.
+    def _move(self, contact: Array, step: Array) -> Array:
+        """Return contacts that are moved by a step and kept within the domain of the charge map.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            step: Changes of x, y and, optionally, ln F times the radius, shape (n, 2) or (n, 3), mm.
+            step: Changes of x, y and, optionally, ln F times the radius of the domain, shape (n, 2) or (n, 3), mm.
 
         Returns:
-            Contacts, shape (n, 3), mm and N.
+            Moved contacts (x, y, F), shape (n, 3), mm and N.
         """
         domain = self.charge_map.domain
         position = onto_disk(contact[:, :2] + step[:, :2], INNER_RADIUS * domain.radius)
@@ -380,23 +392,24 @@ class Triangulation:
 
 
 def gauss_newton_step(slopes: Array, distance: Array) -> Array:
-    """Compute the Gauss-Newton step that minimises the sum of the squared distances.
+    """Compute the damped Gauss-Newton steps of n problems, in which sums of squared distances are minimised.
 
     Args:
         slopes: Derivatives of the distances with respect to the unknowns, shape (n, n_distance, n_unknown),
             dimensionless and of order one.
-        distance: Distances, shape (n, n_distance), mm.
+        distance: Distances of each problem, shape (n, n_distance), mm.
 
     Returns:
-        Step, shape (n, n_unknown), mm, not longer than `MAX_STEP`.
+        Step of each problem, shape (n, n_unknown), mm, not longer than `MAX_STEP`.
     """
-    # Normal equations (J' J + damping) step = -J' distance, with sums over the distances i of each row n
+    # Let J be the slopes of one problem (index n). The normal equations are (J' J + damping) step = -J' distance, with
+    # sums over the distances (index i).
     normal_matrix = np.einsum("nij,nik->njk", slopes, slopes) + DAMPING * np.eye(slopes.shape[2])
     gradient = np.einsum("nij,ni->nj", slopes, distance)
     step: Array = -np.linalg.solve(normal_matrix, gradient[..., None])[..., 0]
 
     # Shorten steps that are longer than `MAX_STEP`.
     length = np.linalg.norm(step, axis=1)
-    factor = np.minimum(1.0, MAX_STEP / np.maximum(length, 1e-300))  # a step of length zero remains zero
+    factor = np.minimum(1.0, MAX_STEP / np.maximum(length, 1e-300))  # the lower bound avoids a division by zero
     step *= factor[:, None]
     return step

@@ -1,1 +1,1 @@
-"""Datasets of presses: sampling, simulation of a sweep, and the file format."""
+"""Datasets of simulated presses: sampling of the presses, simulation of their charges, and the file format."""

@@ -1,12 +1,14 @@
-"""Sampling of the presses of a sweep: probes, positions, forces and, optionally, orientations.
+"""Sampling of the positions, forces, probes and orientations of the presses of a sweep.
 
-    sobol   scrambled Sobol points, which cover the domain more evenly than independent draws (Owen 1998), with a
-            separate sequence for each probe
-    random  independent draws
+There are three kinds of sampling:
+
+    sobol   scrambled Sobol points, which cover the domain more evenly than independent random numbers (Owen 1998), with
+            a separate sequence for each probe
+    random  independent random numbers
     grid    every force with every orientation at every position of a square lattice, at most the requested number
 
-Sobol and random presses are uniformly distributed over the disk and in the logarithm of the force. The probes
-alternate.
+The positions of Sobol and random presses are uniformly distributed over the disk, and so are the logarithms of their
+forces over the range of forces. Successive presses of a sweep use the probes in turn.
 """
 
 from collections.abc import Sequence
@@ -23,7 +25,7 @@ from isocharge.simulate.numerics.disk import lattice
 from isocharge.simulate.sensor.probe import Probe
 
 MAX_SAMPLES = 10_000_000
-"""Largest number of presses of a sweep. The files of such a dataset occupy about 600 MB."""
+"""Largest number of presses of a sweep. The files of a dataset with so many presses occupy about 600 MB."""
 
 FULL_TURN = 2.0 * np.pi
 """Angle of a full turn, rad."""
@@ -33,13 +35,13 @@ SAMPLING_DESCRIPTIONS = {
     "random": "independent, uniform over the disk, log-uniform in force",
     "grid": "grid: square lattice over the disk, forces in equal steps of the logarithm, evenly spread orientations",
 }
-"""Description of each sampling in the manifest."""
+"""Description of each kind of sampling in the manifest of a dataset."""
 
 Sampling = Literal["sobol", "random", "grid"]
-"""Name of a sampling."""
+"""Name of a kind of sampling."""
 
 Orientation = Literal["fixed", "random"]
-"""Whether the orientation of the probe is fixed or random."""
+"""Whether all presses have the given orientation of the probe, or each press has a random orientation."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +49,9 @@ class SweepPresses:
     """Presses of a sweep, in the order of the sweep.
 
     Attributes:
-        probe: Number of the probe of each press, shape (n,).
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        rotation: Rotation of the probe relative to its notation, anticlockwise, shape (n,), rad.
+        probe: Index of the probe of each press, shape (n,).
+        contact: Contact (x, y, F) of each press, shape (n, 3), mm and N.
+        rotation: Rotation of the probe in addition to its own orientation, anticlockwise, shape (n,), rad.
     """
 
     probe: Integers
@@ -60,6 +62,7 @@ class SweepPresses:
         return self.probe.size
 
     def __getitem__(self, part: slice | Integers) -> "SweepPresses":
+        """Return the presses that a slice or an array of indices selects."""
         return SweepPresses(self.probe[part], self.contact[part], self.rotation[part])
 
 
@@ -70,11 +73,11 @@ class Sweep:
     Attributes:
         radius: Largest distance of a press from the centre, mm.
         force_range: Smallest and largest force, N.
-        samples: Number of presses, divided equally among the probes. A grid may have fewer presses.
+        samples: Number of presses, which are divided equally among the probes. A grid may have fewer presses.
         seed: Seed of the random numbers. A grid does not depend on the seed.
-        orientation: "fixed" for the orientation of the given probes, or "random" for orientations over a full turn. A
-            grid has orientations at equal angles within the period of the probe instead of random ones.
-        sampling: "sobol", "random" or "grid".
+        orientation: "fixed" if all presses have the orientation of the given probes, "random" for orientations over a
+            full turn. With "random", a grid has equally spaced orientations within the period of the probe.
+        sampling: Kind of sampling: "sobol", "random" or "grid".
     """
 
     radius: float = DEFAULT_RADIUS
@@ -85,7 +88,7 @@ class Sweep:
     sampling: Sampling = "sobol"
 
     def __post_init__(self) -> None:
-        """Check the values.
+        """Check the definition of the sweep.
 
         Raises:
             SceneError: If a value is not allowed.
@@ -108,7 +111,9 @@ class Sweep:
         return self._presses_of_probe(0, 1, FULL_TURN).contact
 
     def over(self, probes: Sequence[Probe]) -> SweepPresses:
-        """Return the presses of a sweep with several probes. Successive presses use the probes in turn.
+        """Return the presses of a sweep with several probes.
+
+        Successive presses use the probes in turn.
 
         Args:
             probes: Probes of the sweep.
@@ -134,78 +139,90 @@ class Sweep:
         return all_presses[order]
 
     def _presses_of_probe(self, probe_index: int, n_probe: int, period: float) -> SweepPresses:
-        """Return the presses of one probe: a grid, or presses that are drawn uniformly over the disk.
+        """Return the presses of one probe of a sweep.
 
         Args:
-            probe_index: Index of the probe.
+            probe_index: Index of the probe in the sweep.
             n_probe: Number of probes in the sweep.
-            period: Smallest rotation that maps the probe onto itself, rad.
+            period: Smallest rotation that maps the probe onto itself, rad; 0 for a circle.
         """
         if self.sampling == "grid":
             position, force, rotation = self._grid(self.samples // n_probe, period)
         else:
             count = len(range(probe_index, self.samples, n_probe))  # every n_probe-th press of the sweep
-            position, force, rotation = self._drawn(count, probe_index)
+            position, force, rotation = self._draw(count, probe_index)
         contact = np.stack([position.real, position.imag, force], axis=1)
         return SweepPresses(np.full(position.size, probe_index), contact, rotation)
 
-    def _drawn(self, count: int, probe_index: int) -> tuple[Complexes, Array, Array]:
-        """Draw the presses of one probe, uniformly over the area of the disk and in the logarithm of the force.
+    def _draw(self, count: int, probe_index: int) -> tuple[Complexes, Array, Array]:
+        """Draw the presses of one probe with Sobol points or random numbers.
+
+        The positions are uniformly distributed over the disk. The logarithms of the forces are uniformly distributed
+        over the range of forces.
 
         Args:
             count: Number of presses.
-            probe_index: Index of the probe.
+            probe_index: Index of the probe in the sweep.
 
         Returns:
             Positions x + iy (mm), forces (N) and rotations (rad), each of shape (count,).
         """
-        fractions = self._unit_cube(count, probe_index)  # uniform in [0, 1), with one column for each quantity
+        fractions = self._unit_cube(count, probe_index)
         distance_fraction, angle_fraction, force_fraction, rotation_fraction = fractions.T
-        distance = self.radius * np.sqrt(distance_fraction)  # the area within a distance grows with its square
+        distance = self.radius * np.sqrt(distance_fraction)  # the area within a distance is proportional to its square
         position = distance * np.exp(1j * FULL_TURN * angle_fraction)
         rotation = FULL_TURN * rotation_fraction if self.orientation == "random" else np.zeros(count)
         return position, self._force(force_fraction), rotation
 
     def _unit_cube(self, count: int, probe_index: int) -> Array:
-        """Draw points of the unit cube for the presses of one probe.
+        """Draw points that are uniformly distributed over the unit cube in four dimensions.
 
         Args:
-            count: Number of presses.
-            probe_index: Index of the probe. Each probe has its own sequence of random numbers.
+            count: Number of points.
+            probe_index: Index of the probe in the sweep. Each probe has its own sequence of random numbers.
 
         Returns:
-            Points (distance, angle, force, rotation), each coordinate from 0 to 1, shape (count, 4).
+            Points, shape (count, 4), with coordinates from 0 to 1. The coordinates are for the distance, the angle, the
+            force and the rotation of a press.
         """
         rng = np.random.default_rng([self.seed, probe_index])
         if self.sampling == "random":
             return rng.random((count, 4))
 
-        # A Sobol sequence is balanced if the number of points is a power of two. Draw the next power of two, and take
-        # the first points.
+        # A Sobol sequence is balanced if the number of points is a power of two. Draw the next larger power of two, and
+        # use the first `count` points.
         log2_count = int(np.ceil(np.log2(max(count, 2))))
         points = scipy.stats.qmc.Sobol(4, rng=rng).random_base2(log2_count)
         return np.asarray(points[:count])
 
     def _force(self, fraction: Array) -> Array:
-        """Return the forces (N) at fractions of the logarithmic range, from 0 (smallest force) to 1 (largest force)."""
-        min_log_force, max_log_force = np.log(self.force_range)
-        force = np.exp(min_log_force + (max_log_force - min_log_force) * fraction)
-        return np.asarray(np.clip(force, *self.force_range))  # rounding may lead out of the range
-
-    def _grid(self, max_count: int, period: float) -> tuple[Complexes, Array, Array]:
-        """Return the presses of a grid.
-
-        At first, the number of steps is the same in each direction. The number of forces is then increased as far as
-        the number of presses allows.
+        """Convert fractions of the logarithmic range of forces into forces.
 
         Args:
-            max_count: Largest number of presses.
+            fraction: Fractions from 0 (smallest force) to 1 (largest force), shape (n,).
+
+        Returns:
+            Forces, shape (n,), N.
+        """
+        min_log_force, max_log_force = np.log(self.force_range)
+        force = np.exp(min_log_force + (max_log_force - min_log_force) * fraction)
+        return np.asarray(np.clip(force, *self.force_range))  # rounding must not move a force out of the range
+
+    def _grid(self, max_count: int, period: float) -> tuple[Complexes, Array, Array]:
+        """Return the presses of a grid with every combination of a position, a force and a rotation.
+
+        First, the same number of steps is assumed for each dimension of the grid. The number of forces is then
+        increased as far as the largest number of presses allows.
+
+        Args:
+            max_count: Largest number of presses in the grid.
             period: Smallest rotation that maps the probe onto itself, rad; 0 for a circle.
 
         Returns:
             Positions x + iy (mm), forces (N) and rotations (rad), each of shape (n,).
         """
-        # The grid has two dimensions for the position, and one each for the force and the rotation if they vary.
+        # The grid has two dimensions for the position, one for the force if it varies, and one for the rotation if it
+        # varies.
         min_force, max_force = self.force_range
         has_forces = min_force < max_force
         has_rotations = self.orientation == "random" and period > 0.0
@@ -214,16 +231,17 @@ class Sweep:
         n_rotation = steps_per_dimension if has_rotations else 1
         initial_n_force = steps_per_dimension if has_forces else 1
 
-        # The lattice may have fewer positions than requested, so the number of forces is computed from it.
+        # The lattice may have fewer positions than requested. The number of forces is therefore computed from the
+        # actual number of positions.
         max_positions = max_count // (n_rotation * initial_n_force)
         positions: Complexes = self.radius * lattice(max_positions)
         n_force = max_count // (positions.size * n_rotation) if has_forces else 1
-        middle = np.array([0.5])  # a single force is the geometric mean of the range
-        force_fractions = np.linspace(0.0, 1.0, n_force) if n_force > 1 else middle
+        middle_fraction = np.array([0.5])  # a single force is the geometric mean of the range
+        force_fractions = np.linspace(0.0, 1.0, n_force) if n_force > 1 else middle_fraction
         forces = self._force(force_fractions)
         rotations: Array = period * np.arange(n_rotation) / n_rotation
 
-        # All combinations of positions, forces and rotations
+        # Return all combinations of the positions, forces and rotations.
         shape = (positions.size, n_force, n_rotation)
         position_index, force_index, rotation_index = np.indices(shape).reshape(3, -1)
         return positions[position_index], forces[force_index], rotations[rotation_index]

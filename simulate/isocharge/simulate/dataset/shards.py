@@ -1,13 +1,13 @@
-"""Dataset format: reader and writer of a folder with shards, a manifest and a data card.
+"""Reader and writer of datasets. A dataset is a folder with shards, a manifest and a data card.
 
-The file manifest.json contains the format version and a description of the sensor, the probes, the ranges, the seed,
-the solver and the columns. It also contains the checksum of each shard. The file README.md is the data card, a
-description for readers. Each shard, such as shard-00000.npz, contains the columns x_mm, y_mm, force_N, probe,
-orientation_deg and charge_pC. The column charge_pC has the shape (n, n_electrode), and all other columns have the shape
-(n,).
+The manifest is the file manifest.json. It contains the version of the format and the checksum of each shard, and
+describes the sensor, the probes, the ranges, the seed, the solver and the columns. The data card is the file README.md,
+which describes the dataset for human readers. The shards are files such as shard-00000.npz, over which the samples are
+distributed. Each shard contains the columns x_mm, y_mm, force_N, probe, orientation_deg and charge_pC. The column
+charge_pC has the shape (n, n_electrode), and all other columns have the shape (n,).
 
-A dataset is written under a temporary name and renamed when it is complete. Measured data has the same format, but its
-manifest has no entries `solver` and `seed`.
+A dataset is written into a temporary folder, which is renamed when the dataset is complete. A dataset of measured
+presses has the same format, but its manifest has no entries `solver` and `seed`.
 """
 
 import io
@@ -30,7 +30,7 @@ from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
 FORMAT_VERSION = 1
-"""Version of the format in the manifest."""
+"""Version of the format of datasets, which the manifest contains."""
 
 COLUMNS = {
     "x_mm": "position of the press along the drawn direction, mm",
@@ -40,21 +40,21 @@ COLUMNS = {
     "orientation_deg": "angle by which the probe is turned against its notation, deg, anticlockwise",
     "charge_pC": "touch charge of each electrode, pC, electrodes in the manifest's order",
 }
-"""Columns of a shard and their descriptions in the manifest and the data card."""
+"""Names of the columns of a shard, and their descriptions in the manifest and in the data card."""
 
 MAX_SHARD_BYTES = 1 << 26
-"""Largest size of a shard, bytes."""
+"""Largest size of the file of a shard, bytes."""
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Presses and their charges.
+    """Presses and the charges that they cause.
 
     Attributes:
-        x_mm: Position along the drawn direction, shape (n,), mm.
-        y_mm: Position across the drawn direction, shape (n,), mm.
-        force_N: Force, positive for a push, shape (n,), N.
-        probe: Notation of the probe without the angle, shape (n,), text.
+        x_mm: Position of each press along the drawn direction, shape (n,), mm.
+        y_mm: Position of each press across the drawn direction, shape (n,), mm.
+        force_N: Force of each press, positive for a push, shape (n,), N.
+        probe: Notation of the probe of each press without its rotation, shape (n,), text.
         orientation_deg: Rotation of the probe relative to its notation, anticlockwise, shape (n,), degrees.
         charge_pC: Touch charge of each electrode, shape (n, n_electrode), pC.
     """
@@ -70,20 +70,20 @@ class Samples:
         return len(self.x_mm)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return the arrays by the names of the columns."""
+        """Return the array of each column by the name of the column."""
         return {name: getattr(self, name) for name in COLUMNS}
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """Dataset in memory.
+    """Content of a dataset that has been read.
 
     Attributes:
         sensor: Sensor to which the charges belong.
-        samples: Samples of all shards in order.
+        samples: Samples of all shards, in the order of the shards.
         manifest: Content of the manifest.
-        sha256: Checksum of the manifest. It identifies the dataset, because the manifest contains the checksums of the
-            shards.
+        sha256: Checksum of the manifest. It identifies the whole dataset, because the manifest contains the checksums
+            of the shards.
     """
 
     sensor: Sensor
@@ -93,13 +93,13 @@ class Dataset:
 
 
 def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about: dict[str, Any]) -> Path:
-    """Write a dataset.
+    """Write a dataset into a new folder.
 
     Args:
-        folder: Folder to create. It must not exist yet.
+        folder: Folder that is created. It must not exist yet.
         sensor: Sensor to which the charges belong.
-        shards: Samples of each shard, which is one file of the dataset. The iterable is consumed while the shards are
-            written.
+        shards: Samples of each shard, which is one file of the dataset. The samples of a shard are requested from the
+            iterable only when the shard is written.
         about: Entries of the manifest about the origin of the samples, such as probes, ranges, seed and solver.
 
     Returns:
@@ -107,9 +107,10 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
 
     Raises:
         OutputExists: If the folder already exists.
-        DatasetError: If the columns of a shard have different lengths or contain numbers that are not finite.
+        DatasetError: If a column of a shard has a wrong shape or type, or contains a number that is not finite.
     """
-    with new_folder(folder) as temporary_folder:  # is renamed when the dataset is complete
+    # The files are written into a temporary folder, which is renamed to `folder` when the dataset is complete.
+    with new_folder(folder) as temporary_folder:
         entries = []
         for index, samples in enumerate(shards):
             name, data = pack_shard(index, samples, sensor)
@@ -120,15 +121,19 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
 
 
 def pack_shard(number: int, samples: Samples, sensor: Sensor) -> tuple[str, bytes]:
-    """Convert samples into the file name and the content of a shard.
+    """Convert samples into the file of a shard.
 
     Args:
-        number: Number of the shard.
+        number: Number of the shard, from 0.
         samples: Samples of the shard.
         sensor: Sensor to which the charges belong.
 
+    Returns:
+        Name and content of the file.
+
     Raises:
-        DatasetError: If the columns have different lengths or contain numbers that are not finite.
+        DatasetError: If a column has a wrong shape or type or contains a number that is not finite, or if the file is
+            too large.
     """
     name = shard_name(number)
     _check_samples(samples, len(sensor.electrodes), name)
@@ -141,12 +146,18 @@ def pack_shard(number: int, samples: Samples, sensor: Sensor) -> tuple[str, byte
 
 
 def shard_name(number: int) -> str:
-    """Return the file name of a shard."""
+    """Return the file name of the shard with the given number."""
     return f"shard-{number:05d}.npz"
 
 
 def shard_entry(name: str, samples: int, data: bytes) -> dict[str, Any]:
-    """Return the entry of the manifest for a shard."""
+    """Return the entry of the manifest that describes a shard.
+
+    Args:
+        name: File name of the shard.
+        samples: Number of samples in the shard.
+        data: Content of the file.
+    """
     return {"file": name, "samples": samples, "sha256": sha256_of(data)}
 
 
@@ -157,9 +168,9 @@ def write_manifest(
 
     Args:
         folder: Folder that contains the shards.
-        name: Name of the dataset, which may differ from that of the folder.
+        name: Name of the dataset, which may differ from the name of the folder.
         sensor: Sensor to which the charges belong.
-        entries: Entries of the manifest for the shards.
+        entries: Entries of the manifest that describe the shards.
         about: Entries of the manifest about the origin of the samples.
     """
     manifest = {
@@ -177,11 +188,11 @@ def write_manifest(
 
 
 def data_card(name: str, manifest: dict[str, Any]) -> str:
-    """Return the text of the data card, README.md, of a dataset.
+    """Return the text of the file `README.md` of a dataset, which is its data card.
 
     Args:
         name: Name of the dataset.
-        manifest: Content of its file `manifest.json`.
+        manifest: Content of the file `manifest.json` of the dataset.
     """
     probes = manifest.get("probes", [])
     ranges = manifest.get("ranges", {})
@@ -219,7 +230,10 @@ def data_card(name: str, manifest: dict[str, Any]) -> str:
 
 
 def _flat(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the keys and values of nested tables. The keys that lead to a value are joined by spaces."""
+    """Yield the keys and values of nested tables as pairs.
+
+    The keys of a value in an inner table are joined by spaces. For example, {"a": {"b": 1}} yields ("a b", 1).
+    """
     for key, value in table.items():
         if isinstance(value, dict):
             for inner_keys, inner_value in _flat(value):
@@ -229,7 +243,7 @@ def _flat(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
-    """Check shapes, types and values of the columns.
+    """Raise an error if the columns of a shard have wrong shapes, types or values.
 
     Args:
         samples: Samples of a shard.
@@ -240,14 +254,14 @@ def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
         DatasetError: If a column has a wrong shape or type, or contains a number that is not finite.
     """
     shapes = {name: column.shape for name, column in samples.columns().items()}
-    has_rows = samples.x_mm.ndim > 0  # a single number instead of an array has no length
+    has_rows = samples.x_mm.ndim > 0  # an array without dimensions contains a single number and has no length
     count = len(samples) if has_rows else 0
     expected = dict.fromkeys(COLUMNS, (count,)) | {"charge_pC": (count, n_electrode)}
     if shapes != expected or count == 0:
         raise DatasetError(f"{where}: expected columns of shapes {expected}, at least one sample, got {shapes}")
     for name, column in samples.columns().items():
         is_text = name == "probe"
-        expected_kinds = "U" if is_text else "fiu"  # kinds of NumPy types: Unicode; float, signed, unsigned
+        expected_kinds = "U" if is_text else "fiu"  # U: text; f, i, u: floats, signed and unsigned integers
         if column.dtype.kind not in expected_kinds:
             raise DatasetError(
                 f"{where}: column {name}: expected {'text' if is_text else 'numbers'}, got {column.dtype}"
@@ -259,17 +273,17 @@ def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
 
 
 def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
-    """Read a dataset and check every shard against the manifest.
+    """Read a dataset, and check the checksums and the columns of all shards.
 
     Args:
         folder: Folder of the dataset.
-        sensor: Expected sensor; any sensor if absent.
+        sensor: Expected sensor. If it is None, the dataset may belong to any sensor.
 
     Raises:
         DatasetError: If the folder is not a dataset, has a different format version or sensor, or is damaged or
             incomplete. The message names the file and a remedy.
     """
-    # Read the manifest, which describes the sensor and lists the shards.
+    # Read the manifest. Check that it describes the expected sensor.
     folder = Path(folder)
     manifest_path = f"{folder}/manifest.json"
     manifest, checksum = _read_manifest(folder)
@@ -289,7 +303,7 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
             f"{list(dataset_sensor.electrode_names)}, got {shown(checked_manifest.electrodes)}"
         )
 
-    # Read the shards, and join each of their columns.
+    # Read the shards, and concatenate each of their columns.
     shards = [_read_shard(folder, entry, dataset_sensor) for entry in checked_manifest.shards]
     if not shards:
         raise DatasetError(f"{manifest_path}: lists no shards")
@@ -298,14 +312,15 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
 
 
 def _difference(sensor: Sensor, expected: Sensor) -> str:
-    """Describe the differences between a sensor and the expected sensor for an error message.
+    """Describe for an error message how the sensor of a dataset differs from the expected sensor.
 
     Args:
-        sensor: Sensor that was given.
+        sensor: Sensor of the dataset.
         expected: Sensor that was expected.
 
     Returns:
-        The name of the sensor, or, if the names are equal, the keys of the sensor file with different values.
+        If the names of the sensors differ, the name of the sensor of the dataset. Otherwise a text with the keys of the
+        sensor file whose values differ.
     """
     if sensor.name != expected.name:
         return repr(sensor.name)
@@ -317,14 +332,14 @@ def _difference(sensor: Sensor, expected: Sensor) -> str:
 
 
 class _Shard(Struct):
-    """Entry of the manifest for a shard."""
+    """Entry of the manifest that describes a shard, with the keys that the reader uses."""
 
     file: Text
     sha256: Text
 
 
 class _Manifest(Struct):
-    """Entries of the manifest that the reader uses."""
+    """Content of the manifest, with the keys that the reader uses."""
 
     sensor: dict[str, Any]
     electrodes: list[str]
@@ -332,10 +347,16 @@ class _Manifest(Struct):
 
 
 def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
-    """Read the manifest of a dataset and check its format version.
+    """Read the manifest of a dataset, and check the version of the format.
+
+    Args:
+        folder: Folder of the dataset.
 
     Returns:
-        Content of the manifest, and its checksum.
+        Content of the manifest, and checksum of its file.
+
+    Raises:
+        DatasetError: If there is no manifest, or if it is damaged or has another version.
     """
     path = folder / "manifest.json"
     if not path.is_file():
@@ -357,7 +378,7 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
 
 
 def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
-    """Read a shard, and check its checksum and its columns.
+    """Read a shard of a dataset, and check its checksum and its columns.
 
     Args:
         folder: Folder of the dataset.
@@ -368,9 +389,9 @@ def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
         Samples of the shard.
 
     Raises:
-        DatasetError: If the file is missing or damaged, or has other columns.
+        DatasetError: If the file is missing or damaged, or does not contain valid columns.
     """
-    path = folder / Path(entry.file).name  # the name alone, so that a manifest cannot refer to other folders
+    path = folder / Path(entry.file).name  # without a folder, so that a manifest cannot refer to other folders
     if not path.is_file():
         raise DatasetError(f"{path}: the manifest lists this shard, but the file is missing; make the dataset again")
     data = read_needed(path, DatasetError, "make the dataset again", MAX_SHARD_BYTES)
@@ -386,14 +407,16 @@ def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
 
 
 def _unpack(data: bytes, where: str) -> Samples:
-    """Convert the bytes of a shard, an NPZ file, into samples without executing any code in them.
+    """Convert the content of the NPZ file of a shard into samples.
+
+    The file is not trusted. Code that the file may contain is not executed.
 
     Args:
-        data: Contents of the file.
-        where: Beginning of the error message.
+        data: Content of the file.
+        where: First words of the error message, such as the path of the file.
 
     Returns:
-        Samples of the shard, whose columns are not checked.
+        Samples of the shard. Their shapes, types and values are not checked.
 
     Raises:
         DatasetError: If the bytes are not an NPZ file with the columns of a shard.

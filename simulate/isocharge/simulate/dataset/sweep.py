@@ -1,8 +1,8 @@
-"""Simulation of a sweep: many presses over a range of positions and forces, and their charges.
+"""Simulation of a sweep, which computes the charges of many presses and writes them as a dataset.
 
-A forward map is solved for every probe and evaluated for every press. The work is divided into tasks in the same way
-for every executor, so that the files are the same for every executor. Finished parts are saved in a folder next to the
-dataset, from which an interrupted run is resumed.
+A forward map is built for every probe and evaluated for every press. The division of the work into tasks does not
+depend on the executor. The files of the dataset are therefore the same for every executor. Finished parts are saved in
+a folder next to the dataset, so that an interrupted run can be resumed.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -39,10 +39,10 @@ SHARD_SIZE = 16384
 """Default number of samples in a shard."""
 
 TASK_SIZE = 8192
-"""Largest number of presses in a task.
+"""Largest number of presses in a task, which is a call of the executor.
 
-A task then takes about a second, which is long compared with the time for sending the forward map (12 MB) to the
-worker.
+A task of this size takes about a second. This is long compared with the time in which the forward map (12 MB) is sent
+to the worker.
 """
 
 
@@ -57,35 +57,37 @@ def run_sweep(
     shard: int = SHARD_SIZE,
     fresh: bool = False,
 ) -> Path:
-    """Simulate a sweep and write it as a dataset.
+    """Compute the charges of the presses of a sweep, and write them as a dataset.
 
-    If a run is interrupted, a call with the same arguments resumes it.
+    If a run is interrupted, a call with the same arguments resumes the run.
 
     Args:
-        folder: Folder to create. It must not exist yet.
-        sensor: Sensor.
-        probes: Probes, which alternate.
+        folder: Folder that is created. It must not exist yet.
+        sensor: Sensor whose charges are computed.
+        probes: Probes, which successive presses use in turn.
         sweep: Definition of the presses.
-        settings: Settings of the solver.
-        executor: Executor that runs the tasks, such as a process pool or the executor of a Dask cluster; this process
-            if absent. The files do not depend on the executor.
-        shard: Number of samples in a shard.
-        fresh: Whether to delete the saved parts of an earlier run instead of resuming it.
+        settings: Accuracy, theory and mesh of the solver.
+        executor: Executor that runs the tasks, such as a process pool or the executor of a Dask cluster; None for this
+            process. The files do not depend on the executor.
+        shard: Number of samples in a shard, which is one file of the dataset.
+        fresh: Whether to delete the saved parts of an interrupted run instead of resuming this run.
 
     Returns:
         Path of the folder.
 
     Raises:
-        SceneError: If the film cannot be pressed as required.
-        OutputExists: If the folder already exists, or if there is an unfinished run with different settings. The error
-            is raised before the computation starts.
+        SceneError: If a press of the sweep cannot exist.
+        SolveError: If a press has no equilibrium, or the interpolation error of a forward map is too large.
+        OutputExists: If the folder already exists, or if there is an interrupted run with different settings. This
+            error is raised before the computation starts.
         OutputError: If a file cannot be written. The finished parts remain saved.
-        WorkersLost: If the workers of the executor end. The finished parts remain saved.
+        WorkersLost: If the executor loses its workers. The finished parts remain saved.
     """
     folder = Path(folder)
     probes = tuple(probes)
     refuse_finished(folder)
-    # The presses are computed before files are written, because SciPy ignores an interrupt in this step.
+
+    # The presses are computed before files are written, because SciPy ignores an interrupt during this computation.
     presses = sweep.over(probes)
 
     # An interrupted run is resumed only if all these values are the same.
@@ -98,7 +100,8 @@ def run_sweep(
         "shard": shard,
     }
 
-    # The matrices are small, so BLAS is faster with one thread. At the end of the block, the run becomes the dataset.
+    # BLAS is faster with one thread, because the matrices are small. At the end of the block, the folder of the run is
+    # renamed to `folder`.
     with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh) as run:
         maps = [
             ForwardMap.build(
@@ -125,7 +128,15 @@ def solve_maps(
     *,
     executor: Executor | None = None,
 ) -> tuple[ForwardMap, ...]:
-    """Solve a forward map for each probe over the ranges of a sweep; see `run_sweep` for the arguments."""
+    """Build a forward map for each probe of a sweep, which covers the radius and the forces of the sweep.
+
+    Args:
+        sensor: Sensor whose charges are computed.
+        probes: Probes of the sweep.
+        sweep: Definition of the presses.
+        settings: Accuracy, theory and mesh of the solver.
+        executor: Executor that runs the solves; None for this process.
+    """
     return tuple(
         ForwardMap.build(sensor, probe, sweep.radius, sweep.force_range, settings, executor=executor)
         for probe in probes
@@ -133,10 +144,12 @@ def solve_maps(
 
 
 def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
-    """Write the dataset of a sweep in this process from forward maps that have already been solved.
+    """Compute the charges of a sweep with given forward maps, and write them as a dataset.
+
+    In contrast to `run_sweep`, the charges are computed in this process, and an interrupted run cannot be resumed.
 
     Args:
-        folder: Folder to create.
+        folder: Folder that is created. It must not exist yet.
         maps: Forward map of each probe.
         sweep: Definition of the presses.
 
@@ -150,7 +163,12 @@ def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
 
 
 def _manifest_entries(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
-    """Return the entries of the manifest that describe the sweep."""
+    """Return the entries of the manifest that describe the presses and the solver of a sweep.
+
+    Args:
+        maps: Forward map of each probe.
+        sweep: Definition of the presses.
+    """
     return {
         "probes": list(dict.fromkeys(forward_map.probe.notation for forward_map in maps)),
         "ranges": {
@@ -173,19 +191,22 @@ def _manifest_entries(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any
 def _finish_shards(
     run: ResumableRun, maps: Sequence[ForwardMap], presses: SweepPresses, executor: Executor | None, shard: int
 ) -> list[dict[str, Any]]:
-    """Compute and write the shards that an earlier run has not saved. A shard is one file of the dataset.
+    """Compute and save the shards that an interrupted run has not saved yet.
+
+    A shard is one file of the dataset. The progress is reported.
 
     Args:
-        run: Run whose folder contains the shards. The option `final` means that a shard is a file of the dataset.
+        run: Run whose folder contains the shards.
         maps: Forward map of each probe.
         presses: All presses of the sweep.
-        executor: Executor that computes the charges; this process if None.
+        executor: Executor that computes the charges; None for this process.
         shard: Number of presses in a shard.
 
     Returns:
-        Manifest entries of all shards, in order.
+        Entries of the manifest that describe all shards, in the order of the shards.
     """
-    # Load the shards that an earlier run has saved.
+    # Load the shards that an interrupted run has saved. The argument `final` states that a shard is a file of the
+    # dataset, and not only an intermediate result.
     presses_of_shards = list(_split(presses, shard))
     entries: dict[int, dict[str, Any]] = {}  # by the index of the shard
     for index, shard_presses in enumerate(presses_of_shards):
@@ -209,7 +230,7 @@ def _finish_shards(
 
 
 def _split(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
-    """Split presses into parts of equal size."""
+    """Yield successive parts of the presses with `size` presses each. The last part may be smaller."""
     for start in range(0, len(presses), size):
         yield presses[start : start + size]
 
@@ -217,18 +238,18 @@ def _split(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
 def _samples(
     maps: Sequence[ForwardMap], shards: Iterable[SweepPresses], executor: Executor | None
 ) -> Iterator[Samples]:
-    """Yield the samples of each shard in order.
+    """Compute the samples of shards, and yield them in the order of the shards.
 
-    A shard is divided into tasks, each of which computes the charges of some rows of the shard. The workers compute the
-    tasks of later shards in advance.
+    A shard is divided into tasks. Each task computes the charges of some rows of the shard. While the samples of one
+    shard are yielded, the workers already compute the tasks of later shards.
 
     Args:
         maps: Forward map of each probe.
         shards: Presses of each shard.
-        executor: Executor that computes the charges; this process if None.
+        executor: Executor that computes the charges; None for this process.
     """
-    # The tasks of later shards are submitted before the samples of earlier shards are yielded. The two loops over the
-    # shards are therefore at different positions, and each has its own iterator.
+    # The loop that creates the tasks is ahead of the loop that collects the charges. Each loop therefore has its own
+    # iterator over the shards.
     shards_for_samples, shards_for_tasks = tee(shards)
     tasks = (
         (maps[probe], presses.contact[rows], presses.rotation[rows])
@@ -238,13 +259,13 @@ def _samples(
     charges_of_tasks = in_order(executor, _charges, tasks)
     for presses in shards_for_samples:
         charge = np.empty((len(presses), len(maps[0].electrodes)))
-        for _, rows in _tasks(presses, len(maps)):  # the same tasks in the same order as above
+        for _, rows in _tasks(presses, len(maps)):  # the tasks in the order in which they were submitted
             charge[rows] = next(charges_of_tasks)
         yield _samples_of_shard(maps, presses, charge)
 
 
 def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses, charge: Array) -> Samples:
-    """Return the presses of a shard and their charges as samples of a dataset.
+    """Convert the presses of a shard and their charges into the columns of a dataset.
 
     Args:
         maps: Forward map of each probe.
@@ -260,22 +281,22 @@ def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses, charge:
         y_mm=y,
         force_N=force,
         probe=probe_notations[presses.probe],
-        orientation_deg=np.mod(np.round(rotation_deg, 9), 360.0),  # without rounding errors just below 360 degrees
+        orientation_deg=np.mod(np.round(rotation_deg, 9), 360.0),  # rounded, so that 359.999... degrees become 0
         charge_pC=charge,
     )
 
 
 def _tasks(presses: SweepPresses, n_probes: int) -> Iterator[tuple[int, Integers]]:
-    """Divide the presses of a shard, a file of the dataset, into tasks of presses with the same probe.
+    """Divide the presses of a shard into tasks, and yield these tasks.
 
-    A task has at most `TASK_SIZE` presses.
+    All presses of a task have the same probe. A task has at most `TASK_SIZE` presses.
 
     Args:
-        presses: Presses of the shard.
+        presses: Presses of the shard, which is one file of the dataset.
         n_probes: Number of probes of the sweep.
 
     Yields:
-        Number of the probe, and the rows of the shard that belong to the task.
+        Index of the probe, and indices of the presses of the task in the shard.
     """
     for probe in range(n_probes):
         rows = np.flatnonzero(presses.probe == probe)
@@ -284,6 +305,14 @@ def _tasks(presses: SweepPresses, n_probes: int) -> Iterator[tuple[int, Integers
 
 
 def _charges(task: tuple[ForwardMap, Array, Array]) -> Array:
-    """Compute the touch charges of the presses of a task, shape (n, n_electrode), pC."""
+    """Compute the touch charges of the presses of a task.
+
+    Args:
+        task: Forward map of the probe. Contacts (x, y, F), shape (n, 3), mm and N. Rotations of the probe in addition
+            to its own orientation, shape (n,), rad.
+
+    Returns:
+        Charges, shape (n, n_electrode), pC.
+    """
     forward_map, contact, rotation = task
     return forward_map.charges(contact, rotation)

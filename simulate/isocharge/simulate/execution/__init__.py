@@ -1,1 +1,1 @@
-"""Execution of long computations in this process, in worker processes or on a Dask cluster."""
+"""Execution of long computations in this process, in worker processes on this machine, or on a Dask cluster."""

@@ -1,4 +1,4 @@
-"""Restriction of BLAS to one thread."""
+"""Restriction of the linear algebra library (BLAS) to one thread."""
 
 from contextlib import AbstractContextManager
 
@@ -8,10 +8,10 @@ _CONTROLLER = ThreadpoolController()
 
 
 def single_threaded_blas() -> AbstractContextManager[object]:
-    """Return a context manager within which BLAS uses one thread.
+    """Return a context manager within which BLAS uses only one thread.
 
-    Operations on many small matrices are faster with one thread. Several threads would wait for each other in busy
-    loops. These waits are long if other processes use the remaining cores.
+    Operations on many small matrices are faster with one thread. Several threads would often wait for each other in
+    busy loops. Such waits are long if other processes use the remaining cores.
     """
     limiter: AbstractContextManager[object] = _CONTROLLER.limit(limits=1, user_api="blas")
     return limiter

@@ -1,4 +1,4 @@
-"""Fingerprint of the code on which the results depend."""
+"""Fingerprint of the code on which the results of a simulation depend."""
 
 import hashlib
 import importlib.metadata
@@ -9,15 +9,15 @@ PACKAGE = Path(__file__).parents[1]
 """Folder of the package isocharge.simulate."""
 
 LIBRARIES = ("numpy", "scipy", "shapely")
-"""Libraries on whose version the results depend."""
+"""Libraries whose versions affect the results of a simulation."""
 
 
 @lru_cache(maxsize=1)
 def code_fingerprint() -> str:
-    """Return a text that changes whenever the code or a numerical library changes.
+    """Return a text that identifies the code of the simulator and the versions of the numerical libraries.
 
-    The text contains the versions of isocharge, NumPy, SciPy and shapely. It also contains a checksum of the source
-    files of isocharge.simulate and of the built-in sensors.
+    The text contains the versions of isocharge, NumPy, SciPy and shapely, and a checksum of the source files of
+    isocharge.simulate and of the files of the built-in sensors.
     """
     source = hashlib.sha256()
     for path in sources():
@@ -30,5 +30,5 @@ def code_fingerprint() -> str:
 
 
 def sources() -> list[Path]:
-    """Return the files that enter the checksum, in an order that is the same on every machine."""
+    """Return the files from which the checksum is computed, in an order that is the same on every machine."""
     return sorted([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.toml")], key=lambda path: path.as_posix())

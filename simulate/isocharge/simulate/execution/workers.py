@@ -1,7 +1,7 @@
 """Execution of long computations with a `concurrent.futures.Executor`, such as a process pool or a Dask cluster.
 
-The work is divided into jobs beforehand, and the results are returned in the order of the jobs. The results therefore
-do not depend on the executor, on the number of workers, or on the order in which the workers finish.
+The caller divides the work into jobs, and the results are returned in the order of the jobs. The results therefore do
+not depend on the executor, on the number of workers, or on the order in which the workers finish.
 """
 
 import multiprocessing
@@ -27,33 +27,33 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 MAX_PENDING = 64
-"""Default of the largest number of submitted jobs whose results have not been returned yet.
+"""Default value of the largest number of submitted jobs whose results have not been returned yet.
 
-It is enough for about thirty workers and limits the memory that finished results occupy.
+The value suffices for about thirty workers. It limits the memory that finished results occupy.
 """
 
 CONNECT_TIMEOUT_s = 10.0
-"""Longest time to wait for a connection to a Dask cluster, s."""
+"""Longest time for which the program waits for a connection to a Dask cluster, s."""
 
 MANAGER_TIMEOUT_s = 2.0
-"""Longest time to wait for the thread that manages an abandoned process pool, s."""
+"""Longest time for which the program waits for the manager thread of an abandoned process pool, s."""
 
 POLL_INTERVAL_s = 0.005
-"""Interval between two checks of the thread that manages an abandoned process pool, s."""
+"""Time between two checks of the manager thread of an abandoned process pool, s."""
 
 
 def in_order(
     executor: Executor | None, function: Callable[[Job], Result], jobs: Iterable[Job], *, max_pending: int = MAX_PENDING
 ) -> Iterator[Result]:
-    """Call a function with every job and yield the results in the order of the jobs.
+    """Call a function with every job, and yield the results in the order of the jobs.
 
-    A job is taken from the iterable only when it can be submitted.
+    A job is requested from the iterable only when it can be submitted to the executor.
 
     Args:
         executor: Executor that runs the jobs, such as a process pool with any start method, a thread pool, or
             `Client.get_executor()` of Dask. If it is None, each job runs in this process when its result is requested.
         function: Function that is called with each job. Worker processes must be able to import it.
-        jobs: Arguments of the calls.
+        jobs: Argument of each call.
         max_pending: Largest number of submitted jobs whose results have not been returned yet.
 
     Raises:
@@ -62,31 +62,42 @@ def in_order(
     if executor is None:
         yield from map(function, jobs)
         return
+
+    # The workers run the jobs only if they have the same version of the code as this process.
     task = partial(run_same_code, code_fingerprint(), function)
     pending: deque[Future[Result]] = deque()
     try:
         for job in jobs:
             with _executor_errors():
                 pending.append(executor.submit(task, job))
-            # Yield results if too many jobs are pending. Results are also yielded if no job is running any more.
+            # Yield the oldest result if too many jobs are pending, or if no job is running any more. In the second
+            # case, the next job can be submitted after the caller has processed the results.
             while pending and (len(pending) >= max_pending or all(future.done() for future in pending)):
                 yield _result(pending.popleft())
         while pending:
             yield _result(pending.popleft())
-    finally:  # after an error, or if the caller needs no further results
+    finally:
+        # Cancel the remaining jobs after an error, or if the caller requests no further results.
         for future in pending:
             future.cancel()
 
 
 def _result(future: Future[Result]) -> Result:
-    """Wait for a future and return its result."""
+    """Wait until a future is finished, and return its result.
+
+    Raises:
+        WorkersLost: If the executor has lost the worker that computes the result.
+    """
     with _executor_errors():
         return future.result()
 
 
 @contextmanager
 def _executor_errors() -> Iterator[None]:
-    """Convert the exceptions that executors raise when they lose workers into WorkersLost."""
+    """Return a context manager that converts the exceptions of executors that lose workers into WorkersLost.
+
+    All other exceptions, such as those of a job, are raised unchanged.
+    """
     try:
         yield
     except BrokenExecutor as error:
@@ -94,21 +105,25 @@ def _executor_errors() -> Iterator[None]:
     except CancelledError as error:
         raise WorkersLost("the executor was shut down, or lost its workers, before the work was done") from error
     except Exception as error:
-        if not type(error).__module__.startswith("distributed."):  # KilledWorker, CommClosedError
+        # Dask raises its own exceptions, such as KilledWorker and CommClosedError of the package `distributed`.
+        if not type(error).__module__.startswith("distributed."):
             raise
         raise WorkersLost(f"the Dask cluster stopped the computation: {error}") from error
 
 
 def run_same_code(fingerprint: str, function: Callable[[Job], Result], job: Job) -> Result:
-    """Run a job in a worker after checking that the worker runs the same code as the sender.
+    """Run a job in a worker if the worker has the same version of the code as the process that sent the job.
 
     Args:
-        fingerprint: Result of `code_fingerprint` in the sending process.
-        function: Function to call.
+        fingerprint: Result of `code_fingerprint` in the process that sent the job.
+        function: Function that is called with the job.
         job: Argument of the call.
 
+    Returns:
+        Result of the call.
+
     Raises:
-        WorkersLost: If the code of the worker differs, because its results would then differ as well.
+        WorkersLost: If the code of the worker differs, because the results might then differ, too.
     """
     if code_fingerprint() != fingerprint:
         raise WorkersLost(
@@ -125,22 +140,25 @@ def cores() -> int:
 
 @contextmanager
 def local_workers(count: int) -> Iterator[Executor | None]:
-    """Start worker processes on this machine.
+    """Return a context manager that starts worker processes on this machine and provides their executor.
 
     The workers end when the `with` block ends, and also if this process is killed.
 
     Args:
-        count: Number of worker processes. For 1, no process is started and the executor is None.
+        count: Number of worker processes. For 1, no process is started, and None is provided in place of the executor.
     """
     if count == 1:
         yield None
         return
-    context = multiprocessing.get_context("spawn")  # a fork would copy locks that other threads hold
-    worker_end, parent_end = context.Pipe(duplex=False)  # a worker ends when the parent's end is closed
+
+    # The start method "spawn" is used, because a fork would copy locks that other threads hold. A worker ends when the
+    # end of the pipe in this process is closed, which the operating system also does if this process is killed.
+    context = multiprocessing.get_context("spawn")
+    worker_end, parent_end = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_initialise_worker, initargs=(worker_end,))
     try:
         yield pool
-    except BaseException:  # also an interrupt; the running jobs are not completed
+    except BaseException:  # includes KeyboardInterrupt; running jobs are not completed
         _abandon(pool, parent_end)
         raise
     finally:
@@ -150,33 +168,36 @@ def local_workers(count: int) -> Iterator[Executor | None]:
 
 
 def _abandon(pool: ProcessPoolExecutor, parent_end: Connection) -> None:
-    """End the workers of a pool although they are still computing, and wait until the pool has ended.
+    """End the workers of a process pool although they are still computing, and wait until the pool has ended.
 
-    The method `ProcessPoolExecutor.shutdown` is not sufficient, because the thread that manages the pool in this
-    process can fail or wait forever if the workers end unexpectedly. This function prevents two such cases:
+    The method `ProcessPoolExecutor.shutdown` is not sufficient. In this process, a manager thread manages the pool. If
+    the workers end unexpectedly, the manager thread may fail or wait forever in two cases, which this function
+    prevents:
 
-    - A future was cancelled before the workers end. The manager then fails with an InvalidStateError, unless it has
-      discarded the cancelled futures before.
-    - A job that is larger than the pipe is being sent when the workers end. The sending waits forever if this process
-      itself keeps a reading end of the pipe open (https://github.com/python/cpython/issues/94777).
+    - A future is cancelled, and then the workers end. The manager thread fails with an InvalidStateError if it has not
+      discarded the cancelled future yet.
+    - The workers end while a job that is larger than the buffer of a pipe is sent to them. The sending thread waits
+      forever if this process keeps a reading end of this pipe open (https://github.com/python/cpython/issues/94777).
 
     Args:
-        pool: Process pool whose results are not needed.
+        pool: Process pool whose results are no longer needed.
         parent_end: End of the pipe that keeps the workers running.
     """
-    internals: Any = pool  # the attributes below are private, and mypy does not know them
+    internals: Any = pool  # access to private attributes, which mypy does not know
     manager: threading.Thread | None = internals._executor_manager_thread
     job_queue = internals._call_queue
     pool.shutdown(wait=False, cancel_futures=True)
     if manager is None:
         return  # no job was submitted, so there are no workers
 
-    # Wait until the manager has discarded the cancelled futures, which resets the flag. Then end the workers.
+    # Wait until the manager has discarded the cancelled futures. It then resets the flag `_cancel_pending_futures`.
     _wait_until(lambda: not internals._cancel_pending_futures or not manager.is_alive())
+
+    # End the workers, and wait until the manager has noticed that they ended.
     parent_end.close()
     _wait_until(lambda: not manager.is_alive())
 
-    # If a job is still being sent, close the reading end of the pipe in this process, so that the sending fails.
+    # If a job is still being sent, close the reading end of its pipe in this process, so that the sending fails.
     sender: threading.Thread | None = job_queue._thread
     if sender is not None and sender.is_alive():
         job_queue._reader.close()
@@ -185,29 +206,37 @@ def _abandon(pool: ProcessPoolExecutor, parent_end: Connection) -> None:
 
 def _wait_until(condition: Callable[[], bool]) -> None:
     """Wait until a condition is true, but at most for MANAGER_TIMEOUT_s."""
-    end = time.monotonic() + MANAGER_TIMEOUT_s
-    while not condition() and time.monotonic() < end:
+    deadline = time.monotonic() + MANAGER_TIMEOUT_s
+    while not condition() and time.monotonic() < deadline:
         time.sleep(POLL_INTERVAL_s)
 
 
 def _initialise_worker(worker_end: Connection) -> None:
-    """Prepare a worker: ignore interrupts, and end the worker when the parent process closes its end of the pipe."""
+    """Prepare a new worker process.
+
+    The worker ignores interrupts, because the parent process handles interrupts. The worker ends when the parent
+    process closes its end of the pipe.
+
+    Args:
+        worker_end: End of the pipe in the worker.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, args=(worker_end,), daemon=True).start()
 
 
 def _end_with_parent(worker_end: Connection) -> None:
-    """Wait until the parent closes its end of the pipe, and then end this process."""
-    worker_end.poll(None)
+    """Wait until the parent process closes its end of the pipe, and then end this process."""
+    worker_end.poll(None)  # the parent sends no data, so this returns only when its end is closed
     os._exit(1)
 
 
 @contextmanager
 def dask_workers(address: str) -> Iterator[Executor]:
-    """Connect to the workers of a Dask cluster, which must run the same version of isocharge as this process.
+    """Return a context manager that connects to a Dask cluster and provides the executor of its workers.
 
-    If a worker is killed, Dask runs its tasks on the other workers.
+    The workers must have the same version of isocharge as this process. If a worker is killed, Dask runs its tasks on
+    the other workers.
 
     Args:
         address: Address of the scheduler, such as "tcp://10.0.0.1:8786".
@@ -221,7 +250,8 @@ def dask_workers(address: str) -> Iterator[Executor]:
         import dask
         from distributed import Client
 
-    with dask.config.set({"distributed.admin.large-graph-warning-threshold": "100MiB"}):  # tasks contain a map
+    # A task contains a forward map of many MB, about which Dask would warn.
+    with dask.config.set({"distributed.admin.large-graph-warning-threshold": "100MiB"}):
         try:
             client = Client(address, timeout=CONNECT_TIMEOUT_s, set_as_default=False)
         except ValueError as error:
@@ -231,7 +261,7 @@ def dask_workers(address: str) -> Iterator[Executor]:
                 f"no Dask scheduler answers at {address}: {error}; is 'dask scheduler' running?"
             ) from error
         with client:
-            # With `pure=False`, Dask does not compute the keys of the tasks from their large arguments.
+            # With `pure=False`, Dask does not compute the keys of the tasks from their arguments, which are large.
             executor: Executor = client.get_executor(pure=False)
             try:
                 yield executor

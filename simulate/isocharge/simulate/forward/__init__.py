@@ -1,1 +1,1 @@
-"""Fast computation of the charges of presses: readout, forward maps from a few solves, and splines of these maps."""
+"""Fast computation of the charges of many presses, by interpolation between a few solved presses."""

@@ -1,4 +1,7 @@
-"""Charge maps, which compute charges from contacts, and checks of contacts and charges."""
+"""Charge maps, which compute the charges of the electrodes from contacts.
+
+The module also contains functions that check the shapes and values of contacts and charges.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,18 +13,23 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import ChargeError, SceneError
 
 STEPS = (0.05, 0.05, 1e-3)
-"""Steps of the central differences in x and y (mm) and in ln F (dimensionless)."""
+"""Steps of the central differences in x and y (mm) and in ln F (dimensionless), where F is the force."""
 
 MIN_LOG_FORCE_HALF_WIDTH = 0.05
-"""Lower bound for the half width of a domain in ln F, dimensionless. It allows a domain with a single force."""
+"""Smallest half width of a domain in ln F, dimensionless.
+
+If a domain contains a single force, its half width would be zero, and contacts could not be scaled by it.
+"""
 
 LIMIT_TOLERANCE = 1.0 + 1e-9
-"""Factor by which a contact may exceed the limits of a domain because of rounding."""
+"""Factor by which a distance or a force may exceed the limits of a domain, in order to allow for rounding errors."""
 
 
 @dataclass(frozen=True)
 class Domain:
-    """Contacts for which a map is valid: a disk about the centre of the film, and a range of forces.
+    """Set of contacts for which a charge map is valid.
+
+    The positions of the contacts lie in a disk around the centre of the film, and their forces lie in an interval.
 
     Attributes:
         radius: Largest distance from the centre, mm.
@@ -33,21 +41,21 @@ class Domain:
 
     @property
     def centre(self) -> Array:
-        """Centre of the domain in (x, y, ln F), shape (3,), mm and logarithm of N."""
+        """Centre of the domain in the coordinates x (mm), y (mm) and ln F, where F is the force in N, shape (3,)."""
         low, high = np.log(self.force_range)
         return np.array([0.0, 0.0, 0.5 * (low + high)])
 
     @property
     def scale(self) -> Array:
-        """Half width of the domain in (x, y, ln F), shape (3,), mm and logarithm of N."""
+        """Half width of the domain along x (mm), y (mm) and ln F, where F is the force in N, shape (3,)."""
         low, high = np.log(self.force_range)
         return np.array([self.radius, self.radius, max(0.5 * (high - low), MIN_LOG_FORCE_HALF_WIDTH)])
 
     def is_outside(self, contact: Array) -> Booleans:
-        """Return which contacts are farther from the centre than the radius, or have a force outside the range.
+        """Return whether each contact lies outside the disk or has a force outside the range of forces.
 
         Args:
-            contact: Contacts (x, y, F), shape (n, 3), mm and N. A coordinate that is NaN counts as inside.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N. A position or a force that is NaN counts as inside.
 
         Returns:
             Whether each contact lies outside, shape (n,).
@@ -57,21 +65,25 @@ class Domain:
         return np.asarray((np.hypot(x, y) > self.radius) | (force < low) | (force > high))
 
     def to_unit(self, contact: Array) -> Array:
-        """Convert contacts into (x, y, ln F), scaled to the cube [-1, 1]^3.
+        """Convert contacts (x, y, F) into coordinates (x, y, ln F) that are scaled to the cube [-1, 1]^3.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Scaled contacts, shape (n, 3).
+            Scaled coordinates, shape (n, 3), dimensionless.
         """
         logs = np.stack([contact[:, 0], contact[:, 1], np.log(contact[:, 2])], axis=1)
         return np.asarray((logs - self.centre) / self.scale)
 
     def to_contact(self, unit: Array) -> Array:
-        """Convert scaled contacts, shape (..., 3), into contacts (x, y, F), same shape.
+        """Convert the scaled coordinates that `to_unit` returns back into contacts (x, y, F).
 
-        This is the inverse of `to_unit`.
+        Args:
+            unit: Scaled coordinates, shape (..., 3), dimensionless.
+
+        Returns:
+            Contacts (x, y, F), shape (..., 3), mm and N.
         """
         contact: Array = unit * self.scale + self.centre
         contact[..., 2] = np.exp(contact[..., 2])
@@ -79,17 +91,17 @@ class Domain:
 
     @property
     def places(self) -> str:
-        """Description of the positions in the domain, which error messages contain."""
+        """Description of the allowed positions for error messages."""
         return f"at most {self.radius:g} mm from the centre"
 
     def within(self, radius: float) -> "Domain":
-        """Return the domain with the same forces and another radius, mm."""
+        """Return a copy of the domain with another radius (mm) and the same range of forces."""
         return Domain(radius, self.force_range)
 
     def contains(self, contact: Array) -> Booleans:
-        """Return which contacts lie in the domain.
+        """Return whether each contact lies in the domain.
 
-        The comparison allows for rounding errors. A contact with NaN lies outside.
+        The comparison allows for rounding errors. A contact that contains NaN lies outside.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -101,22 +113,22 @@ class Domain:
         return np.asarray(inside & _are_within(contact[:, 2], self.force_range))
 
     def check(self, contact: Array, source: str) -> Array:
-        """Raise an error if a contact lies outside the domain.
+        """Convert contacts into an array of floats, and raise an error if a contact lies outside the domain.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            source: Name of the map in the error message, such as "forward map".
+            source: Name of the charge map in the error message, such as "forward map".
 
         Returns:
-            The contacts as an array of floats.
+            The same contacts as an array of floats, shape (n, 3).
 
         Raises:
-            SceneError: If the array has another shape, or a contact lies outside the domain.
+            SceneError: If the array does not have the shape (n, 3), or a contact lies outside the domain.
         """
         contact = as_contacts(contact, source)
         inside = self.contains(contact)
         if not inside.all():
-            first_outside = int(np.argmin(inside))  # the first False
+            first_outside = int(np.argmin(inside))  # index of the first False
             x, y, force = contact[first_outside]
             low, high = self.force_range
             raise SceneError(
@@ -127,11 +139,14 @@ class Domain:
 
 
 def as_contacts(contact: Array, source: str) -> Array:
-    """Convert contacts into an array of floats, and check its shape.
+    """Convert contacts into an array of floats, and check that the array has the shape (n, 3).
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        source: Name of the map in the error message.
+        source: Name of the charge map in the error message, such as "forward map".
+
+    Returns:
+        The same contacts as an array of floats, shape (n, 3).
 
     Raises:
         SceneError: If the array has another shape.
@@ -146,7 +161,7 @@ def as_contacts(contact: Array, source: str) -> Array:
 
 
 class ChargeMap(Protocol):
-    """Map from contacts (x, y, F) to touch charges."""
+    """Interface of an object that computes the touch charges of the electrodes from contacts (x, y, F)."""
 
     @property
     def electrodes(self) -> tuple[str, ...]:
@@ -154,11 +169,17 @@ class ChargeMap(Protocol):
 
     @property
     def domain(self) -> Domain:
-        """Contacts for which the map is valid."""
+        """Set of contacts for which the map is valid."""
 
     def charges(self, contact: Array) -> Array:
-        """Compute the charges of contacts (x, y, F), shape (n, 3), mm and N. The result has the shape (n, n_electrode),
-        pC."""
+        """Compute the charges that contacts cause.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Charges, shape (n, n_electrode), pC.
+        """
 
     def derivatives(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F.
@@ -173,20 +194,30 @@ class ChargeMap(Protocol):
 
 @runtime_checkable
 class LinearisedMap(ChargeMap, Protocol):
-    """A charge map that computes charges and derivatives together in less time than one after the other."""
+    """Charge map with a method that computes charges and derivatives together, faster than two separate calls."""
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Return the results of `charges` and `derivatives` for contacts (x, y, F), shape (n, 3), mm and N."""
+        """Compute the charges of contacts and their derivatives with respect to x, y and ln F.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            The result of `charges`, and the result of `derivatives`.
+        """
 
 
 def linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
-    """Return the results of `ChargeMap.charges` and `ChargeMap.derivatives`.
+    """Compute the charges of contacts and their derivatives with respect to x, y and ln F.
 
-    If the map supports it, both are computed together.
+    If the map has a method `linearised`, this method computes the charges and their derivatives together.
 
     Args:
-        charge_map: The map.
+        charge_map: Map that computes the charges.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        Charges, shape (n, n_electrode), pC. Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
     """
     if isinstance(charge_map, LinearisedMap):
         return charge_map.linearised(contact)
@@ -195,13 +226,14 @@ def linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class FunctionMap:
-    """A charge map that evaluates a function, with derivatives by central differences.
+    """Charge map that computes charges with a given function, and their derivatives by central differences.
 
     Attributes:
         function: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns charges, shape (n, n_electrode),
             pC.
         electrodes: Names of the electrodes.
-        domain: Contacts for which the function is valid. The differences evaluate it up to `STEPS` outside the domain.
+        domain: Contacts for which the map is valid. For the central differences, the function must also accept contacts
+            that lie outside the domain by up to `STEPS`.
     """
 
     function: Callable[[Array], Array]
@@ -219,7 +251,12 @@ class FunctionMap:
 
 @dataclass(frozen=True)
 class _RestrictedMap:
-    """A charge map that is restricted to a smaller domain; see `ChargeMap`."""
+    """Charge map with the charges of another map and a smaller domain.
+
+    Attributes:
+        unrestricted: Map that computes the charges and their derivatives.
+        domain: Contacts for which the restricted map is valid.
+    """
 
     unrestricted: ChargeMap
     domain: Domain
@@ -239,7 +276,7 @@ class _RestrictedMap:
 
 
 def within(charge_map: ChargeMap, radius: float) -> ChargeMap:
-    """Restrict a charge map to a disk with a smaller radius (mm)."""
+    """Return a charge map with the same charges, whose domain is restricted to a disk with the given radius (mm)."""
     return _RestrictedMap(charge_map, charge_map.domain.within(radius))
 
 
@@ -247,9 +284,9 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
     """Compute the derivatives of a function of contacts by central differences.
 
     Args:
-        function: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns values, shape (n, k). It is
-            called only once, with the contacts of all steps.
-        contact: Contacts at which the derivatives are computed, shape (n, 3), mm and N.
+        function: Function of contacts (x, y, F), shape (n, 3), mm and N, that returns values, shape (n, k). The
+            function is called once with all stepped contacts, because one call is faster than six.
+        contact: Contacts (x, y, F) at which the derivatives are computed, shape (n, 3), mm and N.
         steps: Steps in x and y, mm, and in ln F.
 
     Returns:
@@ -257,10 +294,10 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
     """
     contact = np.asarray(contact, dtype=float)
     variable_steps = np.array(steps)
-    contacts_up = _step_each_variable(contact, variable_steps)  # shape (3, n, 3), the first axis is the variable
+    contacts_up = _step_each_variable(contact, variable_steps)  # shape (3, n, 3), one block per stepped variable
     contacts_down = _step_each_variable(contact, -variable_steps)
 
-    # Evaluate the function once, for the stepped contacts in the order (variable, up or down, contact).
+    # Evaluate the function once, for the stepped contacts in the order (stepped variable, up or down, contact).
     stepped_contacts = np.stack([contacts_up, contacts_down], axis=1)
     values = np.asarray(function(stepped_contacts.reshape(-1, 3))).reshape(3, 2, len(contact), -1)
     values_up = values[:, 0]
@@ -270,7 +307,7 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
 
 
 def _step_each_variable(contact: Array, steps: Array) -> Array:
-    """Return three copies of contacts: one after a step in x, one after a step in y, and one after a step in ln F.
+    """Return three copies of the contacts: one shifted in x, one shifted in y, and one shifted in ln F.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -290,21 +327,21 @@ def _step_each_variable(contact: Array, steps: Array) -> Array:
 
 
 def check_forces(force: Array | float, force_range: tuple[float, float], source: str) -> None:
-    """Raise an error if a force lies outside a range.
+    """Raise an error if a force lies outside the range of forces for which a map is valid.
 
     Args:
         force: Forces, a number or shape (n,), N.
-        force_range: Smallest and largest force, N.
-        source: Name of the map with this range in the error message.
+        force_range: Smallest and largest allowed force, N.
+        source: Name of the map in the error message, such as "forward map".
 
     Raises:
-        SceneError: If a force lies outside.
+        SceneError: If a force lies outside the range or is NaN.
     """
     forces = np.atleast_1d(force)
     inside = _are_within(forces, force_range)
     if not inside.all():
         low, high = force_range
-        first_outside = int(np.argmin(inside))  # the first False
+        first_outside = int(np.argmin(inside))  # index of the first False
         name = f"force of press {first_outside}" if forces.size > 1 else "force"
         raise SceneError(
             f"{name}: expected {low:g} to {high:g} N, which the {source} covers, got {forces[first_outside]:g} N"
@@ -312,51 +349,61 @@ def check_forces(force: Array | float, force_range: tuple[float, float], source:
 
 
 def _are_within(force: Array, force_range: tuple[float, float]) -> Booleans:
-    """Return which forces (N) lie in a range (N). The comparison allows for rounding errors. NaN lies outside."""
+    """Return whether each force lies in a range.
+
+    The comparison allows for rounding errors. A force that is NaN lies outside the range.
+
+    Args:
+        force: Forces, shape (n,), N.
+        force_range: Smallest and largest force of the range, N.
+    """
     low, high = force_range
     return np.asarray((force >= low / LIMIT_TOLERANCE) & (force <= high * LIMIT_TOLERANCE))
 
 
 def check_radius(radius: float, largest: float, source: str) -> None:
-    """Raise an error if a radius is not positive or too large.
+    """Raise an error if a radius is not positive or exceeds the radius for which a map is valid.
 
     Args:
-        radius: Radius, mm.
-        largest: Largest accepted radius, mm.
-        source: Name of the map with this limit in the error message.
+        radius: Radius to be checked, mm.
+        largest: Largest allowed radius, mm. Rounding errors are allowed.
+        source: Name of the map in the error message, such as "forward map".
 
     Raises:
-        SceneError: If the radius lies outside.
+        SceneError: If the radius is not positive or exceeds the largest one.
     """
     if not 0.0 < radius <= largest * LIMIT_TOLERANCE:
         raise SceneError(f"radius: expected up to the {source}'s {largest:g} mm, got {radius:g} mm")
 
 
-def check_determined(electrodes: int) -> None:
-    """Raise an error if a sensor has too few electrodes to determine a contact.
+def check_electrode_count(n_electrode: int) -> None:
+    """Raise an error if a sensor has fewer than three electrodes, which are too few to determine a contact.
+
+    Args:
+        n_electrode: Number of electrodes of the sensor.
 
     Raises:
         SceneError: If there are fewer than three electrodes.
     """
-    if electrodes < 3:
+    if n_electrode < 3:
         raise SceneError(
-            f"expected at least three electrodes, got {electrodes}: x, y and the force are three unknowns, so with "
+            f"expected at least three electrodes, got {n_electrode}: x, y and the force are three unknowns, so with "
             "fewer charges a whole line of contacts has the same charges; add an electrode"
         )
 
 
 def as_charges(charge: Array, electrode_names: tuple[str, ...]) -> Array:
-    """Convert charges into an array of floats, and check its shape and values.
+    """Convert charges into an array of floats, and check that it contains one finite value for each electrode.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC.
         electrode_names: Names of the electrodes, in the order of the charges.
 
     Returns:
-        The charges, shape (n, n_electrode), pC.
+        The same charges as an array of floats, shape (n, n_electrode), pC.
 
     Raises:
-        ChargeError: If the charges are not finite or not one for each electrode.
+        ChargeError: If the array does not have one column for each electrode, or a charge is not finite.
     """
     charge = np.asarray(charge, dtype=float)
     n_electrode = len(electrode_names)
@@ -365,7 +412,7 @@ def as_charges(charge: Array, electrode_names: tuple[str, ...]) -> Array:
             f"expected charges of shape (n, {n_electrode}) for {electrode_names}, got shape {charge.shape}"
         )
     if not np.isfinite(charge).all():
-        row, column = np.argwhere(~np.isfinite(charge))[0]  # the first such charge
+        row, column = np.argwhere(~np.isfinite(charge))[0]  # position of the first charge that is not finite
         raise ChargeError(
             f"charge of {electrode_names[column]!r} in press {row}: expected a finite number, got {charge[row, column]}"
         )

@@ -1,11 +1,14 @@
-"""Spline approximation of a forward map, which computes charges and their derivatives about two hundred times faster.
+"""Approximation of a forward map by splines.
 
-The charges are divided by the squared amplitude of `mechanics.scaling`, which removes most of their dependence on the
-force. For each of a few forces, the scaled charges are approximated by a cubic spline in (x, y). The spline is fitted
-by least squares to presses on the disk. Near an electrode, its charge changes considerably over the length of the
-probe. Around each electrode, a second spline with finer knots therefore corrects the charge of this electrode. Between
-the forces, the charges are interpolated by Lagrange polynomials in ln F. A forward map interpolates its stress fields
-in the same way, so the interpolation in the force adds no error.
+The splines compute charges and their derivatives about two hundred times faster than the forward map.
+
+Each charge is divided by the squared amplitude, which is a function of the force in the module `mechanics.scaling`.
+The scaled charges that result from this division depend only weakly on the force. At each of a few forces, a cubic
+spline in (x, y) approximates the scaled charges. The spline is fitted by least squares to presses on a disk around the
+centre of the film. Near an electrode, the charge of this electrode varies strongly with the position of the press.
+Around each electrode, a second spline with finer knots therefore corrects the charge of this electrode. For all other
+forces, the scaled charges are interpolated by Lagrange polynomials in ln F. A forward map interpolates its stress
+fields between forces in the same way. The interpolation between forces therefore adds no error.
 """
 
 from dataclasses import dataclass, replace
@@ -35,52 +38,54 @@ MAX_KNOT_SPACING = 0.3
 RELATIVE_KNOT_SPACING = 1.0 / 6.0
 """Largest distance between the knots near an electrode, in units of the reach of the probe, dimensionless.
 
-The charge of an electrode changes over the length of this reach.
+The reach is the largest distance of a point of the footprint from its centroid. The charge of an electrode changes
+considerably if the press moves by the reach.
 """
 
 MIN_CELLS = 8
-"""Smallest number of cells of the spline across the disk."""
+"""Smallest number of cells of a spline along x or y."""
 
 MAX_CELLS = 400
 """Largest number of cells of a spline along x or y."""
 
 PRESSES_PER_CELL = 1.6
-"""Number of fitted presses per cell of the disk."""
+"""Number of presses per cell to which a spline is fitted."""
 
 PRESSES_PER_EDGE_CELL = 2.0
-"""Number of additional fitted presses on the edge of the disk, per cell along the edge."""
+"""Number of additional presses on the edge of the disk to which a spline is fitted, per cell along the edge."""
 
 EDGE_RADIUS = 1.0 - 1e-12
-"""Distance from the centre at which presses on the edge of the disk are fitted, in radii of the disk.
+"""Distance of the presses on the edge of the disk from the centre, in radii of the disk, dimensionless.
 
-It is less than 1 by more than the rounding error, so that the presses lie in the domain of the forward map.
+This distance is less than 1 by more than the rounding error. The presses therefore lie in the domain of the forward
+map.
 """
 
 EXTRA_FORCE_NODES = 2
-"""Number of additional force nodes if d33 is not zero.
+"""Number of additional force nodes if the piezoelectric coefficient d33 is not zero.
 
-The charges of d33 are proportional to the force, and not to the squared amplitude. Their relative error is at most
-1e-4.
+The charges that d33 causes are proportional to the force, and not to the squared amplitude. With the additional nodes,
+the relative error of these charges is at most 1e-4.
 """
 
 CHECK_COUNT = 400
 """Number of presses at which the splines are compared with the forward map."""
 
 LOG_FORCE_STEP = 1e-4
-"""Step of the central difference with respect to ln F, dimensionless."""
+"""Step of the central difference with respect to ln F, where F is the force, dimensionless."""
 
 
 @dataclass(frozen=True)
 class Patch:
-    """Correction of the charge of one electrode for presses in a rectangle around it.
+    """Correction of the scaled charge of one electrode for presses in a rectangle around this electrode.
 
-    The correction and its slopes are zero on the edges of the rectangle.
+    The correction and its first derivatives are zero on the edges of the rectangle.
 
     Attributes:
-        electrode: Number of the electrode.
-        low: Corner of the rectangle with the smallest coordinates, shape (2,), mm.
-        high: Corner of the rectangle with the largest coordinates, shape (2,), mm.
-        table: Spline of the correction in x and y, whose values have the shape (n_force,), pC.
+        electrode: Index of the electrode.
+        low: Lower left corner (x, y) of the rectangle, shape (2,), mm.
+        high: Upper right corner (x, y) of the rectangle, shape (2,), mm.
+        table: Spline in x and y that returns the corrections for all forces of the splines, shape (n_force,), pC.
     """
 
     electrode: int
@@ -89,24 +94,30 @@ class Patch:
     table: "scipy.interpolate.NdBSpline"
 
     def contains(self, position: Array) -> Booleans:
-        """Return whether positions, shape (n, 2), mm, lie in the rectangle."""
+        """Return whether each position (x, y) lies in the rectangle.
+
+        Args:
+            position: Positions, shape (n, 2), mm.
+        """
         return np.asarray(((position > self.low) & (position < self.high)).all(axis=1))
 
 
 @dataclass(frozen=True)
 class ChargeSpline:
-    """Touch charges as a function of (x, y, F), for one probe in one orientation.
+    """Splines that compute touch charges as a function of the position (x, y) and the force F of a press.
+
+    The splines are valid for one probe in a fixed orientation.
 
     Attributes:
         electrodes: Names of the electrodes, in the order of the charges.
-        film: Film whose amplitude scales the charges.
+        film: Film whose squared amplitude scales the charges.
         calibration: Calibration that adds the crosstalk to the charges.
-        domain: Presses that the splines cover.
-        force: Forces of the splines, shape (n_force,), N.
-        table: Spline of the scaled charges without crosstalk in x and y, whose values have the shape (n_force,
-            n_electrode).
+        domain: Presses for which the splines are valid.
+        force: Forces at which splines were fitted, shape (n_force,), N.
+        table: Spline in x and y that returns the scaled charges without crosstalk, shape (n_force, n_electrode), pC.
         patches: Corrections of the scaled charges near the electrodes.
-        error: Largest error with respect to the forward map, relative to the largest charge of a press.
+        error: Largest difference between a charge of the splines and that of the forward map, relative to the largest
+            charge of the same press, dimensionless.
     """
 
     electrodes: tuple[str, ...]
@@ -120,16 +131,18 @@ class ChargeSpline:
 
     @classmethod
     def of(cls, forward_map: ForwardMap, radius: float | None = None, spacing: float | None = None) -> "ChargeSpline":
-        """Fit splines to a forward map, which takes a few seconds.
+        """Fit splines to the charges that a forward map computes. The fit takes a few seconds.
 
         Args:
-            forward_map: The forward map. The probe keeps the orientation with which the map was built.
-            radius: Largest distance from the centre, mm; None for that of the map.
-            spacing: Distance between the knots near the electrodes, mm; None for a sixth of the reach of the probe,
-                and at most `MAX_KNOT_SPACING`.
+            forward_map: Forward map to which the splines are fitted. The probe keeps the orientation with which the map
+                was built.
+            radius: Largest distance of a press from the centre of the film, mm; None for the largest distance of the
+                forward map.
+            spacing: Distance between the knots near the electrodes, mm. If None, the distance is a sixth of the reach
+                of the probe, but at most `MAX_KNOT_SPACING`.
 
         Raises:
-            SceneError: If the radius is not positive or larger than that of the map.
+            SceneError: If the radius is not positive or is larger than the radius of the forward map.
         """
         map_domain = forward_map.domain
         domain = map_domain if radius is None else map_domain.within(radius)
@@ -141,13 +154,13 @@ class ChargeSpline:
         samples = _ScaledCharges(forward_map, _force_nodes(forward_map))
         coarse = _fit_disk(samples, domain.radius, max(spacing, COARSE_SPACING))
         patches: list[Patch] = []
-        if spacing < COARSE_SPACING:
+        if spacing < COARSE_SPACING:  # otherwise the coarse splines are already as fine as the corrections
             for electrode in range(len(sensor.electrodes)):
                 patch = _fit_patch(samples, electrode, domain.radius, spacing, coarse)
                 if patch is not None:
                     patches.append(patch)
 
-        # The error is measured with the finished splines, and is unknown (NaN) until then.
+        # The error is unknown (NaN) until the finished splines are compared with the forward map.
         spline = cls(
             electrodes=forward_map.electrodes,
             film=sensor.film,
@@ -161,7 +174,7 @@ class ChargeSpline:
         return replace(spline, error=_largest_error(spline, forward_map))
 
     def charges(self, contact: Array) -> Array:
-        """Compute touch charges.
+        """Compute the touch charges of presses.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -192,15 +205,26 @@ class ChargeSpline:
         return derivatives
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Return the results of `charges` and `derivatives`, which are computed together in less time."""
+        """Compute charges and derivatives together, faster than separate calls of `charges` and `derivatives`.
+
+        Args:
+            contact: Presses (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Charges, shape (n, n_electrode), pC. Derivatives with respect to x, y and ln F, shape (n, n_electrode, 3),
+            pC/mm, pC/mm and pC.
+
+        Raises:
+            SceneError: If a press lies outside the domain.
+        """
         contact = self.domain.check(contact, "table")
         charge, position_derivative, log_force_derivative = self.first_order(contact[:, :2], contact[:, 2])
         return charge, np.concatenate([position_derivative, log_force_derivative[..., None]], axis=2)
 
     def first_order(self, position: Array, force: Array | float) -> tuple[Array, Array, Array]:
-        """Compute charges and their derivatives.
+        """Compute the charges of presses, and the derivatives of these charges.
 
-        The positions may lie outside the disk, because a solver may try such positions.
+        Positions outside the disk are accepted, because an iterative solver may try such positions.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm. Positions outside the disk are moved to its edge.
@@ -211,7 +235,7 @@ class ChargeSpline:
             Derivatives with respect to ln F, shape (n, n_electrode), pC.
         """
         # Each charge is a weighted sum of the scaled charges at the forces of the splines. Only the weights depend on
-        # the force. Their derivatives with respect to ln F are computed by central differences.
+        # the force. The derivatives of the weights with respect to ln F are computed by central differences.
         position = onto_disk(position, self.domain.radius)
         log_force = np.log(np.broadcast_to(force, len(position)))
         weights = self.force_weights(log_force)
@@ -223,20 +247,21 @@ class ChargeSpline:
         scaled_charge = self.scaled_charges(position)
         scaled_gradient = self.scaled_gradients(position)
 
-        # Sum over k, the forces of the splines, for each press n and electrode e (i is x or y).
+        # Sum over the forces of the splines (index k), for each press (n) and electrode (e). The index i is x or y.
         charge = np.einsum("nk,nke->ne", weights, scaled_charge)
         position_derivative = np.einsum("nk,nkei->nei", weights, scaled_gradient)
         log_force_derivative = np.einsum("nk,nke->ne", weight_slopes, scaled_charge)
         return charge, position_derivative, log_force_derivative
 
     def force_weights(self, log_force: Array) -> Array:
-        """Compute the weights with which the scaled charges at the forces of the splines are summed.
+        """Compute the weights that convert the scaled charges at the forces of the splines into a charge.
 
-        The weighted sum is the charge. Each weight is a Lagrange weight in ln F, multiplied by the squared amplitude at
-        the force, because the scaled charges are divided by the squared amplitude.
+        The charge at a given force is the sum of the scaled charges at the forces of the splines, each multiplied by
+        its weight. Each weight is the product of two factors. The Lagrange weight in ln F interpolates between the
+        forces of the splines. The squared amplitude at the given force converts the scaled charge into a charge.
 
         Args:
-            log_force: Logarithms of the forces (N), shape (...).
+            log_force: Natural logarithms of the given forces in N, shape (...).
 
         Returns:
             Weights, shape (..., n_force).
@@ -248,11 +273,11 @@ class ChargeSpline:
         return weights.reshape(*log_force.shape, nodes.size)
 
     def scaled_charges(self, position: Array) -> Array:
-        """Compute the scaled charges at the forces of the splines.
+        """Compute the scaled charges for all forces at which splines were fitted.
 
-        A scaled charge is a charge divided by the squared amplitude at its force. The splines over the disk give all
-        charges. Each patch corrects the charge of one electrode in a rectangle around it. The calibration adds the
-        crosstalk last.
+        A scaled charge is a charge divided by the squared amplitude at its force. The splines over the disk approximate
+        the scaled charges of all electrodes. Each patch then corrects the scaled charge of one electrode in a rectangle
+        around this electrode. Finally, the calibration adds the crosstalk.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
@@ -275,7 +300,7 @@ class ChargeSpline:
         Returns:
             Derivatives, shape (n, n_force, n_electrode, 2), pC/mm.
         """
-        # A spline takes the orders of the derivative with respect to x and y.
+        # A spline expects the orders of the derivative with respect to x and y.
         x_derivative_orders = (1, 0)
         y_derivative_orders = (0, 1)
         derivatives = []
@@ -289,17 +314,21 @@ class ChargeSpline:
 
 
 def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
-    """Return splines of a forward map, whose fit takes a few seconds. Any other charge map is returned unchanged."""
+    """Fit splines to a charge map if it is a forward map, because splines compute derivatives faster.
+
+    The fit takes a few seconds. A charge map of another class is returned unchanged.
+    """
     if isinstance(charge_map, ForwardMap):
         return ChargeSpline.of(charge_map)
     return charge_map
 
 
 def _force_nodes(forward_map: ForwardMap) -> Array:
-    """Return the forces of the splines, shape (n_force,), N.
+    """Return the forces at which splines are fitted, shape (n_force,), N.
 
-    If d33 is zero, these are the forces of the forward map. The charges of d33 depend on the force in another way than
-    the charges of the stress, so that a sensor with d33 needs a few forces more. A single force is never extended.
+    If the piezoelectric coefficient d33 is zero, the splines have the forces at which the forward map was solved. If
+    d33 is not zero, the splines have a few more forces, because the charges caused by d33 depend on the force in
+    another way than the charges caused by the stress. A map with a single force keeps this single force.
     """
     solved_force = forward_map.family.force
     min_log_force, max_log_force = np.log(forward_map.domain.force_range)
@@ -310,22 +339,24 @@ def _force_nodes(forward_map: ForwardMap) -> Array:
 
 
 def _fit_positions(cells: int) -> Array:
-    """Return the positions of the fitted presses on the unit disk: a lattice, and points on the edge.
+    """Return positions on the unit disk for the presses to which a spline is fitted.
+
+    The positions are the points of a lattice in the disk, and points on the edge of the disk.
 
     Args:
-        cells: Number of cells of the spline across the disk.
+        cells: Number of cells of the spline along the diameter of the disk.
 
     Returns:
-        Positions (x, y), shape (n, 2).
+        Positions (x, y), shape (n, 2), in radii of the disk.
     """
-    # The disk has the diameter `cells`, in units of the side of a cell. A few presses are added for small numbers of
-    # cells.
+    # In units of the side of a cell, the diameter of the disk is `cells`. The constants 16 and 8 ensure that there are
+    # enough presses if there are only a few cells.
     cells_in_disk = np.pi * (0.5 * cells) ** 2
     cells_along_edge = np.pi * cells
     inner_count = int(PRESSES_PER_CELL * cells_in_disk) + 16
     edge_count = int(PRESSES_PER_EDGE_CELL * cells_along_edge) + 8
 
-    # Positions are complex numbers x + iy. Those on the edge are moved inwards by more than the rounding error.
+    # Positions are complex numbers x + iy. EDGE_RADIUS moves the points on the edge slightly into the disk.
     inner_positions = lattice(inner_count)
     edge_positions = np.exp(2j * np.pi * np.arange(edge_count) / edge_count) * EDGE_RADIUS
     complex_positions = np.concatenate([inner_positions, edge_positions])
@@ -337,21 +368,22 @@ class _ScaledCharges:
     """Scaled charges of a forward map without crosstalk, to which splines are fitted.
 
     Attributes:
-        forward_map: The forward map.
-        force: Forces of the splines, shape (n_force,), N.
+        forward_map: Forward map that computes the charges.
+        force: Forces at which the splines are fitted, shape (n_force,), N.
     """
 
     forward_map: ForwardMap
     force: Array
 
     def at(self, position: Array, is_needed: Booleans) -> Array:
-        """Compute the scaled charges of presses: the charges divided by the squared amplitude at their force.
+        """Compute the scaled charges of presses, which are charges divided by the squared amplitude at their force.
 
-        At each position, the press is computed with every force of the splines.
+        At each position, the charges are computed for every force at which splines are fitted.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
-            is_needed: Whether the charge of each electrode is needed, shape (n_electrode,).
+            is_needed: Whether the charge of each electrode is needed, shape (n_electrode,). The stress charges of the
+                other electrodes are not computed and are set to zero.
 
         Returns:
             Scaled charges, shape (n, n_force, n_electrode), pC.
@@ -364,7 +396,7 @@ class _ScaledCharges:
         if forward_map.sensor.piezo.d33 == 0.0:
             return scaled_stress_charge
 
-        # Interpolate from the solved forces to the forces of the splines.
+        # A sensor with d33 has more spline forces than solved forces. Interpolate from the solved forces to them.
         nodes = np.log(solved_force)
         force_weights = lagrange_values(nodes, barycentric_weights(nodes), np.log(self.force))
         scaled_charge = force_weights @ scaled_stress_charge  # shape (n, n_force, n_electrode)
@@ -377,43 +409,44 @@ class _ScaledCharges:
 
 
 def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.interpolate.NdBSpline":
-    """Fit splines of all charges over the disk.
+    """Fit a spline to the scaled charges of all electrodes over the disk.
 
     Args:
-        samples: Scaled charges to which the splines are fitted.
+        samples: Scaled charges to which the spline is fitted.
         radius: Radius of the disk, mm.
         spacing: Largest distance between the knots, mm.
 
     Returns:
-        Splines in (x, y), whose values have the shape (n_force, n_electrode), pC.
+        Spline in x and y that returns scaled charges, shape (n_force, n_electrode), pC.
     """
     cells = int(np.clip(np.ceil(2.0 * radius / spacing), MIN_CELLS, MAX_CELLS))
     knots = spline_knots(-radius, radius, cells)
     position = radius * _fit_positions(cells)
     all_electrodes = np.ones(len(samples.forward_map.electrodes), dtype=bool)
     charge = samples.at(position, all_electrodes)
-    # No coefficients are fixed, because the splines cover the whole disk and need not vanish at its edge.
+    # No coefficients are fixed at zero, because the charges do not vanish at the edge of the disk.
     return fit_spline(position, charge, (knots, knots), fixed=0)
 
 
 def _fit_patch(
     samples: _ScaledCharges, electrode: int, radius: float, spacing: float, coarse: "scipy.interpolate.NdBSpline"
 ) -> Patch | None:
-    """Fit a correction of the coarse splines for the charge of one electrode, in a rectangle around this electrode.
+    """Fit a fine spline that corrects the coarse spline near one electrode.
 
-    The correction is the difference between the charge and the coarse spline.
+    The correction is the scaled charge of this electrode minus the value that the coarse spline returns. The fine
+    spline covers a rectangle around the electrode.
 
     Args:
-        samples: Scaled charges.
+        samples: Scaled charges to which the splines are fitted.
         electrode: Index of the electrode.
-        radius: Radius of the disk, mm.
-        spacing: Largest distance between the knots, mm.
-        coarse: Splines of all charges over the disk.
+        radius: Radius of the disk that the coarse spline covers, mm.
+        spacing: Largest distance between the knots of the fine spline, mm.
+        coarse: Spline of the scaled charges of all electrodes over the disk.
 
     Returns:
         The correction; None if the rectangle lies outside the disk.
     """
-    # Choose a rectangle around the electrode, outside of which its charge is smooth.
+    # Choose a rectangle so large that outside it the charge of the electrode is smooth.
     sensor = samples.forward_map.sensor
     corners = np.concatenate([sensor.calibration.place(part) for part in sensor.electrodes[electrode].parts])
     margin = samples.forward_map.probe.reach + PATCH_MARGIN
@@ -426,15 +459,15 @@ def _fit_patch(
     x_knots = spline_knots(lower_left[0], upper_right[0], x_cells)
     y_knots = spline_knots(lower_left[1], upper_right[1], y_cells)
 
-    # Choose the fitted presses in the part of the rectangle that lies in the disk.
+    # Choose the presses of the fit in the part of the rectangle that lies in the disk.
     cells_along_edge = 2.0 * np.pi * radius / spacing  # along the whole edge of the disk
     edge_count = int(PRESSES_PER_EDGE_CELL * cells_along_edge)
     position = _patch_positions(lower_left, upper_right, cells, radius, edge_count)
     if not len(position):
         return None
 
-    # Fit the error of the coarse splines for this electrode. Two fixed coefficients at each end of an axis make the
-    # correction and its slopes zero on the edges of the rectangle.
+    # Fit the error of the coarse spline for this electrode. Two coefficients at each end of an axis are fixed at zero.
+    # The correction and its first derivatives are therefore zero on the edges of the rectangle.
     is_needed = np.arange(len(sensor.electrodes)) == electrode
     residual = (samples.at(position, is_needed) - coarse(position))[:, :, electrode]
     table = fit_spline(position, residual, (x_knots, y_knots), fixed=2)
@@ -442,11 +475,14 @@ def _fit_patch(
 
 
 def _patch_positions(lower_left: Array, upper_right: Array, cells: Integers, radius: float, edge_count: int) -> Array:
-    """Return the positions of the fitted presses in a rectangle: a grid within the disk, and points on its edge.
+    """Return positions in a rectangle for the presses to which the correction of a spline is fitted.
+
+    Some of the positions are the points of a grid that lie in the disk. The other positions are points on the edge of
+    the disk that lie in the rectangle.
 
     Args:
-        lower_left: Corner (x, y) of the rectangle, shape (2,), mm.
-        upper_right: Opposite corner, shape (2,), mm.
+        lower_left: Lower left corner (x, y) of the rectangle, shape (2,), mm.
+        upper_right: Upper right corner (x, y) of the rectangle, shape (2,), mm.
         cells: Numbers of cells of the spline along x and y, shape (2,).
         radius: Radius of the disk, mm.
         edge_count: Number of points on the whole edge of the disk.
@@ -454,7 +490,7 @@ def _patch_positions(lower_left: Array, upper_right: Array, cells: Integers, rad
     Returns:
         Positions (x, y), shape (n, 2), mm.
     """
-    # The grid has PRESSES_PER_CELL points per cell, so the square root of this number along each side of a cell.
+    # A grid with PRESSES_PER_CELL points per cell has the square root of this number along each side of a cell.
     x_count, y_count = np.ceil(np.sqrt(PRESSES_PER_CELL) * cells).astype(int)
     x_line = np.linspace(lower_left[0], upper_right[0], x_count)
     y_line = np.linspace(lower_left[1], upper_right[1], y_count)
@@ -462,7 +498,7 @@ def _patch_positions(lower_left: Array, upper_right: Array, cells: Integers, rad
     grid = np.stack([x_grid.ravel(), y_grid.ravel()], axis=1)
     is_in_disk = np.hypot(grid[:, 0], grid[:, 1]) < radius
 
-    # Of the points on the edge of the disk, only those in the rectangle are used.
+    # Use only the points on the edge of the disk that lie in the rectangle.
     edge_angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
     edge = radius * EDGE_RADIUS * np.stack([np.cos(edge_angle), np.sin(edge_angle)], axis=1)
     is_in_rectangle = ((edge > lower_left) & (edge < upper_right)).all(axis=1)
@@ -470,14 +506,16 @@ def _patch_positions(lower_left: Array, upper_right: Array, cells: Integers, rad
 
 
 def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:
-    """Compute the largest relative error at evenly distributed presses that do not lie on the lattice of the fit.
+    """Compute the largest relative error of a spline at evenly distributed presses.
+
+    The presses differ from the presses to which the spline was fitted.
 
     Args:
-        spline: The spline.
+        spline: Finished spline whose error is computed.
         forward_map: Forward map that the spline approximates.
 
     Returns:
-        The largest error of a charge, relative to the largest charge of the same press.
+        The largest error of a charge, relative to the largest charge of the same press, dimensionless.
     """
     position = spline.domain.radius * sunflower(CHECK_COUNT)
     # Multiples of the golden ratio, modulo 1, distribute the logarithms of the forces evenly.

@@ -1,4 +1,4 @@
-"""Computation of the deflection of the film under a circular probe, which the live page shows."""
+"""Tables of the deflection of a film under a circular probe, from which the live page draws the film."""
 
 import numpy as np
 
@@ -12,52 +12,60 @@ from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
 from isocharge.simulate.solver.press import press
 
 RINGS = 20
-"""Number of rings about the probe in the table."""
+"""Number of rings around the probe in the table of deflections."""
 
 ANGLES = 13
-"""Number of angles of half a turn in the table."""
+"""Number of angles in the table, which cover half a turn around the probe."""
 
 FORCES = (0.05, 0.3, 2.0)
-"""Forces of the table, N."""
+"""Forces of the presses in the table, N."""
 
 MAX_DISTANCE = 16.0 / 45.0
-"""Largest distance of a press from the centre in the table, in film radii."""
+"""Largest distance of a press in the table from the centre of the film, in film radii, dimensionless."""
 
 DISTANCES = 5
-"""Number of distances in the table."""
+"""Number of distances of the presses in the table from the centre of the film."""
 
 INNER_RADIUS = 0.999999
-"""Largest radius of the points at which the deflection is computed, in film radii.
+"""Largest radius of the points at which the deflection is computed, in film radii, dimensionless.
 
-Points on the rim may lie outside the film because of rounding.
+The radius is less than 1, because rounding could move points on the rim out of the film.
 """
 
 
 def deflection_field(
     film: Film, probe: Circle, forces: tuple[float, ...] = FORCES, *, distances: int = DISTANCES
 ) -> DeflectionField:
-    """Compute the deflection of a film on rings about presses with several forces at several distances from the centre.
+    """Compute a table of the deflection of a film under a circular probe.
+
+    The table contains presses with several forces at several distances from the centre of the film. For each press, the
+    table contains the deflection on rings around the probe.
 
     Args:
-        film: The film.
+        film: Film on which the probe presses.
         probe: The circular probe.
-        forces: Increasing forces, N.
-        distances: Number of distances from 0 to `MAX_DISTANCE`, at least 2.
+        forces: Forces of the presses in ascending order, N.
+        distances: Number of distances of the presses from the centre, from 0 to `MAX_DISTANCE`, at least 2.
 
     Returns:
-        Deflections on rings about each press. The first ring is the centre of the probe, and the last one is the rim of
-        the film.
+        Deflections on rings around each press. The first ring is the centre of the probe, and the last ring is the rim
+        of the film.
 
     Raises:
         SolveError: If a press has no equilibrium.
     """
     press_distances = np.linspace(0.0, MAX_DISTANCE * film.radius, distances).tolist()
+    # The radii of the rings in film radii: the centre of the probe, then a geometric series from half of the radius of
+    # the probe to the rim of the film.
     smallest_ring = 0.5 * probe.radius / film.radius
-    rings = np.concatenate([[0.0], np.geomspace(smallest_ring, 1.0, RINGS - 1)])  # radii in film radii
+    rings = np.concatenate([[0.0], np.geomspace(smallest_ring, 1.0, RINGS - 1)])
+
+    # The forces at one distance are solved one after the other, because a solve is faster if it starts from the
+    # equilibrium under the previous force.
     deflections = np.zeros((len(forces), distances, RINGS, ANGLES))
     for distance_index, distance in enumerate(track(press_distances, "solving the film", distances)):
         equilibrium: Equilibrium | None = None
-        for force_index, force in enumerate(forces):  # each solve starts from the equilibrium under the previous force
+        for force_index, force in enumerate(forces):
             equilibrium = press(film, probe, (distance, 0.0), force, start=equilibrium)
             deflections[force_index, distance_index] = _deflection_on_rings(equilibrium, distance, rings)
     return DeflectionField(
@@ -71,21 +79,23 @@ def deflection_field(
 
 
 def _deflection_on_rings(equilibrium: Equilibrium, distance: float, rings: Array) -> Array:
-    """Compute the deflection on rings about the probe; see `isocharge.common.deflection_field`.
+    """Compute the deflection of the film on rings around the probe.
+
+    The module `isocharge.common.deflection_field` defines the rings.
 
     Args:
-        equilibrium: The solved press.
+        equilibrium: Equilibrium of the film under the press.
         distance: Distance of the press from the centre, mm.
-        rings: Radii of concentric rings of the unit disk, shape (n_ring,). `points_mm` maps this disk onto the film
-            so that 0 becomes a point under the probe, and 1 remains the rim of the film.
+        rings: Radii of concentric rings of the unit disk, shape (n_ring,), dimensionless. The function `points_mm` maps
+            the unit disk onto the film. It maps the radius 0 to a point under the probe, and the radius 1 to the rim.
 
     Returns:
         Deflection, shape (n_ring, n_angle), mm. It is zero at the rim.
     """
     film_radius = equilibrium.film.radius
-    rings_in_mesh = np.minimum(rings, INNER_RADIUS)  # the last ring, at the rim, is replaced below
+    rings_in_mesh = np.minimum(rings, INNER_RADIUS)  # moves the last ring from the rim into the mesh
     complex_points = points_mm(film_radius, equilibrium.probe.reach, distance, rings_in_mesh, ANGLES).ravel()
     points = np.stack([complex_points.real, complex_points.imag], axis=1)  # x + iy becomes (x, y), mm
     deflection_mm = deflection(equilibrium, points).reshape(len(rings), ANGLES)
-    deflection_mm[-1] = 0.0  # the film is clamped at the rim
+    deflection_mm[-1] = 0.0  # the last ring is the rim, where the film is clamped
     return deflection_mm

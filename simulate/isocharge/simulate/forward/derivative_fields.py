@@ -1,7 +1,7 @@
-"""Solver of the derivatives of the stress field, for example with respect to a side force or the pretension.
+"""Computation of the derivatives of the stress field of a film with respect to a side force or the pretension.
 
-Derivatives are small corrections and need less accuracy than the stress itself. They are therefore solved at fewer
-presses than the stress of a forward map.
+The derivatives are used for small corrections, so they need not be as accurate as the stress itself. The derivatives
+are therefore solved at fewer presses than the stress of a forward map.
 """
 
 from concurrent.futures import Executor
@@ -12,21 +12,22 @@ from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.solver.load_case import SolveSettings
 
 NODE_COUNTS = (6, 6)
-"""Number of distances and number of forces at which the derivatives are solved."""
+"""Number of distances from the centre, and number of forces, at which the derivatives are solved."""
 
 
 def solve_derivatives(forward_map: ForwardMap, read: Reading, executor: Executor | None) -> ForwardMap:
-    """Compute derivatives of the stress at a few presses in the domain of a forward map, and store them in a new map.
+    """Compute derivatives of the stress for a few presses, and return a map that interpolates these derivatives.
 
-    The presses are solved again with the mesh of the forward map, which takes about ten seconds.
+    The presses are distributed over the domain of a forward map, and are solved with the mesh of this map. The solves
+    take about ten seconds.
 
     Args:
-        forward_map: Forward map of the film, whose probe is a circle. Its mesh and its readout are used.
+        forward_map: Forward map of the film under a circular probe. It provides the domain, the mesh and the readout.
         read: Function that computes the derivatives of the stress at the nodes of the mesh from a solved press.
         executor: Executor that runs the solves; None for this process.
 
     Returns:
-        Copy of the forward map whose table contains the derivatives that `read` computes, in place of the stress, shape
+        Copy of the forward map. In place of the stress, its table contains the derivatives that `read` computes, shape
         (n_distance * n_force, n_value).
 
     Raises:
@@ -35,10 +36,11 @@ def solve_derivatives(forward_map: ForwardMap, read: Reading, executor: Executor
     sensor = forward_map.sensor
     film = sensor.film
     family = Family.spread(forward_map.domain, film.radius, NODE_COUNTS, period=0.0)  # a circle has no orientation
-    theory = replace(forward_map.theory, stretching=True)  # the tangent of the equilibrium requires it
+    theory = replace(forward_map.theory, stretching=True)  # `read` needs a theory that includes stretching
     settings = SolveSettings(theory=theory, resolution=forward_map.resolution, layer=forward_map.layer)
 
-    # A chain contains the presses with all forces at one distance, which are solved one after the other.
+    # A chain contains the presses with all forces at one distance. They are solved one after the other, because each
+    # solve starts from the equilibrium under the previous force.
     chains = [
         Chain(film, forward_map.probe, distance, family.force, sensor.surface, settings, read)
         for distance in family.distance.tolist()

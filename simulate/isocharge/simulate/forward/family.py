@@ -1,4 +1,7 @@
-"""Families of presses with one probe. The presses at the nodes are solved, and all other presses are interpolated."""
+"""Families of presses with one probe, of which only a few presses are solved.
+
+The solved presses are the nodes of the family. For every other press, the stress is interpolated between the nodes.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -27,20 +30,20 @@ from isocharge.simulate.solver.load_case import SolveSettings, check_press
 from isocharge.simulate.solver.press import press
 
 ROTATIONS = 7
-"""Smallest number of orientations of the probe.
+"""Smallest number of orientations of a probe that is not axisymmetric.
 
-A few orientations suffice, because the rim of the film is far from the probe, so that the stress depends on the
-orientation through a few harmonics only.
+In a frame that rotates with the probe, the orientation changes only the direction to the centre and to the rim of the
+film. The rim is far from the probe. A few harmonics of the orientation therefore describe the stress.
 """
 
 
 class NodeCount(NamedTuple):
-    """Number of nodes of a family.
+    """Number of nodes at which a family of presses is solved.
 
     Attributes:
-        distances: Number of distances.
-        forces: Number of forces.
-        min_orientations: Smallest number of orientations.
+        distances: Number of distances of the presses from the centre of the film.
+        forces: Number of forces of the presses.
+        min_orientations: Smallest number of orientations of a probe that is not axisymmetric.
     """
 
     distances: int
@@ -54,22 +57,23 @@ NODE_COUNTS = (
     NodeCount(10, 7, 3 * ROTATIONS),
     NodeCount(13, 12, 3 * ROTATIONS),
 )
-"""Numbers of nodes that are tried one after the other.
+"""Numbers of nodes that are tried one after the other, until the interpolation is sufficiently accurate.
 
-The last entry is for films with a large pretension, whose charges change from one power of the force to another and
-pass through zero.
+The last entry is for films with a large pretension. With increasing force, the charges of such a film change from one
+power of the force to another, and pass through zero.
 """
 
 
 @dataclass(frozen=True)
 class Family:
-    """Nodes at which a family of presses is solved.
+    """Presses at which the stress is solved, in order to interpolate the stress of all presses in a domain.
 
     Attributes:
-        domain: Presses that the family covers.
+        domain: Presses for which the stress can be interpolated.
         film_radius: Radius of the film, mm.
-        distance: Distances from the centre, at Chebyshev nodes in `distance_coordinate`, shape (n_distance,), mm.
-        force: Forces, at Chebyshev nodes in the logarithm, shape (n_force,), N.
+        distance: Distances of the solved presses from the centre of the film, shape (n_distance,), mm. Their
+            `distance_coordinate` has Chebyshev nodes.
+        force: Forces of the solved presses, shape (n_force,), N. Their logarithms are Chebyshev nodes.
         rotation: Rotations of the probe relative to the direction of the press, evenly spaced over a full turn, shape
             (n_rotation,), rad.
         symmetry_order: Order of the rotational symmetry of the probe: the number of rotations within a full turn that
@@ -87,31 +91,33 @@ class Family:
     def spread(
         cls, domain: Domain, film_radius: float, count: tuple[int, int], period: float, rotations: int = ROTATIONS
     ) -> "Family":
-        """Distribute the nodes for a probe.
+        """Distribute the solved presses over a domain.
 
         Args:
-            domain: Presses to cover.
+            domain: Presses for which the stress will be interpolated.
             film_radius: Radius of the film, mm.
             count: Number of distances and number of forces.
             period: Smallest rotation that maps the probe onto itself, rad; 0 for an axisymmetric probe.
             rotations: Smallest number of orientations of a probe that is not axisymmetric.
 
         Returns:
-            The family. It has a single force if the range of forces is a single value.
+            The family. It has only one force if the smallest and the largest force of the domain are equal.
         """
         n_distance, n_force = count
 
-        # `tanh` is the inverse of `distance_coordinate`.
+        # The distance coordinate is atanh(distance / film_radius), and tanh is its inverse.
         largest_coordinate = float(distance_coordinate(domain.radius / film_radius))
         distance = film_radius * np.tanh(chebyshev_nodes(n_distance, 0.0, largest_coordinate))
 
+        # The logarithms of the forces are Chebyshev nodes, unless the domain has a single force.
         min_log_force, max_log_force = np.log(domain.force_range)
         if max_log_force > min_log_force:
             force = np.exp(chebyshev_nodes(n_force, min_log_force, max_log_force))
         else:
             force = np.array([domain.force_range[0]])
 
-        # The rotations cover a full turn, with the same number of rotations in each period of the probe.
+        # The rotations cover a full turn, with the same number of rotations in each period of the probe. An
+        # axisymmetric probe needs only one rotation.
         symmetry_order = 1
         n_rotation = 1
         if period > 0.0:
@@ -122,24 +128,29 @@ class Family:
 
     @property
     def solved_rotations(self) -> Array:
-        """Orientations that must be solved, which cover one period of the probe, rad."""
+        """Rotations at which presses are solved, shape (n_solved_rotation,), rad.
+
+        The rotations cover one period of the probe. The stress for all other rotations follows from the symmetry of the
+        probe.
+        """
         return self.rotation[: self.rotation.size // self.symmetry_order]
 
     def weights(self, distance: Array, force: Array, rotation: Array) -> Array:
-        """Compute the weights of the nodes for the interpolation to presses.
+        """Compute the weights that interpolate the stress between the solved presses (nodes).
 
-        The interpolation is polynomial in the distance coordinate and in the logarithm of the force (Lagrange), and
-        trigonometric in the rotation.
+        Lagrange polynomials interpolate in the distance coordinate and in the logarithm of the force. A trigonometric
+        polynomial interpolates in the rotation of the probe.
 
         Args:
-            distance: Distances from the centre, shape (n,), mm.
-            force: Forces, shape (n,), N.
+            distance: Distances of the interpolated presses from the centre, shape (n,), mm.
+            force: Forces of the interpolated presses, shape (n,), N.
             rotation: Rotations of the probe relative to the direction of the press, shape (n,), rad.
 
         Returns:
-            Weights, shape (n, n_distance * n_force * n_rotation). An interpolated value is the sum of the values at the
-            nodes, multiplied by these weights.
+            Weights, shape (n, n_distance * n_force * n_rotation), dimensionless. An interpolated value is the sum over
+            the nodes of the weight of a node times the value at this node.
         """
+        # Interpolation weights along each axis; `rotation` may have the shape (1,) if it is the same for all presses.
         distance_nodes = distance_coordinate(self.distance / self.film_radius)
         press_coordinates = distance_coordinate(distance / self.film_radius)
         distance_weights = lagrange_values(distance_nodes, barycentric_weights(distance_nodes), press_coordinates)
@@ -147,20 +158,21 @@ class Family:
         force_weights = lagrange_values(force_nodes, barycentric_weights(force_nodes), np.log(force))
         rotation_weights = self._rotation_weights(rotation)
 
-        # The weight of a node is the product of its weights along the axes (distance, force, rotation).
+        # The weight of a node is the product of its weights along the axes (press, distance, force, rotation).
         distance_force_weights = distance_weights[:, :, None, None] * force_weights[:, None, :, None]
         node_weights = distance_force_weights * rotation_weights[:, None, None, :]
         return np.asarray(node_weights.reshape(distance.size, -1))
 
     def _rotation_weights(self, rotation: Array) -> Array:
-        """Compute the weights of the rotation nodes for trigonometric interpolation.
+        """Compute the weights that interpolate between the rotations of the family by a trigonometric polynomial.
 
-        With N evenly spaced nodes, the weight of a node at the angular distance t is the Dirichlet kernel
+        The family has N evenly spaced rotations. If t is the angle between the interpolated rotation and a rotation of
+        the family, the weight of the latter is the Dirichlet kernel
 
             (1 + 2 cos(t) + 2 cos(2 t) + ...) / N
 
         with all harmonics up to N / 2. If N is even, the highest harmonic has the amplitude 1 in place of 2, because
-        its sine is zero at all nodes.
+        the sine of the highest harmonic is zero at every rotation of the family.
 
         Args:
             rotation: Rotations of the probe relative to the direction of the press, shape (n,), rad.
@@ -176,18 +188,20 @@ class Family:
         return np.asarray((1.0 + np.cos(phase) @ amplitudes) / n_rotation)
 
     def solve(self, sensor: Sensor, probe: Probe, settings: SolveSettings, executor: Executor | None) -> Array:
-        """Solve the presses of the family.
+        """Compute the stress under the presses of the family, for the rotations within one period of the probe.
 
         Args:
-            sensor: The sensor.
-            probe: The probe.
-            settings: Theory, mesh and width of the thin rings, which are the same for all presses.
+            sensor: Sensor with the film, and with the surface at which the stress is read.
+            probe: Probe that presses the film.
+            settings: Theory, mesh and width of the thin rings at the rim, which are the same for all presses.
             executor: Executor that runs the solves; None for this process.
 
         Returns:
             Scaled stress at the nodes of the mesh, shape
-            (n_distance, n_solved_rotation, n_force, n_element * n_local * 3), which is the argument of `unfold`.
+            (n_distance, n_solved_rotation, n_force, n_element * n_local * 3), dimensionless. The method `unfold`
+            extends it to all rotations.
         """
+        # A chain contains the presses with all forces at one distance and rotation.
         chains = [
             Chain(sensor.film, probe.rotated(float(rotation)), float(distance), self.force, sensor.surface, settings)
             for distance in self.distance
@@ -197,20 +211,20 @@ class Family:
         return solved.reshape(self.distance.size, self.solved_rotations.size, self.force.size, -1)
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
-        """Compute the stress of all orientations from that of the solved orientations, by the symmetry of the probe.
+        """Extend the stress from the rotations within one period of the probe to all rotations, by symmetry.
 
-        If a probe is rotated by one of its periods, the press remains the same. The mesh, however, is rotated. The
-        stress of each further period is therefore that of the solved period, after a rotation of the elements and of
-        the components.
+        A rotation of the probe by one period does not change the press, but rotates the mesh. The stress of each
+        further period is therefore computed from the stress of the solved period, by a rotation of the elements of the
+        mesh and of the components of the stress.
 
         Args:
-            solved: Scaled stress in a frame that rotates with the probe, shape
-                (n_distance, n_solved_rotation, n_force, n_element * n_local * 3).
-            mesh: Template of the mesh.
+            solved: Scaled stress in a frame that rotates with the probe, as returned by `solve`, shape
+                (n_distance, n_solved_rotation, n_force, n_element * n_local * 3), dimensionless.
+            mesh: Template of the mesh of the solves.
 
         Returns:
-            Scaled stress, shape (n_distance * n_force * n_rotation, n_element * n_local * 3), in the order of
-            `weights`.
+            Scaled stress, shape (n_distance * n_force * n_rotation, n_element * n_local * 3), dimensionless. The rows
+            have the order of the columns of `weights`.
         """
         # The order of the axes becomes (distance, force, rotation), as in `weights`.
         n_distance, n_rotation, n_force, n_value = solved.shape
@@ -220,7 +234,7 @@ class Family:
             angle = 2.0 * np.pi * period_index / self.symmetry_order
             rotated_elements = mesh.rotated(period_index, self.symmetry_order)
             reordered_stress = solved_period[..., rotated_elements, :, :]
-            # The components refer to a frame that rotates with the probe, so they rotate in the opposite direction.
+            # The components refer to a frame that rotates with the probe. In this frame they rotate backwards.
             stress_of_periods.append(rotate_stress(reordered_stress, -angle))
         all_rotations = np.concatenate(stress_of_periods, axis=2)
         return np.asarray(all_rotations.reshape(-1, n_value))
@@ -230,10 +244,10 @@ class CheckPress(NamedTuple):
     """A press at which the interpolation of a family is compared with a direct solve.
 
     Attributes:
-        distance: Distance from the centre, mm.
-        angle: Direction from the centre, rad.
-        force: Force, N.
-        rotation: Further rotation of the probe, rad.
+        distance: Distance of the press from the centre of the film, mm.
+        angle: Direction from the centre of the film to the press, rad.
+        force: Force of the press, N.
+        rotation: Rotation of the probe in addition to its own orientation, rad.
     """
 
     distance: float
@@ -243,18 +257,19 @@ class CheckPress(NamedTuple):
 
     @property
     def position(self) -> tuple[float, float]:
-        """Position (x, y), mm."""
+        """Position (x, y) of the press, mm."""
         return self.distance * math.cos(self.angle), self.distance * math.sin(self.angle)
 
 
 def check_presses(domain: Domain, count: int) -> list[CheckPress]:
-    """Return presses that cover the distances and forces of a domain. The last press lies at the largest distance.
+    """Return presses that are distributed over the distances and forces of a domain.
 
-    The square roots of Chebyshev nodes are used as distances, so that the presses cover the area of the disk.
+    The last press lies at the largest distance. The distances of the other presses are the square roots of Chebyshev
+    nodes. The square root distributes the presses over the area of the disk.
 
     Args:
-        domain: Presses that a family covers.
-        count: Number of presses.
+        domain: Domain of the family that is checked.
+        count: Number of presses to be returned, including the last press.
     """
     relative_distances = np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0))
     min_force, max_force = domain.force_range
@@ -263,13 +278,14 @@ def check_presses(domain: Domain, count: int) -> list[CheckPress]:
     for index, relative_distance in enumerate([*relative_distances, 1.0]):
         distance = float(domain.radius * relative_distance)
 
-        # Multiples of the golden ratio, modulo 1, distribute the logarithms of the forces evenly. Rounding must not
-        # move a force out of the range.
+        # Multiples of the golden ratio (0.618), modulo 1, distribute the logarithms of the forces evenly. Rounding must
+        # not move a force out of the range.
         log_force_fraction = (0.5 + 0.618 * index) % 1.0
         force = np.exp(min_log_force + (max_log_force - min_log_force) * log_force_fraction)
         force_in_range = float(np.clip(force, min_force, max_force))
 
-        # The golden angle (2.4 rad) distributes the directions evenly. The rotation changes by another angle.
+        # The golden angle (2.4 rad) distributes the directions evenly. The rotation of the probe changes by a different
+        # angle, so that the rotation and the direction are independent.
         angle = 2.4 * index
         rotation = 0.7 * index
         presses.append(CheckPress(distance, angle, force_in_range, rotation))
@@ -277,14 +293,15 @@ def check_presses(domain: Domain, count: int) -> list[CheckPress]:
 
 
 def check_family(film: Film, probe: Probe, domain: Domain) -> None:
-    """Raise an error if a forward map cannot cover a domain.
+    """Raise an error if no forward map can be built for a film, a probe and a domain.
 
-    If the outermost press with the largest force can exist, all other presses of the domain can exist, too.
+    Only the outermost press with the largest force is checked. If this press can exist, all other presses of the domain
+    can exist, too.
 
     Args:
-        film: The film.
-        probe: The probe.
-        domain: Largest distance of a press from the centre, and range of forces.
+        film: Film of the forward map.
+        probe: Probe of the forward map.
+        domain: Presses that the forward map would cover.
 
     Raises:
         SceneError: If the radius or the forces are not positive numbers, if the film is not axisymmetric, or if the
@@ -310,34 +327,40 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
 
 
 Reading = Callable[[Equilibrium, Surface], Array]
-"""Function that computes values of a solved press, such as the stresses at a surface in the thickness, any shape."""
+"""Type of a function that computes values from a solved press, such as the stresses at a surface of the film.
+
+The returned array has any shape.
+"""
 
 
 def probe_frame_stress(solved: Equilibrium, surface: Surface) -> Array:
-    """Compute the scaled touch stress at the nodes in a frame that rotates with the probe.
+    """Compute the scaled touch stress at the nodes of the mesh in a frame that rotates with the probe.
 
     Args:
-        solved: The solved press.
-        surface: Surface in the thickness; see `touch_stress`.
+        solved: Equilibrium of the film under the press.
+        surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
 
     Returns:
-        (S11, S22, S12) in units of E_young A^2, shape (n_element, n_local, 3).
+        Stress components (S11, S22, S12), shape (n_element, n_local, 3), in units of Young's modulus times the squared
+        amplitude, dimensionless.
     """
     return rotate_stress(nodal_stress(solved, surface), -solved.probe.angle)
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Presses on one film at one position with different forces. Each solve starts from the previous equilibrium.
+    """Presses on one film at one position with different forces, which are solved one after the other.
+
+    Each solve starts from the equilibrium under the previous force.
 
     Attributes:
-        film: The film.
-        probe: The probe, with its rotation.
+        film: Film on which the probe presses.
+        probe: Probe in its rotated orientation.
         distance: Distance of the centroid of the footprint from the centre of the film, mm.
         forces: Forces in the order in which they are solved, shape (n_force,), N.
-        surface: Surface in the thickness at which the stress is read.
-        settings: Theory, mesh and width of the thin rings.
-        read: Function that computes the values of each press.
+        surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
+        settings: Theory, mesh and width of the thin rings at the rim.
+        read: Function that computes the returned values from each solved press.
     """
 
     film: Film
@@ -350,16 +373,17 @@ class Chain:
 
 
 def solve_chains(chains: Sequence[Chain], executor: Executor | None) -> Array:
-    """Solve chains of presses.
+    """Solve the presses of several chains, and show the progress.
 
     Args:
-        chains: The chains, which have the same mesh and number of forces.
-        executor: Executor that runs the chains; None for this process.
+        chains: Chains with the same mesh and the same number of forces.
+        executor: Executor that solves the chains in parallel; None for this process.
 
     Returns:
-        Values that `Chain.read` computes, shape (n_chain, n_force, n_value).
+        Values that `Chain.read` computes for each press, shape (n_chain, n_force, n_value).
     """
-    return np.stack(list(track(in_order(executor, _solve_chain, chains), "solving the film", len(chains))))
+    values_of_chains = in_order(executor, _solve_chain, chains)
+    return np.stack(list(track(values_of_chains, "solving the film", len(chains))))
 
 
 def solve_films(
@@ -370,21 +394,25 @@ def solve_films(
     executor: Executor | None,
     read: Reading = probe_frame_stress,
 ) -> Array:
-    """Solve presses with circular probes on the films of a grid.
+    """Solve presses with circular probes on many films.
+
+    A grid defines the properties of the films and of the presses: pretension, thickness, probe radius, distance and
+    force.
 
     Args:
-        film: Film whose radius, Young's modulus and Poisson's ratio all films have.
-        surface: Surface in the thickness at which the stress is read.
-        grid: Grid of distances, loads, pretensions, thicknesses and probe radii.
-        settings: Theory, mesh and width of the thin rings.
+        film: Film that defines the radius, Young's modulus and Poisson's ratio of all films.
+        surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
+        grid: Grid of distances, loads, pretensions, thicknesses and probe radii, dimensionless.
+        settings: Theory, mesh and width of the thin rings at the rim.
         executor: Executor that runs the solves; None for this process.
-        read: Function that computes the values of each press.
+        read: Function that computes the returned values from each solved press.
 
     Returns:
-        Values that `read` computes, shape (*grid.shape, n_value).
+        Values that `read` computes for each press, shape (*grid.shape, n_value).
     """
     # The values of the grid are dimensionless: lengths are divided by the radius of the film, tensions by Young's
-    # modulus, and forces by Young's modulus, the thickness and the radius. Each chain begins with the largest force.
+    # modulus, and forces by the product of Young's modulus, the thickness and the radius. Each chain begins with the
+    # largest force.
     radius = film.radius
     chains = []
     for distance, tension, thickness, reach in product(grid.distance, grid.tension, grid.thickness, grid.reach):
@@ -392,20 +420,29 @@ def solve_films(
         descending_forces = grid.load[::-1] * film.young * grid_film.thickness * radius
         probe = Circle(float(reach) * radius)
         chains.append(Chain(grid_film, probe, float(distance) * radius, descending_forces, surface, settings, read))
-    values = solve_chains(chains, executor)[:, ::-1]  # the load ascends along the second axis
+    values = solve_chains(chains, executor)[:, ::-1]  # reverse the forces into ascending order
 
-    # The order of the solves is (distance, tension, thickness, reach, load). In the grid, the load is the second axis.
+    # The values have the axes (distance, tension, thickness, reach, load, value). In the grid, the load is the second
+    # axis.
     n_distance, n_load, n_tension, n_thickness, n_reach = grid.shape
     load_last = values.reshape(n_distance, n_tension, n_thickness, n_reach, n_load, -1)
     return np.moveaxis(load_last, 4, 1)
 
 
 def _solve_chain(chain: Chain) -> Array:
-    """Solve the presses of one chain, and return the values that `Chain.read` computes, shape (n_force, n_value)."""
+    """Solve the presses of one chain.
+
+    Args:
+        chain: The chain, whose presses have the same position and different forces.
+
+    Returns:
+        Values that `Chain.read` computes for each force, shape (n_force, n_value).
+    """
     position = (chain.distance, 0.0)
     values_of_forces = []
     equilibrium: Equilibrium | None = None
-    for force in chain.forces.tolist():  # each solve starts from the equilibrium under the previous force
+    for force in chain.forces.tolist():
+        # The equilibrium under the previous force is a good start for the iterations of the solver.
         equilibrium = press(chain.film, chain.probe, position, force, chain.settings, start=equilibrium)
         values = chain.read(equilibrium, chain.surface)
         values_of_forces.append(values.ravel())

@@ -1,18 +1,18 @@
-"""Forward maps of all films of a family, from presses with circular probes on a grid of dimensionless parameters.
+"""Forward maps of many similar films, interpolated between solved presses on a grid of dimensionless parameters.
 
-If a is the radius of the film, E h its stretching stiffness and R the radius of the probe, the scaled stress under a
-press depends on five numbers (`mechanics.scaling`):
+Let a be the radius of the film, E its Young's modulus, h its thickness, R the radius of the circular probe and F the
+force. The scaled stress under a press depends on Poisson's ratio and on five numbers (see `mechanics.scaling`):
 
-    distance / a,   F / (E h a),   pretension / E,   h / a,   R / a,
+    distance / a,   F / (E h a),   pretension / E,   h / a,   R / a.
 
-and on Poisson's ratio, which is the same for all films of a family. In a frame that moves with the probe, the stress at
-the nodes of the mesh is a smooth function of these five parameters. The stress is solved at the nodes of a Chebyshev
-grid and interpolated between them. The stresses on the grid are stored as a proper orthogonal decomposition with about
-fifty modes (Sirovich 1987). The forward map of one film is interpolated over the last three parameters, which takes a
-millisecond.
+All films of a family have the same Poisson's ratio. In a frame that moves with the probe, the stress at the nodes of
+the mesh is a smooth function of the five numbers. The stress is computed at the nodes of a Chebyshev grid and
+interpolated between these nodes. The stresses on the grid are stored as a proper orthogonal decomposition with about
+fifty modes (Sirovich 1987). The forward map of a single film is obtained by interpolation over the last three numbers.
+This interpolation takes about one millisecond.
 
-Files contain the coefficients and modes as integers. Modes with small contributions have fewer bits. The rounding
-changes a charge by a fraction of about 3e-5.
+Files contain the coefficients and modes as integers. Modes with small contributions are stored with fewer bits. The
+rounding to integers changes a charge by a relative amount of about 3e-5.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,46 +42,47 @@ NODE_COUNTS = (5, 12, 8, 2, 5)
 """Number of grid nodes along each of `AXES`."""
 
 MAX_BITS = 16
-"""Number of bits of the values of the mode with the largest contribution in a file; see `bits_of`."""
+"""Number of bits per value of the mode with the largest contribution, in a file; see `bits_of`."""
 
 EXTRA_BITS = 4.0
-"""Number of bits that each mode gets in addition to those that its size requires; see `bits_of`."""
+"""Number of bits that each mode gets in addition to the bits that its contribution requires; see `bits_of`."""
 
 IMPERFECTION_PREFIX = "imperfections."
-"""Beginning of the names of the arrays of `FilmModes` in a file."""
+"""Prefix of the names of the arrays of `FilmModes` in a file."""
 
 MAX_TRUNCATION_ERROR = 8e-5
-"""Largest relative error of the stresses by the decomposition (root mean square)."""
+"""Largest relative error of the stresses that the decomposition may cause (root mean square), dimensionless."""
 
 MAX_FAMILY_ERROR = 2e-3
-"""Largest relative error of a charge with respect to direct solves that a family may have.
+"""Largest relative error of a charge, with respect to direct solves, that a family may have, dimensionless.
 
 The error is largest for small forces on films with a large pretension, where the charges are only a few pC.
 """
 
 CHECK_COUNT = 24
-"""Number of direct solves with which a family is compared."""
+"""Number of random presses at which the interpolated charges of a family are compared with direct solves."""
 
 LIMIT_TOLERANCE = 1e-9
-"""Relative tolerance of the limits of a family, which allows for the rounding of units."""
+"""Relative tolerance of the limits of a family, which allows for rounding errors of unit conversions."""
 
 
 @dataclass(frozen=True)
 class FilmFamily:
-    """Scaled stress under presses with circular probes, for all films with the same Poisson's ratio.
+    """Scaled stress under presses with circular probes, for many films with the same Poisson's ratio.
 
     Attributes:
-        poisson: Poisson's ratio.
-        surface: Surface in the thickness at which the stress is read: "middle", "top" or "bottom".
-        limits: Smallest and largest value along each axis, dimensionless.
+        poisson: Poisson's ratio of all films.
+        surface: Surface at which the stress is read: "middle", "top" or "bottom" of the film.
+        limits: Smallest and largest value along each axis of the grid, dimensionless.
         grid: Grid of films and presses that were solved.
         resolution: Fineness of the mesh of the solves.
         layer: Width of the thin rings at the rim, in film radii.
         coefficients: Coefficients of the modes at the grid nodes, shape (n_distance, n_load, n_tension, n_thickness,
             n_reach, n_mode).
-        modes: Modes of the scaled stress C : E' at the nodes of every element, shape (n_mode, n_element * n_local * 3).
-        error: Largest relative error of a charge with respect to the direct solves of `build`.
-        imperfections: Stress fields of the imperfections; None if they were not solved.
+        modes: Modes of the scaled stress at the nodes of every element, shape (n_mode, n_element * n_local * 3),
+            dimensionless.
+        error: Largest relative error of a charge with respect to the direct solves of `build`, dimensionless.
+        imperfections: Stress fields of the imperfections of a film; None if these fields were not solved.
     """
 
     poisson: float
@@ -105,17 +106,19 @@ class FilmFamily:
         counts: tuple[int, ...] = NODE_COUNTS,
         executor: Executor | None = None,
     ) -> "FilmFamily":
-        """Solve about five thousand presses on the films that a calibration may find, and check the interpolation.
+        """Build the family of all films that are possible according to a prior distribution.
+
+        About five thousand presses are solved. The interpolated charges are then compared with direct solves.
 
         Args:
-            prior: Prior distribution of the films.
+            prior: Prior distribution of the parameters of the film and of the probe radius.
             radius: Largest distance of a press from the centre, mm.
             force_range: Smallest and largest force, N.
             counts: Number of grid nodes along each of `AXES`. A narrow prior distribution needs fewer nodes.
             executor: Executor that runs the solves; None for this process.
 
         Raises:
-            SceneError: If the force, the radius or the probe of a press is impossible for one of the films.
+            SceneError: If a press in the domain cannot exist, or the film has a closed back or a static pressure.
             SolveError: If a press has no equilibrium, or the interpolation error exceeds `MAX_FAMILY_ERROR`.
         """
         domain = Domain(radius, force_range)
@@ -128,7 +131,7 @@ class FilmFamily:
         _check_back(film)
         check_family(prior.sensor.coated_film, largest_probe, domain)
 
-        # All solves have the mesh that the smallest probe needs, because this probe needs the finest mesh.
+        # All solves use the mesh that the smallest probe needs, because the smallest probe needs the finest mesh.
         min_force, max_force = force_range
         middle_force = float(np.sqrt(min_force * max_force))
         layer = layer_for(film, middle_force)
@@ -141,7 +144,7 @@ class FilmFamily:
         stress = solve_films(film, surface, grid, settings, executor)
         coefficients, modes = decompose(stress, MAX_TRUNCATION_ERROR)
 
-        # The error is measured with the finished family, and is unknown (NaN) until then.
+        # The error is unknown (NaN) until the finished family is compared with direct solves.
         family = cls(film.poisson, surface, limits, grid, resolution, layer, coefficients, modes, error=np.nan)
         error = _check_against_solves(family, prior, domain)
         if error > MAX_FAMILY_ERROR:
@@ -152,20 +155,20 @@ class FilmFamily:
         return replace(family, error=error)
 
     def forward_map(self, sensor: Sensor, probe: Circle) -> ForwardMap:
-        """Interpolate the forward map of one film.
+        """Interpolate the forward map of a single film.
 
         Args:
-            sensor: Sensor with a film of the family.
-            probe: Probe with a radius of the family.
+            sensor: Sensor whose film has parameters within the limits of the family.
+            probe: Probe whose radius is within the limits of the family.
 
         Returns:
-            Forward map for the presses of the family, up to the same distance and forces.
+            Forward map of the sensor. It covers the distances and the loads of the family.
 
         Raises:
             SceneError: If the film or the probe does not belong to the family.
         """
         film = sensor.film
-        film_parameters = {  # dimensionless coordinates of the film and its probe; see `AXES`
+        film_parameters = {  # values of the film and its probe along three axes of the grid, dimensionless
             "tension": film.pretension / film.young,
             "thickness": film.thickness / film.radius,
             "reach": probe.radius / film.radius,
@@ -178,7 +181,7 @@ class FilmFamily:
         reach_weights = self.grid.weights("reach", film_parameters["reach"])
         film_weights = np.einsum("t,h,r->thr", tension_weights, thickness_weights, reach_weights).ravel()
 
-        # Sum over the films of the grid, separately for each press and each mode
+        # Interpolate the coefficients of the modes: sum over the films of the grid for each press and each mode.
         n_distance, n_load, _, _, _, n_mode = self.coefficients.shape
         coefficients = self.coefficients.reshape(n_distance * n_load, film_weights.size, n_mode)
         press_coefficients = film_weights @ coefficients  # shape (n_distance * n_load, n_mode)
@@ -199,28 +202,31 @@ class FilmFamily:
         return ForwardMap(sensor, probe, family, THEORY, self.resolution, self.layer, table, self.error)
 
     def mode_map(self, sensor: Sensor, probe: Circle, names: Sequence[str] = tuple(MODES)) -> ModeMap:
-        """Return the map of the imperfection modes of one film. Only the fields that these modes need are computed.
+        """Return a map that computes the charges caused by the imperfection modes of a single film.
+
+        Only the stress fields that the requested modes need are interpolated.
 
         Args:
-            sensor: Sensor with a film of the family.
-            probe: Probe with a radius of the family.
-            names: Names of the modes, from `MODES`.
+            sensor: Sensor whose film has parameters within the limits of the family.
+            probe: Probe whose radius is within the limits of the family.
+            names: Names of the requested modes, from `MODES`.
 
         Raises:
-            SceneError: If the film or the probe does not belong to the family, or the family has no such modes.
+            SceneError: If the film or the probe does not belong to the family, if the family has no imperfections, or
+                if a name is not in `MODES`.
         """
         if self.imperfections is None:
             raise SceneError("this family of films has no modes of imperfections; add FilmModes.build")
         return self.imperfections.mode_map(self.forward_map(sensor, probe), names)
 
     def to_arrays(self) -> dict[str, Any]:
-        """Return the family as arrays, numbers and texts for a file.
+        """Convert the family into arrays, numbers and texts that can be stored in a file.
 
         Returns:
-            The values by their names. The coefficients and modes are rounded to integers. The value of "mode_scale" is
-            the product of the scales of both, shape (n_mode, 1).
+            Values by their names. The coefficients and the modes are rounded to integers. The array "mode_scale", shape
+            (n_mode, 1), is the product of the scale of the coefficients and the scale of the modes.
         """
-        # The coefficients of a mode have one scale over all axes of the grid. Its values have another scale.
+        # Each mode has one scale for its coefficients at all nodes of the grid, and one scale for its own values.
         bits = bits_of(self.coefficients, self.modes, MAX_BITS, EXTRA_BITS)  # shape (n_mode,)
         axes_of_grid = tuple(range(len(AXES)))
         coefficients, coefficient_scale = quantised(self.coefficients, axes_of_grid, bits)
@@ -249,7 +255,8 @@ class FilmFamily:
             arrays: Arrays, numbers and texts by their names.
 
         Returns:
-            The family. Its coefficients are integers, and its modes contain the scales of both.
+            The family. Its coefficients have integer values, because its modes are multiplied by the scale of the
+            modes and by the scale of the coefficients.
 
         Raises:
             InputError: If an array is missing, or the shapes are inconsistent.
@@ -264,7 +271,7 @@ class FilmFamily:
                 limits[axis] = (float(smallest), float(largest))
 
             # The nodes of all axes are stored in one array, one axis after the other.
-            axis_starts = np.cumsum(arrays["grid_shape"])[:-1]  # without the first axis, which starts at 0
+            axis_starts = np.cumsum(arrays["grid_shape"])[:-1]  # starts of all axes but the first, which starts at 0
             axis_nodes = np.split(np.asarray(arrays["grid"], dtype=float), axis_starts)
             modes = arrays["modes"] * np.asarray(arrays["mode_scale"], dtype=float)
 
@@ -296,12 +303,14 @@ class FilmFamily:
         """Raise an error if a film does not belong to the family.
 
         Args:
-            film: The film.
-            surface: Surface in the thickness at which the stress is read.
-            film_parameters: Values of the film and its probe along the axes "tension", "thickness" and "reach".
+            film: Film to be checked.
+            surface: Surface at which the stress of the film is read.
+            film_parameters: Values of the film and its probe along the axes "tension", "thickness" and "reach",
+                dimensionless.
 
         Raises:
-            SceneError: If the film does not belong to the family.
+            SceneError: If Poisson's ratio or the surface differs, if the film is not axisymmetric, if it has a closed
+                back or a static pressure, or if a value lies outside the limits of the family.
         """
         if (film.poisson, surface) != (self.poisson, self.surface):
             raise SceneError(
@@ -313,7 +322,7 @@ class FilmFamily:
         _check_back(film)
         for name, value in film_parameters.items():
             smallest, largest = self.limits[name]
-            # The absolute tolerance of 1e-15 is for limits of zero.
+            # A relative tolerance has no effect on a limit of zero. The absolute tolerance is 1e-15.
             is_above_smallest = value >= smallest * (1.0 - LIMIT_TOLERANCE) - 1e-15
             is_below_largest = value <= largest * (1.0 + LIMIT_TOLERANCE)
             if not (is_above_smallest and is_below_largest):
@@ -323,10 +332,10 @@ class FilmFamily:
 
 
 def _check_shapes(arrays: Mapping[str, Any]) -> None:
-    """Raise an error if the arrays of a file have inconsistent shapes.
+    """Raise an error if the arrays of a film family have inconsistent shapes.
 
     Args:
-        arrays: Arrays of `FilmFamily.to_arrays`.
+        arrays: Arrays of a file with the names of `FilmFamily.to_arrays`.
 
     Raises:
         ValueError: If the coefficients, modes and scales do not have the same number of modes, or the limits, the grid
@@ -351,7 +360,10 @@ def _check_shapes(arrays: Mapping[str, Any]) -> None:
 def _check_back(film: Film) -> None:
     """Raise an error if a film has a closed back or a static pressure.
 
-    The axes of a family do not include these properties.
+    A family of films covers neither of these properties.
+
+    Args:
+        film: Film to be checked.
 
     Raises:
         SceneError: If the film has a closed back or a static pressure.
@@ -365,17 +377,17 @@ def _check_back(film: Film) -> None:
 
 
 def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) -> float:
-    """Compute the largest relative error of the interpolated charges of presses on random films.
+    """Compare the interpolated charges of a family with direct solves, and return the largest relative error.
 
-    One random press on each of `CHECK_COUNT` random films is also solved directly.
+    One press is compared on each of `CHECK_COUNT` films, which are drawn at random from the prior distribution.
 
     Args:
-        family: The family, from which the charges are interpolated.
-        prior: Distribution of the films.
-        domain: Presses on the films.
+        family: Family from which the charges are interpolated.
+        prior: Prior distribution of the films.
+        domain: Positions and forces of the presses.
 
     Returns:
-        The largest of the errors; see `ForwardMap.relative_error`.
+        The largest relative error as defined by `ForwardMap.relative_error`, dimensionless.
     """
     rng = np.random.default_rng(0)
     min_force, max_force = domain.force_range
@@ -384,8 +396,8 @@ def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) 
         sensor, probe = prior.film(parameters)
         forward_map = family.forward_map(sensor, probe)
 
-        # The square root and the golden angle (2.4 rad) distribute the positions evenly over the disk. The forces are
-        # uniform in the logarithm.
+        # The square root and the golden angle (2.4 rad) distribute the positions evenly over the disk. The logarithms
+        # of the forces are distributed uniformly.
         distance = domain.radius * np.sqrt((index + 1.0) / CHECK_COUNT)
         angle = 2.4 * index
         force = float(min_force * (max_force / min_force) ** rng.random())
@@ -396,14 +408,14 @@ def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) 
 
 
 def _limits_of(prior: FilmPrior, domain: Domain) -> FilmLimits:
-    """Return the limits of the dimensionless parameters of presses on the films within the bounds of a prior.
+    """Compute the smallest and largest values of the dimensionless parameters that a family must cover.
 
     Args:
-        prior: Prior distribution of the films, with the smallest and largest value of each of their parameters.
-        domain: Presses on each film.
+        prior: Prior distribution of the films, with the smallest and largest value of each parameter of a film.
+        domain: Positions and forces of the presses on each film.
 
     Returns:
-        Smallest and largest value along each of `AXES`.
+        Smallest and largest value along each of `AXES`, dimensionless.
     """
     lower_bounds, upper_bounds = prior.bounds
     smallest = dict(zip(prior.names, lower_bounds.tolist(), strict=True))

@@ -1,4 +1,7 @@
-"""Grid of films and presses at which a family of films is solved, and low-rank decomposition of the stresses."""
+"""Grid of films and presses at which a family of films is solved, and decomposition of the solved stresses into modes.
+
+The modes and their coefficients are rounded to integers before they are stored in a file.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,15 +15,16 @@ from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 AXES = ("distance", "load", "tension", "thickness", "reach")
-"""Dimensionless coordinates of a press on a film, in the order of the axes of the grid."""
+"""Names of the axes of the grid. Together, their values describe a press on a film by dimensionless numbers."""
 
 THEORY = Theory(stretching=True, bending=True, pretensioned=True)
-"""Theory of all solves of a family, which includes all terms because the pretension varies."""
+"""Theory of all solves of a family. It includes all terms, because the pretension of the films varies."""
 
 SOFTENING = 4e-4
-"""Strain that is added to the pretension strain before its logarithm is taken.
+"""Strain that is added to the pretension strain before the logarithm of the sum is taken, dimensionless.
 
-A press of 0.05 N induces about this strain. Smaller pretension strains hardly change its charges.
+A press of 0.05 N induces about this strain. A pretension strain that is smaller hardly changes the charges of such a
+press.
 """
 
 FilmLimits = dict[str, tuple[float, float]]
@@ -29,16 +33,17 @@ FilmLimits = dict[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class FilmGrid:
-    """Nodes of a family of films: one ascending array for each of `AXES`.
+    """Grid of the dimensionless parameters for which presses on films are solved.
 
-    E is Young's modulus, h the thickness and a the radius of the film.
+    Each attribute contains the nodes along one axis of the grid in ascending order. In the list of attributes, E is
+    Young's modulus, h is the thickness, and a is the radius of the film.
 
     Attributes:
-        distance: Distance of the press from the centre of the film over a.
-        load: Force over E h a.
-        tension: Pretension over E.
-        thickness: Thickness h over a.
-        reach: Radius of the probe over a.
+        distance: Distances of the press from the centre of the film, divided by a, shape (n_distance,).
+        load: Forces divided by E h a, shape (n_load,).
+        tension: Pretensions divided by E, shape (n_tension,).
+        thickness: Thicknesses divided by a, shape (n_thickness,).
+        reach: Radii of the probe divided by a, shape (n_reach,).
     """
 
     distance: Array
@@ -49,13 +54,13 @@ class FilmGrid:
 
     @classmethod
     def spread(cls, limits: FilmLimits, counts: Sequence[int]) -> "FilmGrid":
-        """Distribute Chebyshev nodes between limits.
+        """Return a grid with the given number of nodes between the limits of each axis.
 
-        On each axis, the coordinate of `_interpolation_coordinate` has Chebyshev nodes between those of the limits.
-        These nodes are converted back into values of the axis.
+        The interpolation coordinates of the nodes are Chebyshev nodes. The interpolation coordinates are converted back
+        into values along the axis.
 
         Args:
-            limits: Smallest and largest value along each axis.
+            limits: Smallest and largest value along each axis, dimensionless.
             counts: Number of nodes along each of `AXES`.
         """
         nodes = {}
@@ -67,33 +72,39 @@ class FilmGrid:
         return cls(**nodes)
 
     def weights(self, axis: str, value: float) -> Array:
-        """Compute the interpolation weights of the nodes of an axis at a value on this axis, shape (n_node,).
+        """Compute the weights that interpolate between the nodes of one axis.
 
         Args:
-            axis: One of `AXES`.
-            value: Value on the axis, dimensionless.
+            axis: Name of the axis, from `AXES`.
+            value: Value along the axis to which a quantity is interpolated, dimensionless.
+
+        Returns:
+            Weights of the nodes of the axis, shape (n_node,), dimensionless. The sum of the weights is 1.
         """
         nodes = _interpolation_coordinate(axis, getattr(self, axis))
-        coordinate = np.array([_interpolation_coordinate(axis, value)])
+        coordinate = np.array([_interpolation_coordinate(axis, value)])  # a single value
         (weights,) = lagrange_values(nodes, barycentric_weights(nodes), coordinate)
         return np.asarray(weights)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of nodes along each axis."""
+        """Number of nodes along each axis of the grid, in the order of `AXES`."""
         return tuple(getattr(self, name).size for name in AXES)
 
 
 def _interpolation_coordinate(axis: str, value: Array | float) -> Any:
-    """Return the coordinate in which the stress is interpolated along an axis.
+    """Convert values along an axis into the coordinate in which the stress is interpolated along this axis.
 
     For the load and the reach, the coordinate is the logarithm of the value. For the tension, the coordinate is the
-    logarithm of the sum of the tension and `SOFTENING`. For the distance, the coordinate is `distance_coordinate`. The
-    thickness is its own coordinate.
+    logarithm of the sum of the tension and `SOFTENING`. For the distance, the coordinate is computed by the function
+    `distance_coordinate`. For the thickness, the coordinate is the value itself.
 
     Args:
-        axis: One of `AXES`.
+        axis: Name of the axis, from `AXES`.
         value: Dimensionless values along this axis, any shape.
+
+    Returns:
+        Coordinates, of the shape of `value`, dimensionless.
     """
     if axis in ("load", "reach"):
         return np.log(value)
@@ -105,35 +116,41 @@ def _interpolation_coordinate(axis: str, value: Array | float) -> Any:
 
 
 def _axis_value(axis: str, coordinate: Array) -> Array:
-    """Convert interpolation coordinates of an axis into values. This is the inverse of `_interpolation_coordinate`.
+    """Convert interpolation coordinates into values along an axis.
+
+    This function is the inverse of `_interpolation_coordinate`.
 
     Args:
-        axis: One of `AXES`.
-        coordinate: Interpolation coordinates, any shape.
+        axis: Name of the axis, from `AXES`.
+        coordinate: Interpolation coordinates, any shape, dimensionless.
+
+    Returns:
+        Dimensionless values along the axis, of the shape of `coordinate`.
     """
     if axis in ("load", "reach"):
         return np.exp(coordinate)
     if axis == "tension":
-        return np.maximum(np.exp(coordinate) - SOFTENING, 0.0)
+        return np.maximum(np.exp(coordinate) - SOFTENING, 0.0)  # rounding must not make the tension negative
     if axis == "distance":
-        return np.tanh(coordinate)
+        return np.tanh(coordinate)  # the inverse of `distance_coordinate`
     return coordinate
 
 
 def bits_of(coefficients: Array, modes: Array, max_bits: int, extra_bits: float) -> Array:
-    """Compute the number of bits with which each mode of a decomposition is stored.
+    """Compute the number of bits with which the values of each mode are stored in a file.
 
-    The decomposition is coefficients @ modes. A mode whose contribution to it is smaller by a factor of 2 needs one bit
-    less for the same absolute error. Every mode has at least 2 bits.
+    The stresses are the product coefficients @ modes. If the contribution of a mode to this product is half as large as
+    that of another mode, the mode needs one bit less for the same absolute error. Every mode has at least 2 bits.
 
     Args:
         coefficients: Coefficients of the modes, shape (..., n_mode).
         modes: Modes, shape (n_mode, n).
-        max_bits: Number of bits of the mode with the largest contribution.
-        extra_bits: Number of bits that each mode gets in addition, because the errors of many modes add up.
+        max_bits: Number of bits of the mode with the largest contribution, which no mode exceeds.
+        extra_bits: Number of bits by which the other modes get more bits than their contribution requires, because the
+            errors of many modes add up.
 
     Returns:
-        Numbers of bits, shape (n_mode,).
+        Number of bits of each mode, shape (n_mode,). The numbers are integers stored as floats.
     """
     largest_coefficient = np.abs(coefficients).reshape(-1, len(modes)).max(axis=0)
     largest_contribution = largest_coefficient * np.abs(modes).max(axis=1)
@@ -142,33 +159,37 @@ def bits_of(coefficients: Array, modes: Array, max_bits: int, extra_bits: float)
 
 
 def quantised(values: Array, axis: int | tuple[int, ...], bits: Array | int) -> tuple[np.ndarray, Array]:
-    """Divide values by a scale and round them to integers.
+    """Divide values by a scale, and round the quotients to integers.
 
     Args:
-        values: The values.
-        axis: Axes along which the values have the same scale.
-        bits: Number of bits of the integers, a number or an array that broadcasts with the scales.
+        values: Values to be stored, any shape.
+        axis: Axes along which all values are divided by the same scale.
+        bits: Number of bits of the integers including the sign, a number or an array that broadcasts with the scales.
 
     Returns:
-        The integers, shape of `values`, and the scales. The values are approximately integers * scales.
+        The integers, of the shape of `values`. The scales, with length 1 along `axis`. The product of both is
+        approximately `values`.
     """
+    # The largest magnitude becomes the largest signed integer.
     scale = np.abs(values).max(axis=axis, keepdims=True) / (2 ** (bits - 1) - 1)
     return np.round(values / scale).astype(np.int16), scale
 
 
 def decompose(stress: Array, max_error: float) -> tuple[Array, Array]:
-    """Compute a low-rank decomposition of stresses (proper orthogonal decomposition, Sirovich 1987).
+    """Decompose the stresses of many presses into a few modes (proper orthogonal decomposition, Sirovich 1987).
 
-    Each stress becomes a weighted sum of a few modes: stress = coefficients @ modes. The stress at each node is first
-    divided by its root mean square over the presses. Otherwise the large stress under the probe would dominate the
-    stress at the electrodes.
+    The stress field of each press is approximated by a weighted sum of the modes: stress = coefficients @ modes. Before
+    the decomposition, the stress at each node is divided by its root mean square over the presses. Without this
+    division, the decomposition would be accurate only under the probe, where the stress is large, and not at the
+    electrodes.
 
     Args:
-        stress: Scaled stresses (s11, s22, s12) at the nodes for all presses, shape (..., n_node * 3).
-        max_error: Largest relative error of the decomposition (root mean square).
+        stress: Scaled stresses (s11, s22, s12) at the nodes of the mesh for all presses, shape (..., n_node * 3).
+        max_error: Largest relative error (root mean square) that the decomposition may have.
 
     Returns:
-        Coefficients, shape (..., n_mode), and modes, shape (n_mode, n_node * 3), with the smallest number of modes.
+        Coefficients, shape (..., n_mode), and modes, shape (n_mode, n_node * 3). The number of modes is the smallest
+        number that satisfies `max_error`.
     """
     stress_of_presses = stress.reshape(-1, stress.shape[-1])
     node_stress = stress_of_presses.reshape(len(stress_of_presses), -1, 3)
@@ -177,25 +198,26 @@ def decompose(stress: Array, max_error: float) -> tuple[Array, Array]:
     rms_of_values = np.repeat(rms_of_nodes, 3)  # a node has three components of the stress
 
     relative_stress = stress_of_presses / rms_of_values
-    relative_modes = _right_singular_vectors(relative_stress, max_error)
+    relative_modes = _right_singular_vectors(relative_stress, max_error)  # orthonormal rows
     coefficients = relative_stress @ relative_modes.T
     return coefficients.reshape(*stress.shape[:-1], -1), relative_modes * rms_of_values
 
 
 def _right_singular_vectors(matrix: Array, max_error: float) -> Array:
-    """Compute the right singular vectors of a matrix M with the largest singular values.
+    """Compute the right singular vectors of a matrix M that belong to the largest singular values of M.
 
-    The singular value decomposition is M = U S V^T. The squares of the singular values are the eigenvalues of M M^T and
-    of M^T M. The smaller one of these Gram matrices is decomposed. The columns of V are the eigenvectors of M^T M. If
-    M M^T is decomposed, its eigenvectors are the columns of U, and V^T = S^-1 U^T M.
+    The singular value decomposition is M = U S V^T. The squares of the singular values are the eigenvalues of both Gram
+    matrices, M M^T and M^T M. The columns of U are the eigenvectors of M M^T, and the columns of V are the eigenvectors
+    of M^T M. Only the eigenvectors of the smaller Gram matrix are computed. If these eigenvectors are the columns of U,
+    the right singular vectors follow from V^T = S^-1 U^T M.
 
     Args:
         matrix: The matrix M, shape (n_row, n_column).
-        max_error: Largest relative error (root mean square) of M if the other singular values are omitted.
+        max_error: Largest relative error (root mean square) of M if all other singular values are replaced by zero.
 
     Returns:
-        Rows of V^T, shape (n_vector, n_column), by descending singular value. The number of rows is the smallest one
-        with a sufficiently small error.
+        Right singular vectors, shape (n_vector, n_column), by descending singular value. The number of vectors is the
+        smallest number that satisfies `max_error`.
     """
     n_row, n_column = matrix.shape
     has_fewer_rows = n_row < n_column
@@ -204,13 +226,14 @@ def _right_singular_vectors(matrix: Array, max_error: float) -> Array:
     eigenvalues = np.maximum(ascending_eigenvalues[::-1], 0.0)
     eigenvectors = ascending_eigenvectors[:, ::-1].T  # one eigenvector in each row
 
-    # The squared relative error is the sum of the omitted eigenvalues over the sum of all eigenvalues.
-    kept_fraction = np.cumsum(eigenvalues) / eigenvalues.sum()  # if the first 1, 2, ... eigenvalues are kept
+    # If only the first n singular values are kept, the squared relative error is the sum of the other eigenvalues,
+    # divided by the sum of all eigenvalues. The arrays contain the results for n = 1, 2, ...
+    kept_fraction = np.cumsum(eigenvalues) / eigenvalues.sum()
     relative_error = np.sqrt(np.maximum(1.0 - kept_fraction, 0.0))
-    n_vector = int(np.argmax(relative_error <= max_error)) + 1  # the first sufficiently small error
+    n_vector = int(np.argmax(relative_error <= max_error)) + 1  # the smallest n with a sufficiently small error
     kept_eigenvectors = eigenvectors[:n_vector]
 
-    if has_fewer_rows:
-        singular_values = np.sqrt(eigenvalues[:n_vector, None])
+    if has_fewer_rows:  # the rows of `kept_eigenvectors` are columns of U
+        singular_values = np.sqrt(eigenvalues[:n_vector, None])  # shape (n_vector, 1)
         return np.asarray(kept_eigenvectors @ matrix / singular_values)
     return kept_eigenvectors

@@ -1,13 +1,13 @@
-"""First-order change of the charges that imperfections of a film cause, for every film of a family and any contact.
+"""Changes of the charges that small imperfections of a film cause, to first order.
 
 The tension or the stiffness of a film may depend on the direction. The clamp may be oval, and the piezoelectric axes
-may be rotated. Poisson's ratio may differ from the assumed value, and the wires may have crosstalk. Each of these
-imperfections is a mode: a first-order change of the charges about those of an isotropic round film.
+may be rotated. Poisson's ratio may differ from the assumed value, and the wires may have crosstalk. Each mode describes
+one such imperfection by the first-order change of the charges that the imperfection causes.
 
-`MODES` declares each mode once, and `ModeMap` computes the charges of all modes. Some modes need the change of the
-stress field that `solver.sensitivity` solves. These fields are solved on a grid of distance, load and tension. Only the
-middle thickness and the middle probe radius of the family are solved, because the charges of the modes are small
-corrections.
+`MODES` declares each mode, and `ModeMap` computes the charges of the modes for any film of a family. For some modes,
+the module `solver.sensitivity` computes the change of the stress field. The change of the stress field is computed on a
+grid of distances, loads and tensions. The charges of the modes are small corrections. The change of the stress field is
+therefore computed only for the middle thickness and the middle probe radius of the family.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,15 +35,17 @@ from isocharge.simulate.solver.sensitivity import FIELDS, IS_ODD, stress_changes
 
 @dataclass(frozen=True)
 class PressedFilm:
-    """Presses on one film, from which the functions of the modes compute charges.
+    """Presses on one film, and the charges of the stress fields that the imperfections of the film cause.
+
+    The functions `Mode.charges` compute the charges of the modes from an object of this class.
 
     Attributes:
-        film: Forward map of the film.
+        film: Forward map of the film without imperfections.
         contact: Presses (x, y, F), shape (n, 3), mm and N.
-        fields: Charges of the solved stress fields, by kind of imperfection. Each kind has an even field, and some
-            kinds also have an odd field, with respect to a reflection in the direction of the press. The charges of a
-            field have the shape (n, n_electrode), pC per unit of the imperfection. Only the fields that the requested
-            modes need are present.
+        fields: Charges of the stress fields, by the kind of imperfection, such as "tension". Each kind has an even
+            field, and some kinds also have an odd field, with respect to a reflection in the direction of the press.
+            The charges of a field have the shape (n, n_electrode) and the unit pC per unit of the imperfection. Only
+            the fields that the requested modes need are present.
     """
 
     film: ForwardMap
@@ -52,39 +54,44 @@ class PressedFilm:
 
     @cached_property
     def twice_angle(self) -> Array:
-        """Twice the angle of each press about the centre, shape (n, 1), rad."""
+        """Twice the angle between the x axis and the direction from the centre to each press, shape (n, 1), rad."""
         return 2.0 * np.arctan2(self.contact[:, 1], self.contact[:, 0])[:, None]
 
     @cached_property
     def tension_scale(self) -> Array:
-        """Tension to which the tension fields are scaled, for each press, shape (n, 1), MPa."""
+        """Tension by which the fields of an uneven tension are scaled, for each press, shape (n, 1), MPa."""
         film = self.film.sensor.film
         return np.asarray(film.young * amplitude_squared(film, self.contact[:, 2]) + film.pretension)[:, None]
 
     def even_and_odd(self, kind: str) -> tuple[Array, Array]:
-        """Return the charges of the even field and of the odd field of an imperfection, for one unit of its modes.
+        """Return the charges of the even field and of the odd field of an imperfection, per unit of its modes.
 
         Args:
             kind: Name of an imperfection with two axes, from `FIELDS`.
 
         Returns:
-            Two arrays of shape (n, n_electrode), pC per unit of the mode.
+            Charges of the even field, and charges of the odd field, each of shape (n, n_electrode), pC per unit of the
+            modes.
         """
         even, odd = self.fields[kind]
-        if kind == "tension":  # the fields belong to a tension of `tension_scale`, and the mode to 1 MPa
+        if kind == "tension":
+            # The unit of the fields is `tension_scale`, and the unit of the modes is 1 MPa.
             return even / self.tension_scale, odd / self.tension_scale
         return even, odd
 
 
 def _component_along_axes(kind: str) -> Callable[[PressedFilm], Array]:
-    """Return a function that computes the charges of the component of an imperfection along x and y.
+    """Return a function that computes the charges of an imperfection whose axes are x and y.
 
-    The axes of the even field are along and across the direction of the press, and those of the odd field are the
-    diagonals between them. An imperfection with two axes rotates with twice the angle t of the press. The charges of a
-    component along x and y are therefore cos(2 t) * even - sin(2 t) * odd.
+    The axes of the even field are along and across the direction of the press. The axes of the odd field are rotated by
+    45 degrees from the direction of the press. Let t be the angle from the x axis to the direction of the press. An
+    imperfection with the axes x and y causes cos(2 t) times the even field minus sin(2 t) times the odd field.
 
     Args:
         kind: Name of an imperfection with two axes, from `FIELDS`.
+
+    Returns:
+        Function of a `PressedFilm`. It returns charges, shape (n, n_electrode), pC per unit of the mode.
     """
 
     def charges(press: PressedFilm) -> Array:
@@ -95,14 +102,17 @@ def _component_along_axes(kind: str) -> Callable[[PressedFilm], Array]:
 
 
 def _component_along_diagonals(kind: str) -> Callable[[PressedFilm], Array]:
-    """Return a function that computes the charges of the component of an imperfection along the diagonals of x and y.
+    """Return a function that computes the charges of an imperfection whose axes are the diagonals between x and y.
 
-    The axes of the even field are along and across the direction of the press, and those of the odd field are the
-    diagonals between them. An imperfection with two axes rotates with twice the angle t of the press. The charges of a
-    component along the diagonals are therefore sin(2 t) * even + cos(2 t) * odd.
+    The axes of the even field are along and across the direction of the press. The axes of the odd field are rotated by
+    45 degrees from the direction of the press. Let t be the angle from the x axis to the direction of the press. An
+    imperfection along the diagonals causes sin(2 t) times the even field plus cos(2 t) times the odd field.
 
     Args:
         kind: Name of an imperfection with two axes, from `FIELDS`.
+
+    Returns:
+        Function of a `PressedFilm`. It returns charges, shape (n, n_electrode), pC per unit of the mode.
     """
 
     def charges(press: PressedFilm) -> Array:
@@ -119,13 +129,17 @@ def _poisson_charges(press: PressedFilm) -> Array:
 
 
 def _shear_charges(press: PressedFilm) -> Array:
-    """Return the charges that the shear stress causes per unit of d12, shape (n, n_electrode), pC per pC/N."""
+    """Return the derivative of the charges with respect to the coefficient d12, shape (n, n_electrode), pC per pC/N."""
+    # The charges are proportional to d12 if all other coefficients are zero.
     shear_sensor = replace(press.film.sensor, piezo=Piezo(0.0, 0.0, d12=1.0))
     return np.asarray(replace(press.film, sensor=shear_sensor).field_charges(press.contact, EVEN_FIELD)[..., 0])
 
 
 def _crosstalk_charges(press: PressedFilm) -> Array:
-    """Return the sum of the charges of all other electrodes, shape (n, n_electrode), pC."""
+    """Return the derivative of the charges with respect to the crosstalk, shape (n, n_electrode), pC.
+
+    The derivative for each electrode is the sum of the charges of all other electrodes.
+    """
     own_charge = press.film.field_charges(press.contact, EVEN_FIELD)[..., 0]
     total_charge = own_charge.sum(axis=1, keepdims=True)
     return np.asarray(total_charge - own_charge)
@@ -133,17 +147,17 @@ def _crosstalk_charges(press: PressedFilm) -> Array:
 
 @dataclass(frozen=True)
 class Mode:
-    """Declaration of one mode of imperfection.
+    """Declaration of one mode, which is a small imperfection of a film such as an oval clamp.
 
     Attributes:
-        meaning: Definition of the value of the mode.
-        unit: Unit of the mode.
-        std: Standard deviation of the mode over films that have imperfections, in its unit.
-        charges: Function that returns the derivative of the charges with respect to the mode, at the value zero, shape
-            (n, n_electrode), pC per unit of the mode.
-        field: Key of the stress fields in `sensitivity.FIELDS` that the mode needs; empty if it needs none.
-        is_uneven_tension: Whether the mode is an uneven tension. Such a mode also has a second-order effect, which is
-            that of a lower mean tension.
+        meaning: Definition of the value of the mode, as a formula or a short text.
+        unit: Unit of the value of the mode.
+        std: Standard deviation of the value over films that have imperfections, in the unit of the mode.
+        charges: Function that returns the derivative of the charges with respect to the value of the mode, for a film
+            without imperfections, shape (n, n_electrode), pC per unit of the mode.
+        field: Key in `sensitivity.FIELDS` of the stress fields that the mode needs; empty if the mode needs no fields.
+        is_uneven_tension: Whether the mode is an uneven tension. To second order, an uneven tension has the effect of
+            a lower mean tension.
     """
 
     meaning: str
@@ -155,10 +169,10 @@ class Mode:
 
 
 OVAL_MEANING = "e of a rim at radius * (1 + e cos 2 (angle - alpha)), times"
-"""Beginning of the meaning of the oval modes."""
+"""First words of the meaning of the modes of an oval clamp."""
 
 STIFFNESS_MEANING = "ln(E1 / E2), axis 1 at an angle from x, times"
-"""Beginning of the meaning of the stiffness modes."""
+"""First words of the meaning of the modes of a stiffness that depends on the direction."""
 
 MODES = {
     "tension_difference": Mode(
@@ -188,33 +202,33 @@ MODES = {
     ),
     "crosstalk": Mode("share of every other electrode's charge that an electrode reads", "1", 0.01, _crosstalk_charges),
 }
-"""All modes by name. The order of the modes is the order of the coefficients in calibration files."""
+"""All modes by name. Calibration files contain the values of the modes in this order."""
 
 NODE_COUNTS = (5, 8, 7, 1, 1)
 """Number of grid nodes along each of `AXES`."""
 
 MAX_TRUNCATION_ERROR = 3e-3
-"""Largest relative error of the fields by their low-rank decomposition (root mean square), dimensionless."""
+"""Largest relative error of the fields that the decomposition may cause (root mean square), dimensionless."""
 
 MAX_BITS = 9
-"""Number of bits of the values of the largest component in a file; see `bits_of`."""
+"""Number of bits per value of the component with the largest contribution, in a file; see `bits_of`."""
 
 EXTRA_BITS = 2.0
-"""Number of bits that each component gets in addition to those that its size requires; see `bits_of`."""
+"""Number of bits that each component gets in addition to the bits that its contribution requires; see `bits_of`."""
 
 SCALE_BITS = 16
-"""Number of bits of the coefficients in a file."""
+"""Number of bits of each coefficient of a component in a file."""
 
 
 @dataclass(frozen=True)
 class ModeMap:
-    """Charges of the modes of one film.
+    """Map that computes the charges caused by the imperfection modes of one film.
 
     Attributes:
         names: Names of the modes, from `MODES`.
         film: Forward map of the film without imperfections.
-        fields: Map whose table contains the stress fields that the modes need; None if they need none.
-        field_numbers: Numbers of these fields, in the order of `FIELDS`.
+        fields: Forward map whose table contains the stress fields that the modes need; None if no mode needs a field.
+        field_numbers: Index in `KINDS` of each stress field of the table.
     """
 
     names: tuple[str, ...]
@@ -223,7 +237,9 @@ class ModeMap:
     field_numbers: tuple[int, ...]
 
     def mode_jacobian(self, contact: Array) -> Array:
-        """Compute the derivatives of the charges with respect to the modes, for a film without imperfections.
+        """Compute the derivatives of the charges with respect to the values of the modes.
+
+        The derivatives are those of a film without imperfections.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
@@ -243,11 +259,11 @@ class ModeMap:
         """Compute the charges of the stress fields, grouped by the kind of imperfection.
 
         Args:
-            contact: Presses (x, y, F) in the domain of the map, shape (n, 3), mm and N.
+            contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
 
         Returns:
-            For each kind of imperfection, the charges of its fields, each of shape (n, n_electrode); see
-            `PressedFilm.fields`.
+            Charges of the fields of each kind of imperfection, as in `PressedFilm.fields`. The charges of each field
+            have the shape (n, n_electrode).
         """
         if self.fields is None:
             return {}
@@ -261,18 +277,21 @@ class ModeMap:
 
 
 KINDS = [kind for kind, fields in FIELDS.items() for _ in fields]
-"""Kind of imperfection of each field, in the order of the field numbers.
+"""Kind of imperfection of each stress field, in the order of `FIELDS`.
 
 The even field of a kind precedes its odd field.
 """
 
 
 class SolvedFilms(Protocol):
-    """Properties of a family of films on which the stress fields of the modes depend; see `FilmFamily`."""
+    """Interface of a family of films, with the properties on which the stress fields of the modes depend.
+
+    `FilmFamily` implements this interface.
+    """
 
     @property
     def surface(self) -> Surface:
-        """Surface in the thickness of the film at which the stress is read."""
+        """Surface at which the stress is read: "middle", "top" or "bottom" of the film."""
 
     @property
     def limits(self) -> FilmLimits:
@@ -289,25 +308,28 @@ class SolvedFilms(Protocol):
 
 @dataclass(frozen=True)
 class FilmModes:
-    """Change of the scaled stress by each of `FIELDS`, for the films of a family, as a low-rank decomposition.
+    """Stress fields that imperfections cause in the films of a family, decomposed into a few components.
+
+    A stress field is the change of the scaled stress by one of `FIELDS`. The fields at a node of the grid are the sum
+    of the components, each multiplied by its coefficient at this node.
 
     Attributes:
         grid: Grid of films and presses at which the fields are solved.
         coefficients: Coefficients of the components at the nodes of the grid, shape (*grid.shape, n_component).
-        parts: Components of the fields, shape (n_component, n_field * n_element * n_local * 3), dimensionless.
+        components: Components of the fields, shape (n_component, n_field * n_element * n_local * 3), dimensionless.
     """
 
     grid: FilmGrid
     coefficients: Array
-    parts: Array
+    components: Array
 
     @classmethod
     def build(cls, family: SolvedFilms, film: Film, executor: Executor | None = None) -> "FilmModes":
-        """Solve the fields for about three hundred presses, and decompose them.
+        """Solve the stress fields for about three hundred presses, and decompose the fields into components.
 
         Args:
-            family: The family of films.
-            film: A film of the family. All films of the grid have its radius.
+            family: Family of films that defines the limits of the grid and the mesh.
+            film: Film that defines the radius, Young's modulus and Poisson's ratio of all films of the grid.
             executor: Executor that runs the solves; None for this process.
         """
         grid = FilmGrid.spread(family.limits, NODE_COUNTS)
@@ -317,11 +339,13 @@ class FilmModes:
         return cls(grid, coefficients, components)
 
     def mode_map(self, film: ForwardMap, names: Sequence[str] = tuple(MODES)) -> ModeMap:
-        """Return the map of the modes of one film. Only the fields that these modes need are computed.
+        """Return a map that computes the charges caused by the imperfection modes of one film.
+
+        Only the stress fields that the requested modes need are interpolated.
 
         Args:
             film: Forward map of the film, from the same family.
-            names: Names of the modes, from `MODES`.
+            names: Names of the requested modes, from `MODES`.
 
         Raises:
             SceneError: If a name is not in `MODES`.
@@ -329,6 +353,7 @@ class FilmModes:
         unknown = sorted(set(names) - set(MODES))
         if unknown:
             raise SceneError(f"modes: expected some of {', '.join(MODES)}, got {', '.join(unknown)}")
+        # Interpolate only the needed fields. A mode that needs no field has the kind "", which no field has.
         needed_kinds = {MODES[name].field for name in names}
         field_numbers = tuple(number for number, kind in enumerate(KINDS) if kind in needed_kinds)
         fields = self._field_map(film, field_numbers) if field_numbers else None
@@ -337,19 +362,19 @@ class FilmModes:
     def _field_map(self, forward_map: ForwardMap, field_numbers: tuple[int, ...]) -> ForwardMap:
         """Interpolate stress fields for one film, and return them as a forward map.
 
-        A forward map interpolates a table of the stress between presses. The returned map has a table of the fields
-        instead, so that the fields are interpolated in the same way.
+        A forward map contains a table of the stress, and interpolates the table between presses. The table of the
+        returned map contains stress fields in place of the stress, so the fields are interpolated in the same way.
 
         Args:
             forward_map: Forward map of the film.
-            field_numbers: Numbers of the fields, in the order of `FIELDS`.
+            field_numbers: Index in `KINDS` of each required field.
 
         Returns:
-            Map with one row of the table for each press of the grid. A row contains the values of all fields at the
-            first node of the mesh, then those at the next node, and so on.
+            Forward map whose table has one row for each press of the grid. A row contains the values of all fields at
+            the first node of the mesh, then those at the next node, and so on.
         """
         film = forward_map.sensor.film
-        n_component = len(self.parts)
+        n_component = len(self.components)
 
         # Interpolate the coefficients at the tension of the film. The grid has one thickness and one reach only.
         tension_weights = self.grid.weights("tension", film.pretension / film.young)
@@ -359,7 +384,7 @@ class FilmModes:
         # Select the fields, and order their values by node.
         mesh = template_for(forward_map.probe, forward_map.resolution)
         n_field = IS_ODD.size
-        all_fields = self.parts.reshape(n_component, n_field, mesh.n_element, -1, 3)
+        all_fields = self.components.reshape(n_component, n_field, mesh.n_element, -1, 3)
         fields = all_fields[:, list(field_numbers)]  # (component, field, element, local node, stress component)
         fields_by_node = np.moveaxis(fields, 1, 3)  # (component, element, local node, field, stress component)
         table = press_coefficients.reshape(-1, n_component) @ fields_by_node.reshape(n_component, -1)
@@ -378,26 +403,32 @@ class FilmModes:
         return replace(forward_map, probe=probe, family=family, table=table)
 
     def to_arrays(self) -> dict[str, Any]:
-        """Return the decomposition as arrays for a file. Coefficients and components are rounded to a few bits."""
+        """Convert the decomposition into arrays that can be stored in a file.
+
+        Returns:
+            Arrays by their names. The coefficients and the components ("parts") are rounded to integers. The array
+            "part_scale", shape (n_component, 1), is the product of the scales of both. The array "node_size" contains
+            the size of the stress at each node, by which the components are divided.
+        """
         axes_of_grid = tuple(range(len(AXES)))
         coefficients, coefficient_scale = quantised(self.coefficients, axes_of_grid, SCALE_BITS)
 
         # The components are divided by the size of the stress at each node. This size is rounded to a power of two,
         # which compresses well. A tiny number is added to the size, because the logarithm of zero does not exist.
-        n_component = len(self.parts)
-        node_stress = self.parts.reshape(n_component, -1, 3)
+        n_component = len(self.components)
+        node_stress = self.components.reshape(n_component, -1, 3)
         node_norm = np.sqrt((node_stress**2).sum(axis=(0, 2), keepdims=True))  # shape (1, n_node, 1)
         node_exponent = np.round(np.log2(node_norm + np.finfo(np.float32).tiny))
         node_size = np.float32(np.exp2(node_exponent))
-        relative_parts = (node_stress / node_size).reshape(n_component, -1)
-        bits = bits_of(self.coefficients, relative_parts, MAX_BITS, EXTRA_BITS)
-        parts, part_scale = quantised(relative_parts, 1, bits[:, None])
+        relative_components = (node_stress / node_size).reshape(n_component, -1)
+        bits = bits_of(self.coefficients, relative_components, MAX_BITS, EXTRA_BITS)
+        components, component_scale = quantised(relative_components, 1, bits[:, None])
         return {
             "grid_shape": np.array(self.grid.shape),
             "grid": np.concatenate([getattr(self.grid, name) for name in AXES]),
             "coefficients": coefficients,
-            "parts": parts,
-            "part_scale": np.float32(coefficient_scale.ravel()[:, None] * part_scale),
+            "parts": components,
+            "part_scale": np.float32(coefficient_scale.ravel()[:, None] * component_scale),
             "node_size": node_size.ravel(),
         }
 
@@ -406,8 +437,8 @@ class FilmModes:
         """Create a decomposition from the result of `to_arrays`.
 
         Args:
-            arrays: Arrays of the file.
-            field_size: Number of values of one field, three for each node of each element of the family's mesh.
+            arrays: Arrays of the file by their names.
+            field_size: Number of values of one stress field, which are three for each node of each element of the mesh.
 
         Raises:
             InputError: If an array is missing, the shapes are inconsistent, or the file contains other fields.
@@ -415,32 +446,33 @@ class FilmModes:
         try:
             _check_shapes(arrays, field_size)
             # The nodes of all axes are stored in one array, one axis after the other.
-            axis_starts = np.cumsum(tuple(arrays["grid_shape"]))[:-1]  # without the first axis, which starts at 0
+            axis_starts = np.cumsum(tuple(arrays["grid_shape"]))[:-1]  # starts of all axes but the first, which is at 0
             grid = FilmGrid(*np.split(np.asarray(arrays["grid"], dtype=float), axis_starts))
 
-            # The file contains the components as integers, divided by the size of the stress at each node.
-            part_scale = np.asarray(arrays["part_scale"], dtype=float)
+            # In the file, the components are integers. They were divided by a scale and by the size of the stress at
+            # each node.
+            component_scale = np.asarray(arrays["part_scale"], dtype=float)
             node_size = np.asarray(arrays["node_size"], dtype=float)
-            value_size = np.repeat(node_size, 3)  # each node has three components of the stress
-            parts = arrays["parts"] * part_scale * value_size
-            return cls(grid, arrays["coefficients"].astype(float), parts)
+            value_size = np.repeat(node_size, 3)  # each node has three stress components
+            components = arrays["parts"] * component_scale * value_size
+            return cls(grid, arrays["coefficients"].astype(float), components)
         except (KeyError, ValueError, TypeError, AttributeError, IndexError) as error:
             raise InputError(f"film modes: expected the arrays that to_arrays gives ({error})") from error
 
 
 def _check_shapes(arrays: Mapping[str, Any], field_size: int) -> None:
-    """Raise an error if the arrays of a file have inconsistent shapes.
+    """Raise an error if the arrays of film modes have inconsistent shapes.
 
     Args:
-        arrays: Arrays of `FilmModes.to_arrays`.
-        field_size: Number of values of one field.
+        arrays: Arrays of a file with the names of `FilmModes.to_arrays`.
+        field_size: Number of values of one stress field.
 
     Raises:
         ValueError: If the numbers of components or nodes differ, or a component does not contain all fields.
     """
     grid_shape = tuple(arrays["grid_shape"])
     coefficients = arrays["coefficients"]
-    parts = arrays["parts"]
+    parts = arrays["parts"]  # the components of the stress fields
     n_component = len(parts)
     coefficients_fit = coefficients.shape == (*grid_shape, n_component)
     scales_fit = arrays["part_scale"].shape == (n_component, 1)

@@ -1,12 +1,12 @@
-"""The forward map: the charges of many presses, computed from a few solves.
+"""Forward map, which computes the charges of many presses from a few solved presses.
 
-The presses of one probe form a family. The coordinates of the family are the distance from the centre and the force. If
-the probe is not axisymmetric, the orientation is a third coordinate. Presses in other directions from the centre are
+All presses with one probe form a family with two coordinates: the distance from the centre of the film, and the force.
+If the probe is not axisymmetric, its orientation is a third coordinate. Presses in other directions from the centre are
 obtained by a rotation of the film. In a frame that moves with the probe, the stress at the nodes of the mesh is a
-smooth function of the coordinates. The press is solved at Chebyshev nodes in the distance and in the logarithm of the
+smooth function of the coordinates. Presses are solved at Chebyshev nodes in the distance and in the logarithm of the
 force, and at evenly spaced orientations. For every other press, the stress field is interpolated, and the charges are
-integrated from the interpolated field. The electrodes therefore do not affect the interpolation, even if the probe lies
-on an electrode. When a map is built, its charges are compared with those of direct solves.
+computed by integration of the interpolated field over the electrodes. The positions of the electrodes therefore do not
+affect the accuracy of the interpolation. When a map is built, its charges are compared with those of direct solves.
 """
 
 from concurrent.futures import Executor
@@ -39,36 +39,41 @@ CHUNK_SIZE = 256
 """Number of presses that are evaluated at once, which limits the size of the working arrays to about 100 MB."""
 
 INTERPOLATION_ERROR = 5e-4
-"""Largest relative error of a charge with respect to direct solves that a forward map may have."""
+"""Largest relative error of a charge, with respect to direct solves, that a forward map may have, dimensionless."""
 
 CHARGE_FLOOR = 0.1
-"""Smallest charge to which an error is relative, in units of the largest charge of the press, dimensionless."""
+"""Smallest charge by which an error is divided, in units of the largest charge of the press, dimensionless."""
 
 EVEN_FIELD = np.zeros(1, dtype=bool)
-"""Parity of the stress field under a press on an isotropic round film: one field, which is even."""
+"""Value of the argument `is_odd` for a single even field.
+
+The stress under a press on an isotropic round film is such a field.
+"""
 
 SKIP_RATIO = 10.0
-"""Ratio of the error to `INTERPOLATION_ERROR` above which the next entry of `NODE_COUNTS` is skipped, because it would
-not be sufficient either, dimensionless."""
+"""Ratio of the error to `INTERPOLATION_ERROR` above which the next entry of `NODE_COUNTS` is skipped, dimensionless.
+
+With such a large error, the next entry would not suffice either.
+"""
 
 CHECK_COUNT = 10
-"""Number of direct solves with which a forward map is compared."""
+"""Number of presses at which a forward map is compared with direct solves."""
 
 
 @dataclass(frozen=True)
 class ForwardMap:
-    """Touch charges of a sensor under one probe, as a function of position, force and orientation.
+    """Map that computes the touch charges of a sensor from the position, the force and the orientation of a probe.
 
     Attributes:
-        sensor: The sensor.
-        probe: The probe.
-        family: Distances, forces and orientations of the solves.
-        theory: Terms of the film theory that are modelled.
+        sensor: Sensor whose charges are computed.
+        probe: Probe that presses the film.
+        family: Distances, forces and orientations of the solved presses.
+        theory: Terms of the film theory that the solves include.
         resolution: Fineness of the mesh of the solves.
-        layer: Width of the thin rings at the rim, in film radii.
-        table: Scaled stress C : E' at the nodes of every element, in a frame that rotates with the probe, shape
-            (n_distance * n_force * n_rotation, n_element * n_local * 3), dimensionless.
-        error: Largest relative error of a charge with respect to the direct solves of `build`.
+        layer: Width of the thin rings of the mesh at the rim, in film radii.
+        table: Scaled stress at the nodes of every element under the solved presses, in a frame that rotates with the
+            probe, shape (n_distance * n_force * n_rotation, n_element * n_local * 3), dimensionless.
+        error: Largest relative error of a charge with respect to the direct solves of `build`, dimensionless.
     """
 
     sensor: Sensor
@@ -91,16 +96,17 @@ class ForwardMap:
         *,
         executor: Executor | None = None,
     ) -> "ForwardMap":
-        """Solve a family of presses, and compare the interpolation with direct solves.
+        """Build a forward map: solve a family of presses, and compare the interpolated charges with direct solves.
 
         Args:
-            sensor: The sensor.
-            probe: The probe.
+            sensor: Sensor whose charges the map computes.
+            probe: Probe that presses the film.
             radius: Largest distance of a press from the centre, mm.
             force_range: Smallest and largest force, N.
-            settings: Accuracy, theory and mesh. Settings that are "auto" are chosen for all presses together: the
-                fewest terms that the accuracy allows for all forces, the mesh that the outermost press needs, and the
-                width of the thin rings for the geometric mean of the forces.
+            settings: Accuracy, theory and mesh. A setting that is "auto" is chosen once for all presses. The theory has
+                the fewest terms that the accuracy allows for all forces. The mesh is as fine as the outermost press
+                requires. The width of the thin rings is that of the geometric mean of the smallest and the largest
+                force.
             executor: Executor that runs the solves; None for this process. The result does not depend on it.
 
         Raises:
@@ -111,7 +117,7 @@ class ForwardMap:
         domain = Domain(radius, force_range)
         check_family(sensor.coated_film, probe, domain)
 
-        # Settings that all presses of the family share
+        # Choose the settings that are the same for all presses of the family.
         min_force, max_force = force_range
         middle_force = float(np.sqrt(min_force * max_force))
         theory = settings.theory
@@ -124,9 +130,9 @@ class ForwardMap:
         layer = min(layer, widest_smooth_layer(template, probe, radius, film.radius))
         settings = replace(settings, resolution=resolution, layer=layer)
 
-        # Increase the number of nodes until the charges of the check presses are sufficiently accurate. The check
-        # presses are solved directly only once, when the first map exists. If the error is very large, the next number
-        # of nodes would not suffice either and is skipped.
+        # Increase the number of nodes until the interpolated charges are sufficiently accurate. They are compared at
+        # the check presses, which are solved directly in the first pass of the loop. If the error is very large, the
+        # next number of nodes would not suffice either and is skipped.
         checks = check_presses(domain, CHECK_COUNT)
         check_charges: list[Array] = []
         error = np.inf
@@ -153,14 +159,14 @@ class ForwardMap:
 
     @property
     def domain(self) -> Domain:
-        """Presses that the map covers."""
+        """Presses for which the map is valid."""
         return self.family.domain
 
     @property
     def settings(self) -> SolveSettings:
-        """Theory and mesh of the solves. A single press or another map can be solved with these settings.
+        """Settings with the theory and the mesh of this map, with which other presses can be solved.
 
-        The width of the thin rings remains "auto".
+        The width of the thin rings at the rim remains "auto", so that it is chosen for each press.
         """
         return SolveSettings(theory=self.theory, resolution=self.resolution)
 
@@ -175,21 +181,22 @@ class ForwardMap:
         return self.family.distance.size * self.family.force.size * self.family.solved_rotations.size
 
     def charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
-        """Compute touch charges.
+        """Compute the touch charges of presses.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N. If F is zero, the charges are zero.
-            orientation: Further rotation of the probe, anticlockwise, shape (n,) or a number, rad.
+            orientation: Anticlockwise rotation of the probe in addition to its own orientation, shape (n,) or a number,
+                rad.
 
         Returns:
             Charges, shape (n, n_electrode), pC.
 
         Raises:
-            SceneError: If a press lies outside the domain.
+            SceneError: If a press with a force lies outside the domain.
         """
         contact = as_contacts(contact, "forward map")
 
-        # Contacts without a force may lie anywhere. In the check, a valid contact replaces them.
+        # A press without a force may lie anywhere. It is replaced by a valid press before the domain is checked.
         has_no_force = contact[:, 2] == 0.0
         min_force, _ = self.domain.force_range
         valid_contact = (0.0, 0.0, min_force)
@@ -204,8 +211,8 @@ class ForwardMap:
     def derivatives(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F by central differences.
 
-        The probe keeps its described orientation. For presses at the edge of the domain, the differences also use
-        presses slightly outside.
+        The probe keeps its own orientation. At the edge of the domain, the central differences also evaluate presses
+        slightly outside the domain.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -220,14 +227,17 @@ class ForwardMap:
         return differences(self._unrotated_charges, contact)
 
     def relative_error(self, check: CheckPress, direct: Array) -> float:
-        """Compute the largest relative difference between the charges of one press and those of a direct solve.
+        """Compute the largest relative difference between the interpolated and the directly solved charges of a press.
 
-        The difference of each electrode is divided by its charge of the direct solve. If this charge is small, the
-        difference is divided by `CHARGE_FLOOR` times the largest charge of the press.
+        The difference of each electrode is divided by the directly solved charge of this electrode. A charge that is
+        smaller than `CHARGE_FLOOR` times the largest charge of the press is replaced by this bound.
 
         Args:
-            check: The press.
-            direct: Charges of the direct solve, shape (n_electrode,), pC.
+            check: Press at which the charges are compared.
+            direct: Directly solved charges of this press, shape (n_electrode,), pC.
+
+        Returns:
+            The largest relative difference of an electrode, dimensionless.
         """
         x, y = check.position
         contact = np.array([[x, y, check.force]])  # a single press
@@ -236,16 +246,17 @@ class ForwardMap:
         return float((np.abs(interpolated - direct) / charge_scale).max())
 
     def field_charges(self, contact: Array, is_odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
-        """Compute the charges of several stress fields that the table contains, for a circular probe.
+        """Compute the charges of each of the stress fields that the table contains, for a circular probe.
 
-        The fields are small corrections, so the coarse integration rule is used for all electrodes. The pressure on the
-        electrodes and the crosstalk are omitted.
+        The crosstalk is omitted, and so are the charges that the contact pressure causes.
 
         Args:
             contact: Presses (x, y, F) in the domain, shape (n, 3), mm and N.
             is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
-                (n_field,). The table contains the values of all fields at one node, then those at the next node.
-            readout: Integration points of the charges; None for the coarse rule of the electrodes.
+                (n_field,). A row of the table contains the values of all fields at one node, then those at the next
+                node.
+            readout: Integration points of the charges. If None, the coarse integration rule is used for all
+                electrodes, because fields that are small corrections need little accuracy.
 
         Returns:
             Charges, shape (n, n_electrode, n_field), pC.
@@ -254,21 +265,24 @@ class ForwardMap:
         position = x + 1j * y
         orientation = np.zeros(1)  # the same for all presses, because a circular probe has no orientation
         rule = readout or self._readout_rules.coarse
+
+        # The same rule is used for all pairs of a press and an electrode.
         all_pairs = np.ones((position.size, len(rule.count)), dtype=bool)
         charges = []
-        with single_threaded_blas():
+        with single_threaded_blas():  # faster for the many small matrices of a chunk
             for start in range(0, position.size, CHUNK_SIZE):
                 chunk = slice(start, start + CHUNK_SIZE)
-                rules = ((rule, all_pairs[chunk]),)  # a single rule for all pairs of a press and an electrode
+                rules = ((rule, all_pairs[chunk]),)
                 charges.append(self._integrate_fields(position[chunk], force[chunk], orientation, is_odd, rules))
         return np.concatenate(charges)
 
     def stress_charges_by_force(self, position: Array, is_needed: Booleans) -> Array:
-        """Compute the charges that the stress causes, for all forces of the family at once.
+        """Compute the charges that the stress causes at given positions, for all forces of the family at once.
 
-        The pressure on the electrodes and the crosstalk are omitted. The probe keeps its orientation. The stress under
-        each force is treated as one of several fields of a map with a single force, so that all forces share the
-        interpolation between distances and the search of the points in the mesh.
+        The crosstalk is omitted, and so are the charges that the contact pressure causes. The probe keeps its own
+        orientation. The stresses under the different forces are treated as several stress fields of a map with a single
+        force. The interpolation between distances, and the search for the points in the mesh, are then done only once
+        for all forces.
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
@@ -277,13 +291,13 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_force, n_electrode), pC. Charges that are not needed are zero.
         """
-        # The stacked map has one field for each force of the family. All these fields are even.
+        # The stacked map has one stress field for each force of the family. All these fields are even.
         complex_position = position[:, 0] + 1j * position[:, 1]
         stacked_map = self._stacked_forces
         first_force = stacked_map.family.force[0]
         is_odd = np.zeros(self.family.force.size, dtype=bool)
         orientation = np.zeros(1)  # the probe keeps its orientation for all presses
-        chunk_size = max(1, CHUNK_SIZE // self.family.force.size)
+        chunk_size = max(1, CHUNK_SIZE // self.family.force.size)  # a press of the stacked map has n_force fields
         charges = []
         with single_threaded_blas():  # faster for the many small matrices of a chunk
             for start in range(0, complex_position.size, chunk_size):
@@ -292,14 +306,17 @@ class ForwardMap:
                 force = np.full(chunk.size, first_force)
                 charges.append(stacked_map._integrate_fields(chunk, force, orientation, is_odd, rules))
 
-        # All fields were multiplied by the stress unit of the first force. Replace it by the unit of each force.
+        # The stacked map multiplies all fields by the stress unit of the first force. Replace it by the unit of the
+        # force to which the field belongs. The stress unit is proportional to the squared amplitude.
         film = self.sensor.film
         unit_ratio = amplitude_squared(film, self.family.force) / amplitude_squared(film, first_force)
         charge_by_force = np.concatenate(charges).swapaxes(1, 2)  # shape (n, n_force, n_electrode)
         return np.asarray(charge_by_force * unit_ratio[:, None])
 
     def pressure_charges(self, position: Array) -> Array:
-        """Compute the charges that the contact pressure causes, divided by the force. Crosstalk is omitted.
+        """Compute the charges that the contact pressure causes, divided by the force.
+
+        Crosstalk is omitted. The probe keeps its own orientation.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
@@ -311,7 +328,7 @@ class ForwardMap:
 
     @cached_property
     def _stacked_forces(self) -> "ForwardMap":
-        """Map for a single force. Its table contains the stress under each force of the family as a separate field.
+        """Map with a single force, in whose table the stress under each force of the family is a separate field.
 
         The table has single precision.
         """
@@ -325,15 +342,24 @@ class ForwardMap:
         return replace(self, family=family, table=table.astype(np.float32))
 
     def _unrotated_charges(self, contact: Array) -> Array:
-        """Return `_unchecked_charges` of presses whose probe has no further rotation, shape (n, n_electrode), pC."""
-        return self._unchecked_charges(contact, np.zeros(len(contact)))
-
-    def _unchecked_charges(self, contact: Array, orientation: Array) -> Array:
-        """Compute the charges of presses in the domain or slightly outside, in chunks that limit the memory.
+        """Compute the charges of presses in the domain or slightly outside, with the probe in its own orientation.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
-            orientation: Further rotation of the probe, shape (n,), rad.
+
+        Returns:
+            Charges, shape (n, n_electrode), pC.
+        """
+        return self._unchecked_charges(contact, np.zeros(len(contact)))
+
+    def _unchecked_charges(self, contact: Array, orientation: Array) -> Array:
+        """Compute the charges of presses in the domain or slightly outside.
+
+        The presses are evaluated in chunks, which limits the required memory.
+
+        Args:
+            contact: Presses (x, y, F), shape (n, 3), mm and N.
+            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
 
         Returns:
             Charges, shape (n, n_electrode), pC.
@@ -349,10 +375,12 @@ class ForwardMap:
     def _chunk_charges(self, position: Complexes, force: Array, orientation: Array) -> Array:
         """Compute the charges of one chunk of presses.
 
+        The charges of the stress and of the contact pressure are added. Then the crosstalk is added.
+
         Args:
             position: Positions x + iy, shape (n,), mm.
             force: Forces, shape (n,), N.
-            orientation: Further rotation of the probe, shape (n,), rad.
+            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
 
         Returns:
             Charges, shape (n, n_electrode), pC.
@@ -363,11 +391,13 @@ class ForwardMap:
         return self.sensor.calibration.read(charge)
 
     def _pressure_charges(self, position: Complexes, orientation: Array) -> Array:
-        """Compute the charges that the contact pressure causes, divided by the force. Crosstalk is omitted.
+        """Compute the charges that the contact pressure causes, divided by the force.
+
+        Crosstalk is omitted.
 
         Args:
             position: Positions x + iy, shape (n,), mm.
-            orientation: Further rotation of the probe, shape (n,), rad.
+            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
 
         Returns:
             Charges per force, shape (n, n_electrode), pC/N.
@@ -375,6 +405,8 @@ class ForwardMap:
         charge = np.zeros((position.size, len(self.electrodes)))
         if self.sensor.piezo.d33 == 0.0:
             return charge
+
+        # The contact pressure acts only on electrodes under the probe. Presses far from all electrodes cause no charge.
         presses_near_electrodes = np.flatnonzero(self._readout_rules.is_near(position).any(axis=1))
         for press_index in presses_near_electrodes:
             probe = self.probe.rotated(float(orientation[press_index]))
@@ -392,15 +424,17 @@ class ForwardMap:
         is_odd: Booleans,
         rules: tuple[tuple[ReadoutPoints, Booleans], ...],
     ) -> Array:
-        """Interpolate the stress fields of one chunk of presses, and integrate their charges.
+        """Interpolate the stress fields of one chunk of presses, and compute their charges by integration.
 
         Args:
             position: Positions x + iy, shape (n,), mm.
             force: Forces, shape (n,), N.
-            orientation: Further rotation of the probe, shape (n,) or (1,), rad.
+            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad; shape (1,) if it is
+                the same for all presses.
             is_odd: Whether each field of the table is odd with respect to a reflection in the direction of the press,
                 shape (n_field,).
-            rules: Integration rules, each with the pairs of press and electrode that use it, shape (n, n_electrode).
+            rules: Pairs of an integration rule and an array, shape (n, n_electrode), that is True where a press and an
+                electrode use this rule.
 
         Returns:
             Charges, shape (n, n_electrode, n_field), pC.
@@ -411,7 +445,7 @@ class ForwardMap:
         pairs_shape = pairs_of_first_rule.shape  # (n, n_electrode), the same for all rules
         scaled_charge = np.zeros((*pairs_shape, is_odd.size))
         for readout, uses_rule in rules:
-            # Electrodes with different numbers of points are integrated separately.
+            # Electrodes with the same number of points are integrated together, because their arrays have equal shapes.
             for n_point in np.unique(readout.count):
                 press_index, electrode = np.nonzero(uses_rule & (readout.count == n_point))
                 points_mm = readout.points[electrode, :n_point] @ np.array([1.0, 1j])  # (x, y) becomes x + iy
@@ -419,7 +453,7 @@ class ForwardMap:
                 weights = readout.weights[electrode, :n_point]
                 scaled_charge[press_index, electrode] = presses.scaled_charges(press_index, points, weights, is_odd)
 
-        # The stress in the table is divided by this unit.
+        # Multiply by the unit of the scaled stress in the table.
         stress_unit = film.young * amplitude_squared(film, force)
         return np.asarray(scaled_charge * stress_unit[:, None, None])
 
@@ -429,7 +463,11 @@ class ForwardMap:
         Args:
             position: Positions x + iy, shape (n,), mm.
             force: Forces, shape (n,), N.
-            orientation: Further rotation of the probe, shape (n,) or (1,), rad.
+            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad; shape (1,) if it is
+                the same for all presses.
+
+        Returns:
+            The interpolated fields, with the position of the mesh under each press.
         """
         distance = np.abs(position)
         direction = np.angle(position)  # from the centre of the film to the press, rad
@@ -442,7 +480,7 @@ class ForwardMap:
 
     @cached_property
     def _readout_rules(self) -> ReadoutRules:
-        """Integration rules for the charges of single electrodes."""
+        """Integration rules from which one is selected for each pair of a press and an electrode."""
         return ReadoutRules(self.sensor, self.probe, self.resolution)
 
 
@@ -450,10 +488,10 @@ def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check:
     """Compute the charges of one press by a direct solve, without interpolation.
 
     Args:
-        sensor: The sensor.
-        probe: The probe.
-        settings: Settings of the solver.
-        check: The press.
+        sensor: Sensor whose charges are computed.
+        probe: Probe in its own orientation, to which the rotation of the press is added.
+        settings: Theory and mesh of the solve.
+        check: Position, force and rotation of the press.
 
     Returns:
         Charges, shape (n_electrode,), pC.

@@ -1,4 +1,4 @@
-"""Charges of several presses, computed by integration of the interpolated stress fields over the electrodes."""
+"""Computation of the charges of several presses, by integration of interpolated stress fields over the electrodes."""
 
 from dataclasses import dataclass
 
@@ -14,15 +14,16 @@ from isocharge.simulate.numerics.interpolation import tensor_values
 
 @dataclass(frozen=True)
 class PressChunk:
-    """Interpolated stress fields of some presses, from which charges are integrated.
+    """Stress fields under several presses, interpolated at the nodes of the mesh.
 
     Attributes:
         mesh: Template of the mesh.
-        placement: Position of the template under each press, with the press rotated onto the x axis.
-        field: Scaled stress of all fields at the nodes of every element, shape (n, n_element * n_local * 3 * n_field).
-        direction: Direction of each press from the centre of the film, shape (n,), rad.
+        placement: Position of the template under each press, after the press has been rotated onto the x axis.
+        field: Scaled stresses of all fields at the nodes of every element, shape (n, n_element * n_local * n_field *
+            3), dimensionless. The values of all fields at one node are adjacent.
+        direction: Direction from the centre of the film to each press, shape (n,), rad.
         probe_angle: Angle of the probe relative to the direction of the press, shape (n,), rad. If the probe is not
-            axisymmetric, the frame of its stress fields is rotated by this angle.
+            axisymmetric, the frame of the stress fields is rotated by this angle.
     """
 
     mesh: Template
@@ -32,22 +33,22 @@ class PressChunk:
     probe_angle: Array
 
     def scaled_charges(self, press_index: Integers, points: Complexes, weights: Array, is_odd: Booleans) -> Array:
-        """Integrate the charges of pairs of a press and an electrode.
+        """Compute the charges of several pairs of a press and an electrode, by integration of the stress fields.
 
         Args:
             press_index: Index of the press of each pair, shape (n_pair,).
-            points: Integration points on the electrode of each pair, shape (n_pair, n_point), in film radii.
-            weights: Charge per stress (s11, s22, s12), shape (n_pair, n_point, 3), pC/MPa.
+            points: Integration points x + iy on the electrode of each pair, shape (n_pair, n_point), in film radii.
+            weights: Charge per stress (s11, s22, s12) at each integration point, shape (n_pair, n_point, 3), pC/MPa.
             is_odd: Whether each field is odd, shape (n_field,). A reflection in the direction of the press leaves an
                 even field unchanged, and changes the sign of an odd field.
 
         Returns:
-            Charges over the unit of stress, shape (n_pair, n_field), pC/MPa.
+            Charges divided by the unit of the scaled stress, shape (n_pair, n_field), pC/MPa.
         """
         stress, is_mirrored = self._interpolated_stress(press_index, points, is_odd.size)
 
-        # The frame of the stress is rotated to the direction of the press. If the whole film is meshed, the frame also
-        # rotates with the probe.
+        # Axis 1 of the interpolated stress is the direction of the press. If the whole film is meshed, the axes are
+        # also rotated by the angle of the probe.
         frame_angle = self.direction[press_index]
         if not self.mesh.half:
             frame_angle = frame_angle + self.probe_angle[press_index]
@@ -55,36 +56,37 @@ class PressChunk:
         charge = np.empty((len(stress), is_odd.size))
         for field_index, odd in enumerate(is_odd):
             field_stress = stress[:, :, field_index]
-            # Reflection changes the sign of s12 of an even field, and of s11 and s22 of an odd field.
+            # At reflected points, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
             sign_changes = slice(0, 2) if odd else slice(2, 3)
             field_stress[is_mirrored, sign_changes] *= -1.0
             film_stress = rotate_stress(field_stress, frame_angle[:, None])
-            # Sum over the points p and the stress components c of each pair k
+            # For each pair (index k), sum over the points (p) and the stress components (c).
             charge[:, field_index] = np.einsum("kpc,kpc->k", film_stress, weights)
         return charge
 
     def _interpolated_stress(self, press_index: Integers, points: Complexes, n_field: int) -> tuple[Array, Booleans]:
-        """Interpolate the stress of all fields from the nodes of the mesh under each press to given points.
+        """Interpolate the stress of all fields from the nodes of the mesh to the integration points.
 
-        If only half of the film is meshed, points of the other half are reflected into the meshed half.
+        If only half of the film is meshed, points in the other half are reflected into the meshed half.
 
         Args:
             press_index: Index of the press of each pair, shape (n_pair,).
-            points: Points x + iy, shape (n_pair, n_point), in film radii.
+            points: Integration points x + iy, shape (n_pair, n_point), in film radii.
             n_field: Number of fields.
 
         Returns:
-            Stress (s11, s22, s12) in the frame of the mesh, shape (n_pair, n_point, n_field, 3). Whether each point was
-            reflected, shape (n_pair, n_point).
+            Scaled stress (s11, s22, s12) in the frame of the mesh, shape (n_pair, n_point, n_field, 3), dimensionless.
+            Whether each point was reflected, shape (n_pair, n_point).
         """
-        # Find the points in the mesh after the press has been rotated onto the positive x axis.
+        # Rotate the film so that the press lies on the positive x axis, and find the element of the mesh that contains
+        # each point.
         mesh = self.mesh
         rotated_points = points * np.exp(-1j * self.direction[press_index])[:, None]
         position, is_mirrored = mesh.into_meshed_half(rotated_points)
         element, xi, eta = locate_points(self.placement[press_index], mesh, position)
 
-        # Interpolate the values of all fields from the nodes of the element of each point.
-        n_value = 3 * n_field  # values at a node
+        # Interpolate the values of all fields from the nodes of this element to the point.
+        n_value = 3 * n_field  # number of values at a node
         basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel()).astype(self.field.dtype)
         field_by_element = self.field.reshape(len(self.field), mesh.n_element, -1, n_value)
         nodal_stress = field_by_element[press_index[:, None], element]  # shape (n_pair, n_point, n_local, n_value)

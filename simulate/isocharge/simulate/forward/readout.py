@@ -5,10 +5,10 @@ collects only the polarisation caused by the in-plane stress (Mirbagheri et al.,
 
     Q = A * mean(d31 * s11 + d32 * s22).
 
-Here s is the mid-surface stress in the axes of the film, and axis 1 is the drawn direction x. The area readout computes
-the mean over the electrode. The edge readout computes the mean of s11 over the left and right edges, and the mean of
-s22 over the lower and upper edges, as in equation 3 of the paper. The touch charge is the charge under load minus the
-charge without load, so a uniform pretension cancels.
+The mid-surface stresses s11 and s22 are in the axes of the film, and axis 1 is the drawn direction x. The area readout
+computes the mean over the area of the electrode. The edge readout computes the mean of s11 over the left and right
+edges, and the mean of s22 over the lower and upper edges (equation 3 of the paper). The touch charge is the charge
+under load minus the charge without load. The charge of a uniform pretension therefore cancels.
 """
 
 from dataclasses import dataclass
@@ -27,12 +27,15 @@ from isocharge.simulate.solver.equilibrium import Equilibrium, touch_stress
 DIRECT = 20
 """Number of Gauss points per side of an electrode for single presses.
 
-The stress has a kink at the edge of the footprint. If this edge crosses an electrode, the relative error of the charge
-is 1e-5.
+The stress has a kink at the edge of the footprint. Even if this edge crosses an electrode, the relative error of the
+charge is only 1e-5.
 """
 
 FINE = 12
-"""Number of Gauss points per side of an electrode near the probe, for many presses. The relative error is 8e-5."""
+"""Number of Gauss points per side of an electrode near the probe, for many presses.
+
+The relative error of the charge is 8e-5.
+"""
 
 COARSE = 4
 """Number of Gauss points per side of an electrode away from the probe, for many presses."""
@@ -41,27 +44,31 @@ FAR = 2
 """Number of Gauss points per side of an electrode far from the probe, for many presses."""
 
 LINE_POINTS = 8
-"""Number of Gauss points on a line."""
+"""Number of Gauss points on a straight line of metal, such as a trace."""
 
 NEAR = 1.0
 """Distance between the footprint and an electrode below which the fine rule is used, mm.
 
-At larger distances the relative error of the coarse rule is at most 1e-4 for squares of 1 to 6 mm.
+At larger distances, the relative error of the coarse rule is at most 1e-4 for square electrodes with sides of 1 to
+6 mm.
 """
 
 FAR_DISTANCE = 8.0
-"""Distance between the press and the parts of an electrode above which `FAR` points are used, in radii of the parts,
-dimensionless. The relative error of this rule is about 2e-5."""
+"""Distance between a press and the nearest part of an electrode above which `FAR` points are used, dimensionless.
+
+The distance is in units of the radius of the circle around the part. The relative error of the charge is about 2e-5.
+"""
 
 
 @dataclass(frozen=True)
 class ReadoutPoints:
-    """Integration points and weights that convert the stress of the film into charges.
+    """Integration points on the electrodes, and weights that convert the stress at these points into charges.
 
     Attributes:
         points: Points (x, y) on the film, shape (n_electrode, n_point, 2), mm.
-        weights: Charge per stress (s11, s22, s12), shape (n_electrode, n_point, 3), pC/MPa.
-        count: Number of points of each electrode, shape (n_electrode,). The remaining points have zero weight.
+        weights: Charge per stress (s11, s22, s12) at each point, shape (n_electrode, n_point, 3), pC/MPa.
+        count: Number of points of each electrode, shape (n_electrode,). An electrode with fewer than n_point points is
+            filled up with points of zero weight.
     """
 
     points: Array
@@ -70,39 +77,39 @@ class ReadoutPoints:
 
     @classmethod
     def of(cls, sensor: Sensor, per_side: int) -> "ReadoutPoints":
-        """Return the integration points for the electrodes and the readout of a sensor.
+        """Return the integration points on the electrodes of a sensor, with the weights of its readout.
 
         Args:
-            sensor: The sensor.
+            sensor: Sensor with the electrodes, the readout, the gains and the piezoelectric coefficients.
             per_side: Number of Gauss points per side of an electrode.
         """
         layout_points = _layout_points(sensor.electrodes, sensor.readout, per_side)
-        # The factor 2 is there because s12 and s21 contribute equally.
+        # The factor 2 accounts for s12 and s21, which contribute equally.
         charge_per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
         weights = sensor.gains[:, None, None] * layout_points.weights * charge_per_stress
         return cls(sensor.calibration.place(layout_points.points), weights, layout_points.count)
 
     @classmethod
     def along(cls, sensor: Sensor, lines: Array) -> "ReadoutPoints":
-        """Return the integration points for straight lines of metal that belong to the electrodes, such as traces.
+        """Return the integration points on straight lines of metal that belong to the electrodes, such as traces.
 
         Args:
-            sensor: Sensor whose coefficients and calibration are used.
-            lines: End points (x, y) of the lines in the layout, shape (n_electrode, n_line, 2, 2), mm.
+            sensor: Sensor whose piezoelectric coefficients, gains and calibration are used.
+            lines: Start and end points (x, y) of the lines in the layout, shape (n_electrode, n_line, 2, 2), mm.
 
         Returns:
-            Points for n_electrode * n_line lines, ordered by electrode. The weights are per width of the line,
-            pC/(MPa mm).
+            Integration points of n_electrode * n_line lines, ordered by electrode. A weight is the charge per stress
+            and per width of the line, pC/(MPa mm).
         """
-        # The Gauss points divide a line from its start (0) to its end (1).
+        # Relative positions of the Gauss points, from the start of a line (0) to its end (1), and their weights
         relative_position, line_weights = gauss_line(LINE_POINTS)
         start = lines[:, :, :1]  # shape (n_electrode, n_line, 1, 2)
         start_to_end = lines[:, :, 1:] - start
         points = start + relative_position[:, None] * start_to_end  # shape (n_electrode, n_line, LINE_POINTS, 2)
         placed_points = sensor.calibration.place(points.reshape(-1, LINE_POINTS, 2))
 
-        # Weight of a point: gain * length that the point represents * charge per area and stress (s11, s22, s12). The
-        # factor 2 is there because s12 and s21 contribute equally.
+        # The weight of a point is the product of the gain, the length that the point represents, and the charge per
+        # area and stress (s11, s22, s12). The factor 2 accounts for s12 and s21, which contribute equally.
         length = np.linalg.norm(start_to_end, axis=3)  # shape (n_electrode, n_line, 1)
         point_length = length * line_weights  # shape (n_electrode, n_line, LINE_POINTS)
         amplified_length = sensor.gains[:, None, None] * point_length
@@ -120,23 +127,24 @@ class ReadoutPoints:
         Returns:
             Charges, shape (..., n_electrode), pC.
         """
-        # sum over the points p and the stress components c of each electrode e
+        # For each electrode (index e), sum over the points (p) and the stress components (c).
         return np.asarray(np.einsum("...epc,epc->...e", stress, self.weights))
 
 
 @lru_cache(maxsize=32)
 def _layout_points(electrodes: tuple[Electrode, ...], readout: Readout, per_side: int) -> ReadoutPoints:
-    """Return the integration points at the nominal positions of the electrodes. The weights are areas (mm^2).
+    """Return the integration points at the nominal positions of the electrodes, with areas as weights.
 
     The result is cached, because many films have the same layout.
 
     Args:
         electrodes: Electrodes of the layout.
-        readout: Mean over the area of an electrode, or over its edges.
-        per_side: Number of points along a side of an electrode.
+        readout: "area" for a mean over the area of an electrode, "edge" for a mean over its edges.
+        per_side: Number of Gauss points along a side of an electrode.
 
     Returns:
-        Points and areas. Electrodes with fewer points than others are filled up with points of the area zero.
+        Points, with weights that are the areas which the points represent, mm^2. An electrode with fewer points than
+        others is filled up with points of zero area.
     """
     rules = [electrode_rule(electrode, readout, per_side) for electrode in electrodes]
     counts = np.array([len(shares) for _, shares in rules])
@@ -146,17 +154,17 @@ def _layout_points(electrodes: tuple[Electrode, ...], readout: Readout, per_side
         electrode_points, shares = rules[index]
         n_point = counts[index]
         points[index, :n_point] = electrode_points
-        # The shares are weights of a mean over the electrode, which sum to 1 for each component of the stress.
+        # The shares are the weights of a mean over the electrode. They sum to 1 for each component of the stress.
         areas[index, :n_point] = electrode.area * shares
     return ReadoutPoints(points, areas, counts)
 
 
 def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
-    """Compute the touch charge of each electrode.
+    """Compute the touch charge of each electrode under a solved press.
 
     Args:
         sensor: Sensor whose `coated_film` was solved.
-        equilibrium: The solved press.
+        equilibrium: Equilibrium of the film under the press.
 
     Returns:
         Charges in the order of `sensor.electrode_names`, shape (n_electrode,), pC. Positive for tension along a
@@ -174,7 +182,7 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
             f"surface {sensor.surface!r} needs bending, but the film was solved as a {equilibrium.theory.name}; solve "
             "it with SolveSettings(theory=theory_for(sensor, probe, (force, force)))"
         )
-    # Integrate the stress at the points of all electrodes, which `touch_stress` expects in one list.
+    # Compute the stress at the integration points of all electrodes. `touch_stress` expects one list of points.
     readout = ReadoutPoints.of(sensor, DIRECT)
     n_electrode, n_point, _ = readout.points.shape
     flat_stress = touch_stress(equilibrium, readout.points.reshape(-1, 2), sensor.surface)
@@ -186,14 +194,17 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
 
 
 def electrode_gaps(sensor: Sensor, position: Complexes) -> Array:
-    """Compute the gaps between positions and the circles around the nearest parts of the electrodes.
+    """Compute the gap between each position and each electrode.
+
+    Each part of an electrode is enclosed by a circle. The gap is the distance from the position to the nearest of the
+    enclosing circles of the electrode.
 
     Args:
         sensor: Sensor with the electrodes.
         position: Positions x + iy, shape (n,), mm.
 
     Returns:
-        Gaps, shape (n, n_electrode), mm. A gap is negative if the position lies in the circle.
+        Gaps, shape (n, n_electrode), mm. A gap is negative if the position lies in a circle.
     """
     gaps = []
     for part_centres, part_radii in sensor.part_circles:
@@ -203,14 +214,17 @@ def electrode_gaps(sensor: Sensor, position: Complexes) -> Array:
 
 
 def electrode_distances(sensor: Sensor, position: Complexes) -> Array:
-    """Compute the distances of positions from the nearest parts of the electrodes, in radii of the parts.
+    """Compute the relative distance between each position and each electrode.
+
+    Each part of an electrode is enclosed by a circle. The distance from the centre of an enclosing circle is divided by
+    the radius of the circle. The relative distance is the smallest of these ratios.
 
     Args:
         sensor: Sensor with the electrodes.
         position: Positions x + iy, shape (n,), mm.
 
     Returns:
-        Distances from the centres of the parts, shape (n, n_electrode), dimensionless.
+        Relative distances, shape (n, n_electrode), dimensionless.
     """
     distances = []
     for part_centres, part_radii in sensor.part_circles:
@@ -220,18 +234,18 @@ def electrode_distances(sensor: Sensor, position: Complexes) -> Array:
 
 
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
-    """Compute the charge that the contact pressure induces on the electrodes. The charge per area is d33 * mean(s33).
+    """Compute the charge that the contact pressure of a probe induces on the electrodes.
 
-    The back of the film is free. Through the thickness, s33 changes from minus the contact pressure at the probe to
-    zero at the back. The mean of s33 is therefore minus half of the contact pressure. Only the part of an electrode
-    under the footprint contributes. The charge is therefore -d33 / 2 times the part of the force that acts on the
-    electrode. The negative d33 of PVDF results in a positive charge.
+    The charge per area is the coefficient d33 times the mean of the stress s33 over the thickness. The stress s33 is
+    minus the contact pressure at the probe, and zero at the free back of the film. The mean of s33 over the thickness
+    is therefore minus half of the contact pressure. The charge of an electrode is therefore -d33 / 2 times the part of
+    the force that acts on this electrode. The coefficient d33 of PVDF is negative, so the charge is positive.
 
     Args:
-        sensor: The sensor.
-        probe: The probe.
+        sensor: Sensor with the electrodes.
+        probe: Probe that presses the film.
         at: Centroid (x, y) of the footprint, mm.
-        force: Force, N.
+        force: Force of the press, N.
 
     Returns:
         Charges, shape (n_electrode,), pC.
@@ -252,29 +266,30 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:
-    """Compute the pyroelectric charge of a uniform change of the temperature.
+    """Compute the pyroelectric charge that a uniform change of the temperature causes.
 
-    The clamp is assumed to expand like the film. If the clamp expands differently, the pretension of the film changes
-    as well; see `mechanics.film_temperature`.
+    The clamp is assumed to expand like the film. If the clamp expands differently, the pretension of the film also
+    changes. The module `mechanics.film_temperature` computes this change of the pretension.
 
     Args:
-        sensor: The sensor.
-        step: Change of the temperature, K, positive for warming. Warming a PVDF film with d31 > 0 lowers the charge.
+        sensor: Sensor with the electrodes and the pyroelectric coefficient.
+        step: Change of the temperature, K, positive if the film becomes warmer. The charge of a PVDF film with a
+            positive coefficient d31 decreases if the film becomes warmer.
 
     Returns:
-        Charges, shape (n_electrode,), pC, proportional to the areas of the electrodes.
+        Charges, shape (n_electrode,), pC. They are proportional to the areas of the electrodes.
     """
     areas = np.array([electrode.area for electrode in sensor.electrodes])
     return sensor.calibration.read(sensor.gains * areas * sensor.piezo.pyro * step)
 
 
 def electrode_rule(electrode: Electrode, readout: Readout, per_side: int) -> tuple[Array, Array]:
-    """Return the integration points of one electrode, and their shares of the mean stress.
+    """Return the integration points of one electrode, and their weights in the mean stress of the electrode.
 
     Args:
-        electrode: The electrode.
-        readout: Mean over the area of the electrode, or over its edges.
-        per_side: Number of Gauss points per side.
+        electrode: Electrode over which the mean is computed.
+        readout: "area" for a mean over the area of the electrode, "edge" for a mean over its edges.
+        per_side: Number of Gauss points along a side of the electrode.
 
     Returns:
         Points (x, y), shape (n, 2), mm. Weights of each point in the means of s11, s22 and s12, shape (n, 3).
@@ -285,23 +300,23 @@ def electrode_rule(electrode: Electrode, readout: Readout, per_side: int) -> tup
 
 
 def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
-    """Return the integration points for the mean of the stress over the area of an electrode.
+    """Return the integration points and weights for the mean of the stress over the area of an electrode.
 
     Args:
-        electrode: The electrode.
+        electrode: Electrode over which the mean is computed.
         per_side: Number of points along a side of a square, or along the longest side of a part.
 
     Returns:
         Points (x, y), shape (n, 2), mm. Weights of each point in the means of s11, s22 and s12, shape (n, 3). The three
-        weights of a point are equal.
+        weights of a point are equal. The sum of each weight over all points is 1.
     """
-    if electrode.square:  # a product of one-dimensional Gauss rules
+    if electrode.square:  # the product of two one-dimensional Gauss rules
         unit_points, shares = gauss_square(per_side)
         lower_left, _, upper_right, _ = np.array(electrode.corners)
         points = lower_left + unit_points * (upper_right - lower_left)
     elif len(electrode.parts) == 1:
         points, shares = gauss_polygon(electrode.parts[0], per_side)
-    else:  # an electrode of several quadrilaterals
+    else:  # an electrode that consists of several quadrilaterals
         rules = [gauss_quadrilateral(part, per_side, MAX_PART_SIDE) for part in electrode.parts]
         points = np.concatenate([part_points for part_points, _ in rules])
         weights = np.concatenate([part_weights for _, part_weights in rules])
@@ -310,25 +325,28 @@ def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
 
 
 def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
-    """Return the integration points of the edge readout (Mirbagheri et al., 2007, equation 3).
+    """Return the integration points and weights of the edge readout (Mirbagheri et al., 2007, equation 3).
 
-    The mean of s11 is over the left and right edges, and the mean of s22 is over the lower and upper edges.
+    The stress s11 is averaged over the left and right edges of the electrode. The stress s22 is averaged over the lower
+    and upper edges of the electrode.
 
     Args:
         electrode: A square electrode.
         per_side: Half of the number of points on each edge.
 
     Returns:
-        Points (x, y), shape (n, 2), mm. Weights of each point in the means of s11, s22 and s12, shape (n, 3).
+        Points (x, y), shape (n, 2), mm. Weights of each point in the means of s11, s22 and s12, shape (n, 3). The
+        weights in the mean of s12 are zero.
     """
-    # The corners start at the lower left one and go anticlockwise, and so do the edges from each corner to the next.
+    # The corners are listed anticlockwise from the lower left corner. Each edge leads from a corner to the next one, so
+    # the first edge is the lower edge.
     relative_position, line_shares = gauss_line(2 * per_side)  # from 0 at the start of an edge to 1 at its end
     corners = np.array(electrode.corners)
     edges = np.roll(corners, -1, axis=0) - corners
     edge_points = corners[:, None] + relative_position[:, None] * edges[:, None]  # shape (4, n_edge_point, 2)
     lower, right, upper, left = edge_points
 
-    # Each mean is over two edges, so each edge contributes half of the mean. A row is (s11, s22, s12).
+    # Each mean is over two edges, so each edge contributes half of the mean. The columns belong to s11, s22 and s12.
     half_shares = 0.5 * line_shares
     zero = np.zeros_like(line_shares)
     s11_shares = np.stack([half_shares, zero, zero], axis=1)

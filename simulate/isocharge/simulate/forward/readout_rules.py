@@ -1,7 +1,7 @@
-"""Choice of the integration rule for the charge of each electrode under each press.
+"""Selection of the integration rule with which the charge of an electrode under a press is computed.
 
-The stress varies strongly near the probe and smoothly far from it. An electrode near the probe therefore needs an
-integration rule with many points, and an electrode far from the probe needs only a few.
+The stress varies strongly near the probe and smoothly far from the probe. An electrode near the probe therefore needs
+an integration rule with many points. An electrode far from the probe needs only a few points.
 """
 
 from dataclasses import dataclass
@@ -25,24 +25,24 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 MIN_CLAMP_DISTANCE = 8.0
-"""Smallest distance of a press from the clamp for the rule for far electrodes, in units of the probe's reach."""
+"""Distance of a press from the clamp above which the rule for far electrodes may be used, in reaches of the probe."""
 
 MAX_RING_RATIO = 2.0
-"""Largest ratio of the radii of successive rings of the mesh at which the rule for far electrodes is used.
+"""Ratio of the radii of successive rings of the mesh up to which the rule for far electrodes may be used.
 
-On coarser meshes the stress is not smooth enough across an electrode. Meshes that are chosen automatically have a ratio
-of about 1.9.
+On coarser meshes, the computed stress is not smooth enough across an electrode. Meshes that are chosen automatically
+have a ratio of about 1.9.
 """
 
 
 @dataclass(frozen=True)
 class ReadoutRules:
-    """Integration rules for electrodes near the probe, between, and far from it.
+    """Three integration rules: for electrodes near the probe, for electrodes far from the probe, and for all others.
 
     Attributes:
-        sensor: The sensor.
-        probe: The probe.
-        resolution: Fineness of the mesh of the solves.
+        sensor: Sensor with the electrodes.
+        probe: Probe that presses the film.
+        resolution: Fineness of the mesh on which the stress is solved.
     """
 
     sensor: Sensor
@@ -65,16 +65,18 @@ class ReadoutRules:
         return ReadoutPoints.of(self.sensor, FAR)
 
     def select(self, position: Complexes) -> tuple[tuple[ReadoutPoints, Booleans], ...]:
-        """Select the integration rule for each pair of a press and an electrode.
+        """Select an integration rule for each pair of a press and an electrode.
 
-        The fine rule is for electrodes near the probe. The rule for far electrodes also requires that the press is far
-        from the clamp, and that the mesh is fine there. The coarse rule is for all other pairs.
+        The fine rule is used for electrodes near the probe. The far rule is used for electrodes far from the probe, if
+        the press is also far from the clamp, and if the mesh is fine enough. The coarse rule is used for all other
+        pairs.
 
         Args:
             position: Positions x + iy of the presses, shape (n,), mm.
 
         Returns:
-            Each rule with the pairs that use it, shape (n, n_electrode).
+            The three rules. Each rule is followed by an array, shape (n, n_electrode), that is True where a press and
+            an electrode use this rule.
         """
         is_near = self.is_near(position)
         is_distant = electrode_distances(self.sensor, position) > FAR_DISTANCE
@@ -85,18 +87,19 @@ class ReadoutRules:
         return (self.fine, is_near), (self.coarse, is_between), (self.far, is_far)
 
     def is_near(self, position: Complexes) -> Booleans:
-        """Return whether electrodes are so near to presses that they need the fine rule.
+        """Return whether each electrode is so near to each press that the fine rule is needed.
 
         Args:
             position: Positions x + iy of the presses, shape (n,), mm.
 
         Returns:
-            Whether each electrode is near to each press, shape (n, n_electrode).
+            Whether the fine rule is needed, shape (n, n_electrode).
         """
         return np.asarray(electrode_gaps(self.sensor, position) < self.probe.reach + NEAR)
 
     @cached_property
     def has_smooth_far_field(self) -> bool:
-        """Whether the mesh is fine enough for the integration with few points over electrodes far from the probe."""
+        """Whether the mesh is fine enough for the rule with few points over electrodes far from the probe."""
+        # The radii of the rings increase by a constant ratio from the edge of the probe to the rim of the film.
         ring_ratio = (self.sensor.film.radius / self.probe.reach) ** (1.0 / self.resolution.rings)
         return bool(ring_ratio <= MAX_RING_RATIO)

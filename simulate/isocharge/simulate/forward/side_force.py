@@ -1,12 +1,14 @@
-"""Changes of the charges that a side force of the probe, or the friction of a probe on a vertical stage, causes.
+"""Changes of the charges that a side force or the friction of the probe causes.
 
 A side force (Fx, Fy) of the probe on the film changes the charges to first order by
 
     dQ = jacobian @ (Fx, Fy).
 
-The stress fields of a side force along and across the direction of the press are solved with the tangent of the
-equilibrium (`solver.sensitivity`). The fields are solved at a few distances and forces, and interpolated as in a
-forward map. For side forces up to 0.2 of the force, the terms of second order are smaller than 1 % of dQ.
+There are two stress fields: the change of the stress by a side force along the direction of the press, and the change
+of the stress by a side force across this direction. The stress fields are computed from the tangent of the equilibrium
+(see `solver.sensitivity`) at a few distances and forces. Between these distances and forces, the stress fields are
+interpolated as in a forward map. If the side force is at most 0.2 times the force of the press, the terms of second
+order are smaller than 1 % of dQ.
 
 Example:
 
@@ -30,20 +32,21 @@ from isocharge.simulate.forward.readout import FINE, ReadoutPoints
 from isocharge.simulate.mechanics.scaling import amplitude_squared, side_force_unit
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.solver.equilibrium import Equilibrium
-from isocharge.simulate.solver.friction import check_friction, holding_force, limited
+from isocharge.simulate.solver.friction import check_friction, holding_force, limit_to_friction
 from isocharge.simulate.solver.sensitivity import SIDE_FORCE_IS_ODD, side_force_stress
 
 
 @dataclass(frozen=True)
 class SideForceMap:
-    """Derivatives of the charges with respect to a side force, as a function of position and force.
+    """Map that computes how the charges change with a side force of the probe, at any position and force.
 
     Attributes:
         film: Forward map of the film without side forces.
-        fields: Map whose table contains the two stress fields of a side force.
-        holding: Ratio of the holding force to the force of the press at the nodes of the family, shape (n_distance *
-            n_force,). The holding force is the side force along the direction of the press that prevents the slip of
-            the film under a probe on a vertical stage. It is negative if it points to the centre of the film.
+        fields: Forward map whose table contains the two stress fields of a side force.
+        holding: Ratio of the holding force to the force of the press for each solved press, shape (n_distance *
+            n_force,), dimensionless. The holding force is the side force that prevents the film from slipping under a
+            probe on a vertical stage. It acts along the direction from the centre of the film to the press, and is
+            negative if it points to the centre.
     """
 
     film: ForwardMap
@@ -52,10 +55,12 @@ class SideForceMap:
 
     @classmethod
     def build(cls, film: ForwardMap, *, executor: Executor | None = None) -> "SideForceMap":
-        """Solve the fields at some presses in the domain of a forward map, which takes about ten seconds.
+        """Compute the stress fields of a side force for a few presses in the domain of a forward map.
+
+        The solves take about ten seconds.
 
         Args:
-            film: Forward map of the film, whose probe is a circle. Its mesh and its readout are used.
+            film: Forward map of the film under a circular probe. It provides the domain, the mesh and the readout.
             executor: Executor that runs the solves; None for this process.
 
         Raises:
@@ -67,9 +72,10 @@ class SideForceMap:
                 f"side forces: expected a circular probe, got {film.probe.notation}; use `press(..., side_force=...)` "
                 "or `isocharge simulate point --side-force` for other probes"
             )
+        # The table contains the stress fields and, in the last column, the ratio of the holding force to the force.
         derivative_map = solve_derivatives(film, _read_side_force, executor)
-        stress_table, holding = np.split(derivative_map.table, [-1], axis=1)  # the last column is the holding force
-        return cls(film, replace(derivative_map, table=stress_table), holding.ravel())
+        stress_table, holding_column = np.split(derivative_map.table, [-1], axis=1)
+        return cls(film, replace(derivative_map, table=stress_table), holding_column.ravel())
 
     def jacobian(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to the side force (Fx, Fy) of the probe on the film.
@@ -89,8 +95,8 @@ class SideForceMap:
         force_unit = side_force_unit(film, amplitude_squared(film, contact[:, 2]))
         charge_per_newton = scaled_charges / force_unit[:, None, None]
 
-        # Rotate the derivatives from the direction of the press and its perpendicular to x and y. Each derivative has
-        # the shape (n, n_electrode), and the angle has the shape (n, 1).
+        # The fields belong to side forces along and across the direction of the press. Rotate the derivatives to x and
+        # y. Each derivative has the shape (n, n_electrode), and the angle has the shape (n, 1).
         along_press, across_press = np.moveaxis(charge_per_newton, 2, 0)
         angle = np.arctan2(contact[:, 1], contact[:, 0])[:, None]
         x_derivative = np.cos(angle) * along_press - np.sin(angle) * across_press
@@ -99,10 +105,10 @@ class SideForceMap:
         return np.stack([calibration.read(x_derivative), calibration.read(y_derivative)], axis=2)
 
     def friction_forces(self, contact: Array, coefficient: float) -> Array:
-        """Compute the side forces of a probe with friction on a vertical stage.
+        """Compute the side forces that a probe on a vertical stage exerts on the film by friction.
 
-        The side force is the holding force, which prevents the film from slipping. Its magnitude is limited to the
-        coefficient of friction times the force of the press; see `solver.friction`.
+        The friction prevents the film from slipping until the side force reaches its limit. The limit of the side force
+        is the coefficient of friction times the force of the press; see `solver.friction`.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
@@ -121,13 +127,13 @@ class SideForceMap:
         orientation = np.zeros(1)  # a circular probe has no orientation
         weights = self.fields.family.weights(distance, force, orientation)
         relative_holding_force = weights @ self.holding  # holding force over the force of the press
-        # Unit vector from the centre to the press. The bound avoids a division by zero at the centre.
+        # Unit vectors from the centre to the presses. The lower bound avoids a division by zero at the centre.
         direction = contact[:, :2] / np.maximum(distance, 1e-12)[:, None]
         holding_force = (relative_holding_force * force)[:, None] * direction
-        return limited(holding_force, coefficient * force)
+        return limit_to_friction(holding_force, coefficient * force)
 
     def friction_charges(self, contact: Array, coefficient: float) -> Array:
-        """Compute the change of the charges by the friction of a probe on a vertical stage, to first order.
+        """Compute the change of the charges that the friction of a probe on a vertical stage causes, to first order.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
@@ -140,11 +146,15 @@ class SideForceMap:
             SceneError: If a press lies outside the domain, or the coefficient is not valid.
         """
         side_force = self.friction_forces(contact, coefficient)
+        # For each press (index n) and electrode (e), sum over the components x and y of the side force (k).
         return np.asarray(np.einsum("nek,nk->ne", self.jacobian(contact), side_force))
 
     @cached_property
     def _readout(self) -> ReadoutPoints:
-        """Integration rule for the electrodes. It has many points, because the fields change rapidly near the probe."""
+        """Integration points of the electrodes.
+
+        The fine integration rule is used, because the stress fields of a side force change rapidly near the probe.
+        """
         return ReadoutPoints.of(self.film.sensor, FINE)
 
 
@@ -152,12 +162,12 @@ def _read_side_force(solved: Equilibrium, surface: Surface) -> Array:
     """Compute the stress fields of a side force under one press, and the holding force.
 
     Args:
-        solved: The solved press, on the positive x axis.
-        surface: Surface in the thickness at which the stress is read.
+        solved: Equilibrium of the film under a press on the positive x axis.
+        surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
 
     Returns:
-        The values of `side_force_stress`, followed by the ratio of the holding force to the force, shape
-        (n_value + 1,). The holding force is positive in the direction away from the centre.
+        The values of `side_force_stress`, followed by the ratio of the holding force to the force of the press, shape
+        (n_value + 1,), dimensionless. The ratio is positive if the holding force points away from the centre.
     """
     outward_force, _ = holding_force(solved)
     return np.append(side_force_stress(solved, surface), outward_force / solved.force)

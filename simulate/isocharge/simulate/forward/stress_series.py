@@ -1,6 +1,6 @@
-"""Chebyshev series of the stress of a film under a round probe, for the playground.
+"""Approximation of the stress of a film under a round probe by Chebyshev series, from which the playground computes.
 
-The module is also a command. The command writes the file of the built-in film of 25 um:
+The module is also a command, which writes the series of the built-in film with a thickness of 25 um to a file:
 
     python -m isocharge.simulate.forward.stress_series FILE.json
 """
@@ -21,40 +21,48 @@ from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor_file import film_to_dict, load_sensor
 
 SENSOR = "three-25um-biaxial"
-"""Built-in sensor with the film of 25 um. The stress does not depend on its electrodes."""
+"""Built-in sensor with a film of 25 um. The stress of the film does not depend on the electrodes of the sensor."""
 
 PROBE = Circle(1.0)
-"""Probe of the released models."""
+"""Probe of the released models, with a radius of 1 mm."""
 
 FORCE_RANGE_N = (0.05, 2.0)
-"""Range of forces of the released models, N."""
+"""Smallest and largest force of the released models, N."""
 
 MAX_DISTANCE_mm = 30.0
-"""Largest distance of a press from the centre, mm. It is four times the radius of the smallest working area."""
+"""Largest distance of a press from the centre, mm. This distance is four times the radius of the smallest working
+area."""
 
 MAX_RING = 0.97
-"""Largest |z| of the series, in film radii. The series omits the rim of the film, where no electrode lies."""
+"""Largest radius of the rings that the series cover, in film radii, dimensionless.
+
+The series omit the rim of the film, where no electrode lies.
+"""
 
 N_DISTANCES = 7
 N_FORCES = 4
 N_INNER_RINGS = 6
 N_OUTER_RINGS = 14
 N_ANGLES = 7
-"""Numbers of Chebyshev polynomials. The relative differences between the charges of the series and of the forward map
-are 5e-5 (root mean square) and 4e-4 (largest)."""
+"""Number of Chebyshev polynomials along each axis of the series.
+
+Between the charges that are computed from the series and those of the forward map, the relative difference is 5e-5
+(root mean square) and at most 4e-4.
+"""
 
 
 def stress_series(forward_map: ForwardMap) -> StressSeries:
-    """Fit Chebyshev series to the logarithm of the stress s11 + s22 of a forward map.
+    """Fit Chebyshev series to the logarithm of the sum s11 + s22 of the stress components of a forward map.
 
-    For each press, the film is mapped conformally onto itself so that the probe becomes a circle about the centre. The
-    rings inside and outside this circle have separate series, because the stress has a kink at the edge of the probe.
+    For each press, a conformal map of the film onto itself maps the footprint of the probe to a circle around the
+    centre. The stress has a kink at the edge of the footprint. Therefore one series covers the rings inside the circle,
+    and another series covers the rings outside the circle.
 
     Args:
-        forward_map: Forward map of the film, with a round probe. The series covers its distances and forces.
+        forward_map: Forward map of the film, with a round probe. The series cover its distances and forces.
 
     Returns:
-        Chebyshev coefficients of ln(stress) inside and outside the footprint.
+        Chebyshev coefficients of the logarithm of the stress inside and outside the footprint.
     """
     max_distance_mm = forward_map.domain.radius
     min_force_N, max_force_N = forward_map.domain.force_range
@@ -69,7 +77,8 @@ def stress_series(forward_map: ForwardMap) -> StressSeries:
     outer_fraction = 0.5 * (_nodes(N_OUTER_RINGS) + 1.0)
     direction: Complexes = np.exp(1j * np.arccos(_nodes(N_ANGLES)))  # unit vectors x + iy
 
-    # Under the automorphism, rings about the centre become rings about the probe. One of them is the edge of the probe.
+    # The automorphism maps rings around the centre to rings around the probe. The ring with the radius `probe_ring`
+    # becomes the edge of the probe.
     for distance_index, distance_mm in enumerate(distances_mm):
         shift, probe_ring = _automorphism(distance_mm / film.radius, forward_map.probe.reach / film.radius)
         inner_rings = probe_ring * np.sqrt(inner_fraction)
@@ -93,21 +102,22 @@ def stress_series(forward_map: ForwardMap) -> StressSeries:
 
 
 def _nodes(count: int) -> Array:
-    """Return the zeros of the Chebyshev polynomial of degree `count`."""
+    """Return the zeros of the Chebyshev polynomial of degree `count`, shape (count,), between -1 and 1."""
     return np.asarray(chebyshev.chebpts1(count))
 
 
 def _automorphism(distance: float, probe_radius: float) -> tuple[float, float]:
-    """Compute the map of the unit disk onto itself that moves a circle about the centre to the edge of the probe.
+    """Compute the conformal map of the unit disk onto itself that maps a circle around the centre to the probe's edge.
 
-    The map has the form (z + c) / (1 + c z) with a parameter c.
+    The map has the form (z + c) / (1 + c z) with a parameter c. On the diameter through the probe, the map is a
+    translation of atanh(z) by atanh(c).
 
     Args:
         distance: Distance of the probe from the centre, in film radii.
         probe_radius: Radius of the probe, in film radii.
 
     Returns:
-        The parameter c of the map, and the radius of the circle.
+        The parameter c of the map, and the radius of the circle in film radii.
     """
     outer_edge = np.arctanh(distance + probe_radius)
     inner_edge = np.arctanh(distance - probe_radius)
@@ -115,12 +125,20 @@ def _automorphism(distance: float, probe_radius: float) -> tuple[float, float]:
 
 
 def _image_points(points: Complexes, c: float) -> Complexes:
-    """Return the images (z + c) / (1 + c z) of points z of the unit disk, any shape; see `_automorphism`."""
+    """Compute the images (z + c) / (1 + c z) of points z of the unit disk under the map of `_automorphism`.
+
+    Args:
+        points: Points z as complex numbers, any shape, in film radii.
+        c: Parameter of the map.
+
+    Returns:
+        Images of the points, of the same shape, in film radii.
+    """
     return np.asarray((points + c) / (1.0 + c * points))
 
 
 def _stress_sum(forward_map: ForwardMap, distance_mm: float, force_N: float, points_mm: Complexes) -> Array:
-    """Compute the sum s11 + s22 of the stress components for a press on the x axis.
+    """Compute the sum s11 + s22 of the stress components at given points, for a press on the positive x axis.
 
     Args:
         forward_map: Forward map of the film.
@@ -131,7 +149,8 @@ def _stress_sum(forward_map: ForwardMap, distance_mm: float, force_N: float, poi
     Returns:
         Sum of the stresses, of the shape of `points_mm`, MPa.
     """
-    # Each point is treated as an electrode. With these weights, the charge of the electrode is s11 + s22 at the point.
+    # Each point is treated as an electrode with one integration point. With weights of 1, 1 and 0 for s11, s22 and s12,
+    # the charge of this electrode is s11 + s22 at the point.
     n_point = points_mm.size
     points = np.stack([points_mm.real.ravel(), points_mm.imag.ravel()], axis=1)
     weights = np.tile([1.0, 1.0, 0.0], (n_point, 1, 1))
@@ -142,15 +161,15 @@ def _stress_sum(forward_map: ForwardMap, distance_mm: float, force_N: float, poi
 
 
 def _coefficients(values: Array) -> Array:
-    """Compute the Chebyshev coefficients of the polynomial that has given values at the Chebyshev nodes of all axes.
+    """Compute the Chebyshev coefficients of the polynomial that has given values on a grid of Chebyshev nodes.
 
     The values are transformed along one axis after the other.
 
     Args:
-        values: Values at the nodes. The number of nodes of each axis is its length.
+        values: Values on the grid, any number of axes. An axis of length n has n Chebyshev nodes.
 
     Returns:
-        Coefficients, of the same shape.
+        Chebyshev coefficients, of the shape of `values`.
     """
     coefficients = values
     for axis, count in enumerate(values.shape):
@@ -162,7 +181,7 @@ def _coefficients(values: Array) -> Array:
 
 
 def main() -> None:
-    """Write the file of the built-in film."""
+    """Fit the series of the built-in film, and write them to the file that the first command-line argument names."""
     forward_map = ForwardMap.build(load_sensor(SENSOR), PROBE, MAX_DISTANCE_mm, FORCE_RANGE_N)
     write_whole(Path(sys.argv[1]), json.dumps(stress_series(forward_map).to_json()).encode())
 

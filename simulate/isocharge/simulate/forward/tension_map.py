@@ -4,9 +4,10 @@ A change of the pretension by (T11, T22, T12) changes the charges to first order
 
     dQ = tension_jacobian @ (T11, T22, T12).
 
-The stress fields are solved with the tangent of the equilibrium (`solver.sensitivity`) at a few distances and forces.
-Between these distances and forces they are interpolated, as in a forward map. If the film becomes warmer than its ring,
-its pretension changes. The module `mechanics.film_temperature` computes this change.
+The change of the stress by a change of the pretension is computed from the tangent of the equilibrium (see
+`solver.sensitivity`), at a few distances and forces. Between these distances and forces, the change of the stress is
+interpolated as in a forward map. If the film becomes warmer than its ring, the pretension of the film changes. The
+module `mechanics.film_temperature` computes this change of the pretension.
 
 Example:
 
@@ -31,12 +32,13 @@ from isocharge.simulate.solver.sensitivity import TENSION_IS_ODD, tension_stress
 
 @dataclass(frozen=True)
 class TensionMap:
-    """Derivatives of the charges with respect to the pretension, as a function of position and force.
+    """Map that computes how the charges change with the pretension of the film, at any position and force.
 
     Attributes:
         film: Forward map of the film.
-        fields: Map whose table contains the stress fields of a change of the mean pretension, of the difference between
-            the pretensions along and across the direction of the press, and of its shear.
+        fields: Forward map whose table contains three stress fields. They are the changes of the stress by a change of
+            the mean pretension, by a difference between the pretensions along and across the direction of the press,
+            and by a shear of the pretension.
     """
 
     film: ForwardMap
@@ -44,10 +46,12 @@ class TensionMap:
 
     @classmethod
     def build(cls, film: ForwardMap, *, executor: Executor | None = None) -> "TensionMap":
-        """Solve the fields at some presses in the domain of a forward map, which takes about ten seconds.
+        """Compute the stress fields of a change of the pretension for a few presses in the domain of a forward map.
+
+        The solves take about ten seconds.
 
         Args:
-            film: Forward map of the film, whose probe is a circle. Its mesh and its readout are used.
+            film: Forward map of the film under a circular probe. It provides the domain, the mesh and the readout.
             executor: Executor that runs the solves; None for this process.
 
         Raises:
@@ -73,8 +77,9 @@ class TensionMap:
         contact = self.film.domain.check(contact, "temperature of the film")
         film = self.film.sensor.film
         field_charge = self.fields.field_charges(contact, TENSION_IS_ODD)
-        # The fields are derivatives with respect to the mean, the difference and the shear of the pretension along and
-        # across the direction of the press, in this unit.
+        # The fields are derivatives with respect to three quantities in the frame of the press: the mean pretension,
+        # the difference of the pretensions along and across the direction of the press, and the shear. All three are
+        # in units of `tension_unit`.
         tension_unit = film.young * amplitude_squared(film, contact[:, 2]) + film.pretension
         derivatives = np.moveaxis(field_charge / tension_unit[:, None, None], 2, 0)  # shape (3, n, n_electrode)
         mean_derivative, press_difference_derivative, press_shear_derivative = derivatives
@@ -94,18 +99,18 @@ class TensionMap:
         return np.stack([calibration.read(derivative) for derivative in components], axis=2)
 
     def temperature_jacobian(self, contact: Array) -> Array:
-        """Compute the change of the touch charges per kelvin of the temperature difference between the film and its
-        ring. The difference is positive if the film is warmer.
+        """Compute the derivatives of the touch charges with respect to the temperature of the film.
 
-        The change does not include the pyroelectric charge.
+        The temperature of the ring remains constant. The pyroelectric charge is not included.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
 
         Returns:
-            Changes, shape (n, n_electrode), pC/K. Zero if the film has no expansion coefficients.
+            Derivatives, shape (n, n_electrode), pC/K. They are zero if the film has no expansion coefficients.
 
         Raises:
             SceneError: If a press lies outside the domain.
         """
-        return np.asarray(self.tension_jacobian(contact) @ tension_change(self.film.sensor.film, 1.0, 0.0))
+        tension_per_kelvin = tension_change(self.film.sensor.film, 1.0, 0.0)  # (T11, T22, T12), MPa/K
+        return np.asarray(self.tension_jacobian(contact) @ tension_per_kelvin)

@@ -1,8 +1,8 @@
-"""A coarse forward map that covers nearly the whole film, for presses far outside the working area.
+"""Coarse forward map that covers nearly the whole film, for presses far outside the working area.
 
-The map is used, for example, to find all presses on the film that cause the same charges as a given press. This search
-needs charges with an error of a few percent up to the clamp. An accurate forward map up to the clamp would take
-minutes.
+The map is used, for example, to find all presses on the film that cause the same charges as a given press. In such a
+search, the charges of presses near the clamp may have an error of a few percent. An accurate forward map up to the
+clamp would take minutes to build.
 """
 
 from concurrent.futures import Executor
@@ -24,16 +24,16 @@ from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 COARSE_ERROR = 0.05
 """Largest relative error of a charge of the coarse map, dimensionless.
 
-The error is below 0.5 % up to two thirds of the film radius.
+For presses within two thirds of the film radius, the error is below 0.5 %.
 """
 
 COARSE_RESOLUTION = Resolution(order=4, around=8, rings=10, rim=2)
-"""Mesh of the solves."""
+"""Fineness of the mesh of the solves."""
 
 RIM_GAP = 1.2
 """Smallest gap between the probe and the clamp, in units of the reach of the probe, dimensionless.
 
-The mesh does not resolve narrower gaps.
+The coarse mesh does not resolve a narrower gap.
 """
 
 DISTANCES = 10
@@ -44,20 +44,20 @@ FORCES = 4
 
 
 def outermost_distance(film: Film, probe: Probe) -> float:
-    """Return the largest distance (mm) from the centre at which the coarse map covers presses; see `RIM_GAP`."""
+    """Return the largest distance of a press from the centre (mm) for which the coarse map is valid; see `RIM_GAP`."""
     return film.radius - (1.0 + RIM_GAP) * probe.reach
 
 
 def whole_film_map(
     sensor: Sensor, probe: Probe, force_range: tuple[float, float], *, executor: Executor | None = None
 ) -> ForwardMap:
-    """Solve a coarse forward map of nearly the whole film, which takes about 3 s of CPU time.
+    """Build a coarse forward map of nearly the whole film. The solves take about 3 s of CPU time.
 
     Args:
         sensor: Sensor with an axisymmetric film.
         probe: Probe that presses the film.
         force_range: Smallest and largest force, N.
-        executor: Executor that runs the solves; this process if absent.
+        executor: Executor that runs the solves; None for this process.
 
     Raises:
         SceneError: If some presses cannot exist.
@@ -66,8 +66,10 @@ def whole_film_map(
     film = sensor.film
     domain = Domain(outermost_distance(film, probe), force_range)
     check_family(sensor.coated_film, probe, domain)
-    # All presses are solved with the same theory and the same coarse mesh. The thin rings at the rim have the width for
-    # the geometric mean of the forces, unless the mesh of the outermost press needs narrower rings.
+
+    # All presses are solved with the same theory and the same coarse mesh. The width of the thin rings at the rim is
+    # that of the geometric mean of the smallest and the largest force, unless the mesh of the outermost press needs
+    # narrower rings.
     theory = Theory(stretching=True, bending=True, pretensioned=film.pretension != 0.0)
     min_force, max_force = force_range
     middle_force = float(np.sqrt(min_force * max_force))

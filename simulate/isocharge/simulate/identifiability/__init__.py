@@ -1,1 +1,1 @@
-"""Identifiability of contacts from charges: Cramer-Rao limits, folds, ambiguous pairs and the working area."""
+"""Analysis of how well the charges of a sensor determine a contact, and in which area the contact is unique."""

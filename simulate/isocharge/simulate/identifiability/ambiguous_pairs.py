@@ -1,4 +1,4 @@
-"""Pairs of distant contacts that have the same charges.
+"""Search for pairs of distant contacts that have the same charges.
 
 Even if a charge map has no folds, two distant contacts may have the same charges. The search for such pairs covers the
 whole domain of the map.
@@ -19,8 +19,7 @@ from isocharge.simulate.numerics.disk import INNER_RADIUS, lattice
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 INDISTINGUISHABLE_SIGMAS = 3.0
-"""Largest difference of the charges of two contacts that count as indistinguishable, in standard deviations of the
-noise."""
+"""Difference of the charges below which two contacts are indistinguishable, in standard deviations of the noise."""
 
 MIN_DISTANCE = 1.0
 """Smallest distance between the contacts of an ambiguous pair, mm."""
@@ -32,16 +31,19 @@ If the distance is smaller, the two contacts count as a single contact with a la
 """
 
 FORCES = 8
-"""Number of forces at which the charges of the second contact are tabulated."""
+"""Number of forces at which the charges at each position are tabulated."""
 
 EXPONENT = 2.0 / 3.0
 """Exponent of the force in the charge of a membrane without pretension, dimensionless.
 
-The ratio of the charge to this power of the force is tabulated, because the ratio depends only weakly on the force.
+The tables contain the ratio of the charge to this power of the force. This ratio depends only weakly on the force.
 """
 
 NEIGHBOURS = 9
-"""Number of lattice points, including the point itself, among which a candidate must have the smallest difference."""
+"""Number of nearest lattice points that are compared, including the point itself.
+
+A candidate must have charges that fit better than the charges at all these points.
+"""
 
 MAX_CANDIDATES = 2
 """Largest number of candidates for the second contact of each first contact."""
@@ -49,11 +51,10 @@ MAX_CANDIDATES = 2
 
 @dataclass(frozen=True)
 class AmbiguousPairs:
-    """Pairs of contacts with the same charges.
+    """Pairs of distant contacts that have the same charges.
 
-    The outer contact of a pair is the contact that is farther from the centre of the film.
-
-    The pairs are ordered by the distance of the outer contact from the centre.
+    The outer contact of a pair is the contact that is farther from the centre of the film. The pairs are ordered by the
+    distance of the outer contact from the centre.
 
     Attributes:
         first: First contact (x, y, F) of each pair, shape (n, 3), mm and N.
@@ -67,7 +68,7 @@ class AmbiguousPairs:
 
     @classmethod
     def none(cls) -> "AmbiguousPairs":
-        """Return an empty result."""
+        """Return a result without any pair."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
     def __len__(self) -> int:
@@ -75,19 +76,22 @@ class AmbiguousPairs:
 
     @property
     def outer_radius(self) -> Array:
-        """Distance of the outer contact of each pair from the centre, shape (n,), mm."""
+        """Distance of the outer contact of each pair from the centre of the film, shape (n,), mm."""
         first_radius = np.hypot(*self.first[:, :2].T)
         second_radius = np.hypot(*self.second[:, :2].T)
         return np.asarray(np.maximum(first_radius, second_radius))
 
     @property
     def radius(self) -> float:
-        """Radius of the smallest centred disk that contains both contacts of a pair, mm; infinite without pairs."""
+        """Radius of the smallest disk around the centre that contains both contacts of a pair, mm.
+
+        The radius is infinite if there are no pairs.
+        """
         return float(self.outer_radius.min(initial=np.inf))
 
     @property
     def summary(self) -> str:
-        """Sentence about the pair whose outer contact is nearest to the centre, which is the first pair.
+        """Sentence about the first pair, whose outer contact is nearest to the centre of the film.
 
         The text is empty if there are no pairs.
         """
@@ -103,14 +107,15 @@ class AmbiguousPairs:
 
 
 def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
-    """Find pairs of distant contacts whose charges differ by less than the noise.
+    """Find pairs of distant contacts whose charges cannot be distinguished because of the noise.
 
-    The first contacts are presses with the force `force` at the positions of a square lattice. For each first contact,
-    all other positions of the lattice are candidates for the second contact. Each candidate has the force that fits
-    best. The best candidates are then improved by least squares.
+    The first contact of a pair is a press with the given force at a position of a square lattice. For each first
+    contact, the other positions of the lattice are candidates for the second contact. At each candidate position, the
+    force is chosen that fits the charges of the first contact best. The best candidates are then improved by least
+    squares.
 
     Args:
-        charge_map: Charges as a function of the contact.
+        charge_map: Map that computes the charges of contacts.
         noise: Noise of the readings.
         force: Force of the first contact of each pair, N. The second contact may have any force of the map.
         places: Number of positions of the lattice.
@@ -118,8 +123,8 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     Returns:
         The pairs, ordered by the distance of the outer contact from the centre.
     """
-    # First contacts, and the distance from which on a second contact counts as distant
-    unit_lattice = lattice(places)  # x + iy
+    # Choose the first contacts, and compute the distance above which a second contact counts as distant.
+    unit_lattice = lattice(places)  # positions x + iy in the unit disk
     position = INNER_RADIUS * charge_map.domain.radius * np.stack([unit_lattice.real, unit_lattice.imag], axis=1)
     contact = np.column_stack([position, np.full(len(position), force)])
     charge = charge_map.charges(contact)
@@ -129,7 +134,8 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     if not first_index.size:
         return AmbiguousPairs.none()
 
-    # Improve the candidates for the second contacts, and select the pairs that are distant and have the same charges.
+    # Improve the candidates for the second contacts. Then select the pairs whose contacts are still distant, and whose
+    # charges agree within the noise.
     first = contact[first_index]
     second, charge_difference = nearest_contact(charge_map, noise, charge[first_index], start)
     x_difference, y_difference, _ = (second - first).T
@@ -143,34 +149,35 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
 def _candidates(
     charge_map: ChargeMap, noise: NoiseModel, position: Array, charge: Array, min_distance: Array
 ) -> tuple[Integers, Array]:
-    """Find candidates for the second contacts of pairs on the lattice.
+    """Find candidates for the second contacts of ambiguous pairs on the lattice.
 
-    A position of the lattice is a candidate if its charges fit better than those of its neighbours. Each first contact
-    has at most `MAX_CANDIDATES` candidates.
+    A distant position of the lattice is a candidate if its charges fit the charges of the first contact better than the
+    charges at the neighbouring positions do. Each first contact has at most `MAX_CANDIDATES` candidates.
 
     Args:
-        charge_map: Charges as a function of the contact.
+        charge_map: Map that computes the charges of contacts.
         noise: Noise of the readings.
-        position: Positions of the lattice, shape (n, 2), mm.
-        charge: Charges of the first contacts at these positions, shape (n, n_electrode), pC.
-        min_distance: Smallest distance of the second contact from each first contact, shape (n,), mm.
+        position: Positions (x, y) of the lattice, shape (n, 2), mm.
+        charge: Charges of the first contact at each of these positions, shape (n, n_electrode), pC.
+        min_distance: Smallest distance of a second contact from the first contact at each position, shape (n,), mm.
 
     Returns:
-        Indices of first contacts, shape (m,). A candidate (x, y, F) for each first contact, shape (m, 3), mm and N. A
-        first contact with two candidates occurs twice.
+        Indices of the first contacts, shape (m,). Candidates (x, y, F) for their second contacts, shape (m, 3), mm and
+        N. A first contact with two candidates occurs twice.
     """
-    # The charges at each position of the lattice are weights(ln F) @ ratios, with the weights of the profile.
+    # The profile computes the charges at a position from the tabulated ratios of charge and power of the force.
     profile, ratios = _tabulate(charge_map, position)
-    _, neighbours = cKDTree(position).query(position, min(NEIGHBOURS, len(position)))  # indices, including itself
+    _, neighbours = cKDTree(position).query(position, min(NEIGHBOURS, len(position)))  # shape (n, n_neighbour)
     first_indices = []
     second_contacts = []
     for first_index, first_charge in enumerate(charge):
-        # At every position of the lattice, find the force that explains the charges of the first contact best.
+        # At every position of the lattice, find the force whose charges fit those of the first contact best.
         observed = np.broadcast_to(first_charge, charge.shape)
         log_force = profile.best(ratios, observed, noise)
         predicted = profile.charge(log_force, ratios)
         chi2 = ((observed - predicted) ** 2 / noise.variance(predicted)).sum(axis=1)  # shape (n,)
 
+        # Select the best distant positions at which chi2 is a local minimum.
         is_local_minimum = chi2 <= chi2[neighbours].min(axis=1)
         x_difference, y_difference = (position - position[first_index]).T
         is_distant = np.hypot(x_difference, y_difference) > min_distance[first_index]
@@ -184,15 +191,16 @@ def _candidates(
 def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Array]:
     """Tabulate the charges at every position as a function of the force.
 
-    The ratio Q / F^EXPONENT is interpolated by a polynomial in ln F, because the ratio depends only weakly on F.
+    If Q is a charge and F is the force, the ratio Q / F^EXPONENT depends only weakly on F. Therefore this ratio is
+    interpolated by a polynomial in ln F.
 
     Args:
-        charge_map: Charges as a function of the contact.
+        charge_map: Map that computes the charges of contacts.
         position: Positions (x, y), shape (n, 2), mm.
 
     Returns:
-        The interpolation as a function of the force, and the ratios Q / F^EXPONENT at the nodes, shape (n, n_node,
-        n_electrode).
+        Profile that computes charges from the ratios at any force. The ratios Q / F^EXPONENT at the nodes of the
+        interpolation, shape (n, n_node, n_electrode), pC/N^EXPONENT.
     """
     force_range = charge_map.domain.force_range
     min_log_force, max_log_force = np.log(force_range)
@@ -200,9 +208,9 @@ def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Arr
         log_nodes = chebyshev_nodes(FORCES, min_log_force, max_log_force)
     else:
         log_nodes = np.array([min_log_force])
-    force_nodes = np.clip(np.exp(log_nodes), *force_range)  # rounding may lead out of the range
+    force_nodes = np.clip(np.exp(log_nodes), *force_range)  # rounding must not move a force out of the range
 
-    # Ratios at the nodes of the interpolation, one array of shape (n, n_electrode) for each force
+    # Compute the ratios at the nodes of the interpolation: one array of shape (n, n_electrode) for each force.
     nodal_ratios = []
     for force in force_nodes:
         contact = np.column_stack([position, np.full(len(position), force)])
@@ -210,13 +218,13 @@ def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Arr
     barycentric = barycentric_weights(log_nodes)
 
     def weights(log_force: Array) -> Array:
-        """Compute the weights with which the ratios at the nodes are summed to give the charge.
+        """Compute weights for the ratios at the nodes, such that the weighted sum of the ratios is the charge.
 
         Args:
-            log_force: Values of ln F, shape (n,).
+            log_force: Natural logarithms of the forces in N, shape (n,).
 
         Returns:
-            Weights for each force, shape (n, n_node), N^EXPONENT.
+            Weights of the nodes for each force, shape (n, n_node), N^EXPONENT.
         """
         interpolation_weights = lagrange_values(log_nodes, barycentric, log_force)
         force_power = np.exp(EXPONENT * log_force)

@@ -1,10 +1,10 @@
-"""Cramer-Rao limit: the smallest errors of an unbiased estimator of a contact from noisy charges.
+"""Cramer-Rao limit, which is the smallest error of an unbiased estimator of a contact from noisy charges.
 
-Let J = d(Q)/d(x, y, ln F, ...) be the Jacobian, and i the information that one reading provides about its charge
-(`NoiseModel.information`). The Fisher information is then J' diag(i) J. The covariance of an unbiased estimate is at
-least the inverse of the Fisher information (Kay 1993, chapter 3). An estimator that uses a prior may have smaller
-errors where the charges provide little information. The package isocharge.train computes the limit of such estimators,
-the Bayes limit.
+Let J = d(Q)/d(x, y, ln F, ...) be the matrix of the derivatives of the charges Q, and let the vector i contain the
+information that one reading provides about each charge (`NoiseModel.information`). The Fisher information is then
+J' diag(i) J. The covariance of an unbiased estimate is at least the inverse of the Fisher information (Kay 1993,
+chapter 3). An estimator that uses a prior distribution may have smaller errors where the charges provide little
+information. The limit of such estimators is the Bayes limit, which the package isocharge.train computes.
 """
 
 from dataclasses import dataclass
@@ -18,34 +18,38 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 MIN_EIGENVALUE = 1e-14
 """Lower bound of the eigenvalues of the scaled Fisher information, dimensionless.
 
-Smaller eigenvalues are rounding errors. With this bound, the limits of undetermined parameters are very large instead
-of infinite.
+Smaller eigenvalues are rounding errors and are replaced by the bound. The limits of parameters that the charges do not
+determine are therefore very large instead of infinite.
 """
 
 MIN_INFORMATION = 1e-60
-"""Fisher information below which a parameter counts as unobservable: 1/mm^2 for x and y, dimensionless for ln F."""
+"""Lower bound of the Fisher information by which a parameter is scaled: 1/mm^2 for x and y, dimensionless for ln F.
+
+The bound avoids a division by zero if the charges do not depend on a parameter.
+"""
 
 
 @dataclass(frozen=True)
 class CramerRao:
-    """Cramer-Rao limits of contacts.
+    """Cramer-Rao limits of several contacts.
 
     Attributes:
-        covariance: Smallest covariance of (x, y, ln F, ...), shape (n, p, p), with x and y in mm and ln F
-            dimensionless. Nuisance parameters come last, in units of their prior standard deviation.
+        covariance: Smallest covariance matrix of the parameters (x, y, ln F, ...) of each contact, shape (n, p, p). The
+            unit of x and y is mm, and ln F is dimensionless. Nuisance parameters come last, in units of their prior
+            standard deviation.
     """
 
     covariance: Array
 
     @property
     def position(self) -> Array:
-        """Root mean square distance of the estimate from the true position, shape (n,), mm."""
+        """Smallest root mean square distance between the estimated and the true position, shape (n,), mm."""
         variance = np.diagonal(self.covariance, axis1=1, axis2=2)
         return np.asarray(np.sqrt(variance[:, 0] + variance[:, 1]))  # x and y
 
     @property
     def force(self) -> Array:
-        """Standard deviation of the force divided by the force, shape (n,), dimensionless."""
+        """Smallest standard deviation of the estimated force divided by the force, shape (n,), dimensionless."""
         variance = np.diagonal(self.covariance, axis1=1, axis2=2)
         return np.asarray(np.sqrt(variance[:, 2]))  # ln F
 
@@ -59,38 +63,44 @@ def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Arra
             ln F.
         noise: Noise of the readings. The white noise must be positive.
         nuisance: Change of the charges by one prior standard deviation of each nuisance parameter, such as the radius
-            of the probe or the pretension, shape (n, n_electrode, n_nuisance), pC. The priors of the nuisance
-            parameters are added to the information (Van Trees 1968, sec. 2.4.3).
+            of the probe or the pretension, shape (n, n_electrode, n_nuisance), pC. The information of the prior
+            distributions of these parameters is added (Van Trees 1968, sec. 2.4.3). None if there are no such
+            parameters.
 
     Returns:
-        The limits, from the inverse of the Fisher information J' W J + prior information.
+        The limits. Their covariance is the inverse of the sum of the Fisher information and the prior information.
     """
     prior_information = np.zeros(jacobian.shape[2])
     if nuisance is not None:
         # A nuisance parameter in units of its prior standard deviation has the prior information 1.
         prior_information = np.concatenate([prior_information, np.ones(nuisance.shape[2])])
         jacobian = np.concatenate([jacobian, nuisance], axis=2)
-    # Sum over the electrodes e, for each press n and each pair of parameters i and j.
+
+    # For each press (index n) and each pair of parameters (i and j), sum over the electrodes (e).
     information = np.einsum("nei,ne,nej->nij", jacobian, noise.information(charge), jacobian, optimize=True)
     return CramerRao(_invert(information + np.diag(prior_information)))
 
 
 def limits_at(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> CramerRao:
-    """Compute the limits for contacts of a charge map.
+    """Compute the Cramer-Rao limits of contacts from a charge map.
 
     Args:
-        charge_map: Charges as a function of the contact.
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        charge_map: Map that computes the charges of contacts.
+        contact: Contacts (x, y, F) in the domain of the map, shape (n, 3), mm and N.
         noise: Noise of the readings. The white noise must be positive.
+
+    Returns:
+        The limits of the three parameters x, y and ln F of each contact.
     """
     charge, jacobian = linearised(charge_map, contact)
     return cramer_rao(charge, jacobian, noise)
 
 
 def _invert(information: Array) -> Array:
-    """Invert information matrices. Singular matrices are regularised.
+    """Invert information matrices, and regularise singular matrices.
 
-    The matrices are first scaled to a unit diagonal, because the units of the parameters differ.
+    Each matrix is first scaled such that its diagonal elements are 1, because the units of the parameters differ. The
+    eigenvalues of the scaled matrix are increased to at least `MIN_EIGENVALUE`.
 
     Args:
         information: Symmetric matrices, shape (n, p, p).
@@ -101,8 +111,9 @@ def _invert(information: Array) -> Array:
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     parameter_scale = np.sqrt(np.maximum(diagonal, MIN_INFORMATION))  # shape (n, p)
     matrix_scale = parameter_scale[:, :, None] * parameter_scale[:, None, :]
-    eigenvalues, eigenvectors = np.linalg.eigh(information / matrix_scale)  # the diagonal of this matrix is 1
+    eigenvalues, eigenvectors = np.linalg.eigh(information / matrix_scale)  # the diagonal elements are 1
     inverse_eigenvalues = 1.0 / np.maximum(eigenvalues, MIN_EIGENVALUE)
-    # Inverse V diag(1 / eigenvalues) V' of each matrix n
+
+    # If V contains the eigenvectors, the inverse of each matrix (index n) is V diag(1 / eigenvalues) V'.
     scaled_inverse = np.einsum("nik,nk,njk->nij", eigenvectors, inverse_eigenvalues, eigenvectors)
     return np.asarray(scaled_inverse / matrix_scale)

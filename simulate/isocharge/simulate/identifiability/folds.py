@@ -1,22 +1,23 @@
-"""Folds of a charge map.
+"""Search for the folds of a charge map, near which different contacts have the same charges.
 
-Charges determine a contact only where the map from (x, y, ln F) to the charges is one to one. The map is not one to one
-near a fold. At a fold, the derivative J = d(Q)/d(x, y, ln F) is singular, and the map reverses its orientation across
-the fold. With three electrodes, det J changes its sign, and folds are lines. With more electrodes, J is not square and
-is singular only at isolated points. At a point of this kind, the map intersects itself. Contacts on both sides of the
-point therefore have the same charges (Whitney 1944).
+Charges Q determine a contact only where the map from (x, y, ln F) to the charges is one to one. The map is not one to
+one near a fold. At a fold, the derivative J = d(Q)/d(x, y, ln F) is singular, and the map reverses its orientation
+across the fold. With three electrodes, det J changes its sign, and folds are lines. With more electrodes, J is not
+square and is singular only at isolated points. The map intersects itself at a singular point. Contacts on opposite
+sides of a singular point therefore have the same charges (Whitney 1944).
 
-The orientation is reversed between two contacts a and b if det(J(a)' W J(b)) < 0, with the weights W = 1 / sigma^2. For
-three electrodes, this determinant has the sign of det J(a) det J(b). With more electrodes, the criterion is reliable
-only for contacts that are close to each other. Between distant contacts, for example on both sides of an electrode, the
-map may turn by more than a right angle without a fold. A segment with reversed orientation is therefore bisected until
-it is shorter than `SEGMENT_LENGTH`, or until neither half has reversed orientation. A fold that is smaller than the
-grid is found by a search for the minima of the smallest singular value of J.
+The orientation is reversed between two contacts a and b if det(J(a)' W J(b)) < 0, where the diagonal matrix W contains
+the inverse variances of the charges. For three electrodes, this determinant has the sign of det J(a) det J(b). For more
+electrodes, the criterion is reliable only if the two contacts are close to each other. Between distant contacts, for
+example on opposite sides of an electrode, the map may turn by more than a right angle without a fold. A segment with
+reversed orientation is therefore bisected until it is shorter than `SEGMENT_LENGTH`, or until the orientation is
+reversed in neither half. A fold that is smaller than the spacing of the grid is found by a search for the minima of the
+smallest singular value of J.
 
-If the electrodes lie on one circle, an isotropic film has a fold near this circle for any number of electrodes. The
-reason is that the charges hardly change if the press is moved to its mirror image in the circle.
+If the electrodes lie on one circle, the charges of an isotropic film hardly change if the press is moved to its mirror
+image in this circle. The map therefore has a fold near the circle for any number of electrodes.
 
-Even without folds, two distant contacts may have the same charges; see `ambiguous_pairs`.
+Even without folds, two distant contacts may have the same charges. The module `ambiguous_pairs` finds such contacts.
 """
 
 from dataclasses import dataclass
@@ -30,17 +31,20 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import INNER_RADIUS, Rings, onto_disk
 
 SEGMENT_LENGTH = 0.02
-"""Length below which a segment with reversed orientation counts as a fold, mm.
+"""Length of a segment with reversed orientation below which the segment counts as a fold, mm.
 
-Beside an electrode, the orientation may be reversed within 0.1 mm although the charges are not ambiguous at 1 N. On a
-circle of four electrodes, where there is a fold, the orientation is reversed within about 0.01 mm.
+Beside an electrode, the orientation may be reversed within 0.1 mm without a fold. At a true fold, such as that on a
+circle of four electrodes, the orientation is reversed within about 0.01 mm.
 """
 
 MAX_STEPS = 40
-"""Largest number of steps of the compass search. Most minima need 8 to 20; minima in narrow valleys need more."""
+"""Largest number of steps of the compass search.
+
+The search for most minima needs 8 to 20 steps. For a minimum in a narrow valley, it needs more steps.
+"""
 
 MIN_COMPASS_STEP = 0.1 * SEGMENT_LENGTH
-"""Step of the compass search below which it ends, mm."""
+"""Length of a step below which the compass search ends, mm."""
 
 _COMPASS_ANGLE = np.pi * np.arange(8) / 4.0
 
@@ -49,41 +53,49 @@ COMPASS = np.stack([np.cos(_COMPASS_ANGLE), np.sin(_COMPASS_ANGLE)], axis=1)
 
 
 def has_reversed_orientation(first: Array, second: Array) -> Booleans:
-    """Return whether the charge map reverses its orientation between neighbouring contacts.
+    """Return whether the charge map reverses its orientation between pairs of neighbouring contacts.
 
     Args:
-        first: J / sigma of the first contacts, shape (..., n_electrode, 3).
-        second: J / sigma of the second contacts, shape (..., n_electrode, 3).
+        first: Derivatives of the charges with respect to (x, y, ln F) at the first contact of each pair, divided by the
+            standard deviations of the charges, shape (..., n_electrode, 3).
+        second: Scaled derivatives at the second contact of each pair, shape (..., n_electrode, 3).
 
     Returns:
         Whether the orientation is reversed, shape (...).
     """
     first_directions = _unit_columns(first)
     second_directions = _unit_columns(second)
-    # Scalar products of the columns, with sums over the electrodes e, shape (..., 3, 3)
+
+    # Scalar products of the columns (i of the first, j of the second contact): sums over the electrodes (index e)
     products = np.einsum("...ei,...ej->...ij", first_directions, second_directions)
     return np.asarray(np.linalg.det(products) < 0.0)
 
 
 def _unit_columns(jacobian: Array) -> Array:
-    """Scale the columns of a matrix to unit length.
+    """Scale the columns of matrices to unit length.
 
-    Without this scaling, rounding errors could change the sign of the determinant.
+    Without this scaling, rounding errors could change the sign of the determinant of their products.
+
+    Args:
+        jacobian: Matrices of derivatives, shape (..., n_electrode, 3).
+
+    Returns:
+        Matrices with columns of length 1, of the same shape. Columns of zeros remain zero.
     """
     length = np.linalg.norm(jacobian, axis=-2, keepdims=True)
     return np.asarray(jacobian / np.maximum(length, np.finfo(float).tiny))
 
 
 def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> Array:
-    """Compute J / sigma for contacts.
+    """Compute the derivatives of the charges of contacts, divided by the standard deviations of the charges.
 
     Args:
-        charge_map: Charges as a function of the contact.
+        charge_map: Map that computes the charges of contacts.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         noise: Noise of the readings.
 
     Returns:
-        Derivatives with respect to x (1/mm), y (1/mm) and ln F (dimensionless), shape (n, n_electrode, 3).
+        Scaled derivatives with respect to x (1/mm), y (1/mm) and ln F (dimensionless), shape (n, n_electrode, 3).
     """
     charge, jacobian = linearised(charge_map, contact)
     return np.asarray(jacobian / noise.sigma(charge)[..., None])
@@ -92,38 +104,39 @@ def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel)
 def singular_values(scaled: Array) -> Array:
     """Compute how strongly the charges depend on the position if the force is unknown.
 
-    A change of the charges that the force could also cause contains no information about the position. It is therefore
-    removed from the derivatives with respect to x and y. The singular values of the remaining derivatives are the
-    inverse standard deviations of the position in the best and in the worst direction. At a fold the second singular
-    value is zero.
+    If a change of the force could also cause a change of the charges, this change contains no information about the
+    position. The derivatives with respect to x and y are therefore projected onto the subspace that is orthogonal to
+    the derivative with respect to ln F. The singular values of the projected derivatives are the inverse standard
+    deviations of the position in the best and in the worst direction. At a fold, the second singular value is zero.
 
     Args:
-        scaled: J / sigma: the derivatives of the charges with respect to x, y and ln F, divided by the standard
-            deviations of the charges, shape (n, n_electrode, 3).
+        scaled: Derivatives of the charges with respect to x, y and ln F, divided by the standard deviations of the
+            charges, shape (n, n_electrode, 3).
 
     Returns:
-        Singular values in descending order, shape (n, 2), 1/mm.
+        Two singular values for each contact in descending order, shape (n, 2), 1/mm.
     """
     position_derivative = scaled[:, :, :2]
     force_derivative = scaled[:, :, 2]
     force_length = np.linalg.norm(force_derivative, axis=1, keepdims=True)
     force_direction = force_derivative / np.maximum(force_length, np.finfo(float).tiny)  # unit vectors
 
-    # Subtract the component along `force_direction`, which is a sum over the electrodes e.
-    component = np.einsum("ne,nei->ni", force_direction, position_derivative)
+    # Subtract the component along `force_direction`. It is a scalar product, which is a sum over the electrodes (e).
+    component = np.einsum("ne,nei->ni", force_direction, position_derivative)  # shape (n, 2)
     across_force = position_derivative - force_direction[:, :, None] * component[:, None, :]
     return np.asarray(np.linalg.svd(across_force, compute_uv=False))
 
 
 @dataclass(frozen=True)
 class Folds:
-    """Folds of a charge map at one force, and the positions that are closest to a fold.
+    """Folds of a charge map at one force, and the positions where the charges contain least information.
 
     Attributes:
-        points: Positions on folds, ordered by the distance from the centre, shape (n, 2), mm. With three electrodes
-            the positions lie on fold lines. With more electrodes they are the points where J is singular.
-        weakest: Local minima of the smallest singular value of J, shape (k, 2), mm. The position error has local maxima
-            at these positions, which may lie between the positions of a grid.
+        points: Positions (x, y) on folds, ordered by the distance from the centre, shape (n, 2), mm. With three
+            electrodes, the positions lie on fold lines. With more electrodes, they are points where the derivative of
+            the charges is singular.
+        weakest: Positions (x, y) where the smallest singular value of the derivative has a local minimum, shape (k, 2),
+            mm. The position error has local maxima at these positions, which may lie between the positions of a grid.
     """
 
     points: Array
@@ -131,19 +144,23 @@ class Folds:
 
 
 def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel) -> Folds:
-    """Find the folds and the local minima of the smallest singular value under one force.
+    """Find the folds of a charge map for contacts with one force.
 
     Args:
-        charge_map: Charges as a function of the contact.
-        rings: Positions between which folds are searched. They may be coarser than the folds.
+        charge_map: Map that computes the charges of contacts.
+        rings: Positions between which folds are searched for. A fold may be smaller than their spacing.
         force: Force of the contacts, N.
         noise: Noise of the readings.
+
+    Returns:
+        The folds, and the positions where the charges contain least information about the position.
     """
     search = _FoldSearch(charge_map, noise, force)
-    # J / sigma, the derivatives of the charges divided by the noise, at all positions
     scaled = rings.per_ring(search.scaled(rings.position.reshape(-1, 2)))  # shape (n_ring, n_angle, n_electrode, 3)
     weakest = search.weakest_positions(rings, scaled)
-    points = np.concatenate([search.folds_between(rings, scaled), search.folds_about(weakest)])
+
+    # Large folds lie between neighbouring positions. A small fold may lie at one of the weakest positions.
+    points = np.concatenate([search.folds_between(rings, scaled), search.folds_near(weakest)])
 
     # Sort the folds by their distance from the centre.
     x, y = points.T
@@ -152,56 +169,81 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
 
 
 class _FoldSearch:
-    """Search of folds under one force. Positions have the shape (n, 2) and the unit mm."""
+    """Search for the folds of a charge map, for contacts with one force.
+
+    Scaled derivatives are the derivatives of the charges with respect to (x, y, ln F), divided by the standard
+    deviations of the charges.
+    """
 
     def __init__(self, charge_map: ChargeMap, noise: NoiseModel, force: float) -> None:
+        """Prepare the search.
+
+        Args:
+            charge_map: Map that computes the charges of contacts.
+            noise: Noise of the readings.
+            force: Force of all contacts, N.
+        """
         self.charge_map = charge_map
         self.noise = noise
         self.force = force
         self.radius = INNER_RADIUS * charge_map.domain.radius
 
     def scaled(self, position: Array) -> Array:
-        """Compute J / sigma at positions, shape (n, n_electrode, 3)."""
+        """Compute the scaled derivatives at positions.
+
+        Args:
+            position: Positions (x, y), shape (n, 2), mm. Positions outside the domain are moved to its edge.
+
+        Returns:
+            Scaled derivatives, shape (n, n_electrode, 3).
+        """
         inside = onto_disk(position, self.radius)
         contact = np.column_stack([inside, np.full(len(inside), self.force)])
         return scaled_derivatives(self.charge_map, contact, self.noise)
 
     def smallest_singular_value(self, position: Array) -> Array:
-        """Compute the smallest singular value of J / sigma with respect to the position, shape (n,), 1/mm."""
+        """Compute the smaller one of the two `singular_values` at each position.
+
+        Args:
+            position: Positions (x, y), shape (n, 2), mm.
+
+        Returns:
+            Smaller singular value, shape (n,), 1/mm.
+        """
         return singular_values(self.scaled(position))[:, 1]
 
     def folds_between(self, rings: Rings, scaled: Array) -> Array:
         """Find folds between neighbouring positions on the same ring or on neighbouring rings.
 
-        A fold lies between two positions at which the charge map has opposite orientations.
+        A fold lies between two positions if the charge map has opposite orientations at these positions.
 
         Args:
-            rings: Positions.
-            scaled: J / sigma at all positions, shape (n_ring, n_angle, n_electrode, 3).
+            rings: Positions between which folds are searched for.
+            scaled: Scaled derivatives at all positions, shape (n_ring, n_angle, n_electrode, 3).
 
         Returns:
-            Positions on folds, shape (n, 2), mm.
+            Positions (x, y) on folds, shape (n, 2), mm.
         """
         position = rings.position
         next_on_ring = np.roll(position, -1, axis=1)
-        has_radial_fold = has_reversed_orientation(scaled[:-1], scaled[1:])  # between neighbours on a radius
-        has_ring_fold = has_reversed_orientation(scaled, np.roll(scaled, -1, axis=1))  # between neighbours on a ring
+        has_radial_fold = has_reversed_orientation(scaled[:-1], scaled[1:])  # between neighbouring rings
+        has_ring_fold = has_reversed_orientation(scaled, np.roll(scaled, -1, axis=1))  # on the same ring
         first = np.concatenate([position[:-1][has_radial_fold], position[has_ring_fold]])
         second = np.concatenate([position[1:][has_radial_fold], next_on_ring[has_ring_fold]])
         return self._bisect(first, second)
 
     def _bisect(self, first: Array, second: Array) -> Array:
-        """Bisect segments until they are short. The charge map has opposite orientations at the two ends of a segment.
+        """Bisect segments until they are shorter than `SEGMENT_LENGTH`.
 
-        In each round, a segment is replaced by the half in which the orientation is reversed, until it is shorter than
-        `SEGMENT_LENGTH`.
+        The charge map has opposite orientations at the two ends of a segment. In each round, a segment is replaced by
+        the half in which the orientation is reversed.
 
         Args:
-            first: First ends of the segments, shape (n, 2), mm.
-            second: Second ends of the segments, shape (n, 2), mm.
+            first: First ends (x, y) of the segments, shape (n, 2), mm.
+            second: Second ends (x, y) of the segments, shape (n, 2), mm.
 
         Returns:
-            Centres of the final segments, shape (m, 2), mm.
+            Centres (x, y) of the final segments, shape (m, 2), mm. Segments with a fold in neither half are omitted.
         """
         if not len(first):
             return np.empty((0, 2))
@@ -215,15 +257,16 @@ class _FoldSearch:
             is_short = np.hypot(x_length, y_length) <= SEGMENT_LENGTH
             points.append(middle[is_short])
 
-            # Find the half of each other segment in which the orientation is reversed.
+            # Find the half of each other segment in which the orientation is reversed. A segment is dropped if the
+            # orientation is reversed in neither half.
             middle_scaled = self.scaled(middle)
-            # The orientation may be reversed in neither half, because of rounding errors. Such a segment is dropped.
             in_first_half = has_reversed_orientation(first_scaled, middle_scaled)
             in_second_half = has_reversed_orientation(middle_scaled, second_scaled)
             remaining = ~is_short & (in_first_half | in_second_half)
             use_second_half = (in_second_half & ~in_first_half)[remaining]
 
-            # The middle replaces the first end or the second end of each remaining segment.
+            # Replace the first end or the second end of each remaining segment by its middle, together with the scaled
+            # derivatives at this end.
             use_second_position = use_second_half[:, None]  # broadcasts with shape (n, 2)
             first = np.where(use_second_position, middle[remaining], first[remaining])
             second = np.where(use_second_position, second[remaining], middle[remaining])
@@ -233,25 +276,26 @@ class _FoldSearch:
         return np.concatenate(points)
 
     def weakest_positions(self, rings: Rings, scaled: Array) -> Array:
-        """Find the local minima of the smallest singular value.
+        """Find the positions where the smallest singular value of the scaled derivatives has a local minimum.
 
-        The search starts at each position whose value is not larger than the values of its neighbours on the rings.
+        A search starts at each position of the rings whose singular value is not larger than those of its neighbours.
 
         Args:
-            rings: Positions.
-            scaled: J / sigma at all positions, shape (n_ring, n_angle, n_electrode, 3).
+            rings: Positions from which the starting positions are chosen.
+            scaled: Scaled derivatives at all positions, shape (n_ring, n_angle, n_electrode, 3).
 
         Returns:
-            Positions of the minima, shape (n, 2), mm.
+            Positions (x, y) of the minima, shape (n, 2), mm.
         """
         n_ring, n_angle, _, _ = scaled.shape
         scaled_of_positions = scaled.reshape(-1, *scaled.shape[2:])
         _, smaller_singular_value = singular_values(scaled_of_positions).T
         smallest = smaller_singular_value.reshape(n_ring, n_angle)
 
-        # The neighbours are the 3 x 3 positions on the same ring and on the rings beside it. The angles are periodic.
+        # The filter returns the smallest value among 3 x 3 positions: the position itself and its neighbours on the
+        # same ring and on the two neighbouring rings. The angles are periodic.
         smallest_of_neighbours = scipy.ndimage.minimum_filter(smallest, 3, mode=("nearest", "wrap"))
-        is_minimum = smallest == smallest_of_neighbours  # includes the position itself, so equality means a minimum
+        is_minimum = smallest == smallest_of_neighbours
 
         # The first step of a search is the distance between neighbouring positions.
         spacing_on_ring = rings.distance * 2.0 * np.pi / n_angle
@@ -260,13 +304,16 @@ class _FoldSearch:
         ring, _ = np.nonzero(is_minimum)
         return self._minimise(rings.position[is_minimum], smallest[is_minimum], first_step[ring])
 
-    def folds_about(self, position: Array) -> Array:
-        """Select the positions near which the orientation of the map is reversed within `SEGMENT_LENGTH`.
+    def folds_near(self, position: Array) -> Array:
+        """Select the positions near which the orientation of the charge map is reversed within `SEGMENT_LENGTH`.
 
-        The orientations at opposite points of a small circle about each position are compared.
+        The orientations at opposite points of a small circle around each position are compared.
 
         Args:
-            position: Positions, shape (n, 2), mm.
+            position: Positions (x, y), shape (n, 2), mm.
+
+        Returns:
+            Selected positions (x, y), shape (m, 2), mm.
         """
         circle_points = position[:, None] + 0.5 * SEGMENT_LENGTH * COMPASS  # shape (n, 8, 2)
         scaled = self.scaled(circle_points.reshape(-1, 2))
@@ -278,26 +325,30 @@ class _FoldSearch:
     def _minimise(self, start: Array, start_value: Array, first_step: Array) -> Array:
         """Find local minima of the smallest singular value by a compass search (Kolda, Lewis and Torczon 2003).
 
-        In each round, a search moves to the best of eight neighbours, or halves its step if no neighbour has a smaller
-        value than the present position. A search ends when its step falls below `MIN_COMPASS_STEP`.
+        One search starts at each position, and all searches run together. In each round, a search evaluates the
+        singular value at eight points around its position. If the best of the eight points has a smaller singular value
+        than the position, the search moves to the best point. If no point has a smaller singular value, the search
+        halves its step length. A search ends when its step length is at most `MIN_COMPASS_STEP`.
 
         Args:
-            start: Starting positions, shape (n, 2), mm.
+            start: Starting positions (x, y), shape (n, 2), mm.
             start_value: Smallest singular value at these positions, shape (n,), 1/mm.
-            first_step: First step of each search, shape (n,), mm.
+            first_step: First step length of each search, shape (n,), mm.
 
         Returns:
-            Positions of the minima, shape (n, 2), mm.
+            Positions (x, y) of the minima, shape (n, 2), mm.
         """
         position = start.copy()
         value = start_value.copy()
-        step = first_step.copy()
-        active = np.flatnonzero(step > MIN_COMPASS_STEP)  # indices of the searches that have not ended
+        step_length = first_step.copy()
+        active = np.flatnonzero(step_length > MIN_COMPASS_STEP)  # indices of the searches that have not ended
         for _ in range(MAX_STEPS):
             if not active.size:
                 break
-            # Best of the eight neighbours of each active search
-            compass_points = position[active, None] + step[active, None, None] * COMPASS  # shape (n_active, 8, 2)
+
+            # Find the best of the eight neighbours of the position of each active search.
+            compass_steps = step_length[active, None, None] * COMPASS  # shape (n_active, 8, 2)
+            compass_points = position[active, None] + compass_steps
             neighbours = onto_disk(compass_points.reshape(-1, 2), self.radius)  # shape (n_active * 8, 2)
             neighbour_values = self.smallest_singular_value(neighbours).reshape(-1, len(COMPASS))
             best_direction = neighbour_values.argmin(axis=1)
@@ -305,11 +356,11 @@ class _FoldSearch:
             best_neighbour = neighbours.reshape(-1, len(COMPASS), 2)[active_rows, best_direction]
             best_value = neighbour_values[active_rows, best_direction]
 
-            # Move to this neighbour if its value is smaller, and halve the step otherwise.
+            # Move to this neighbour if its value is smaller than that of the position. Otherwise halve the step length.
             is_lower = best_value < value[active]
             moving = active[is_lower]
             position[moving] = best_neighbour[is_lower]
             value[moving] = best_value[is_lower]
-            step[active[~is_lower]] *= 0.5
-            active = active[step[active] > MIN_COMPASS_STEP]
+            step_length[active[~is_lower]] *= 0.5
+            active = active[step_length[active] > MIN_COMPASS_STEP]
         return position

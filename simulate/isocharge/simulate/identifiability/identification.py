@@ -1,4 +1,4 @@
-"""Identification of a sensor: error limits, folds and working area, which state how well charges determine contacts."""
+"""Computation of how well the charges of a sensor determine contacts: error limits, folds and working area."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -10,7 +10,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.common.json_values import finite_or_none
-from isocharge.simulate.forward.charge_map import ChargeMap, check_determined
+from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
@@ -36,39 +36,40 @@ from isocharge.simulate.sensor.sensor import Sensor
 MAX_SEARCH_RADIUS = 0.9
 """Largest search radius in units of the film radius, dimensionless.
 
-Forward maps with larger radii need finer meshes.
+A forward map with a larger radius needs a finer mesh.
 """
 
 RADIUS_REDUCTION = 0.9
-"""Factor by which the search radius is reduced if the charges cannot be interpolated, dimensionless."""
+"""Factor by which the search radius is multiplied if the charges cannot be interpolated accurately, dimensionless."""
 
 MAX_REDUCTIONS = 3
 """Largest number of reductions of the search radius."""
 
 DEFAULT_PROBE = Circle(1.0)
-"""Probe of the released models, mm."""
+"""Probe of the released models, which has a radius of 1 mm."""
 
 MAX_LISTED_PAIRS = 20
 """Largest number of ambiguous pairs that the JSON output lists."""
 
 CONTACT_KEYS = ("x_mm", "y_mm", "force_N")
-"""Keys of a contact in JSON."""
+"""Keys of the position and the force of a contact in JSON."""
 
 BOUND_NAMES: dict[Bound, str] = {"fold": "fold", "ambiguous pair": "twins", "error": "error", "search": "searched"}
-"""Names of the bounds of a working area in JSON."""
+"""Names in JSON of the reasons for the radius of a working area."""
 
 
 @dataclass(frozen=True)
 class LimitMap:
-    """Cramer-Rao limits for one force on rings about the centre.
+    """Cramer-Rao limits of contacts with one force on rings around the centre of the film.
 
     Attributes:
-        force: Force, N.
-        rings: Positions at which the limits are evaluated.
-        position: Position error (root mean square), shape (n_ring, n_angle), mm.
-        relative_force: Standard deviation of the force divided by the force, shape (n_ring, n_angle), dimensionless.
-        condition: Ratio of the largest to the smallest standard deviation of the position by direction, shape (n_ring,
-            n_angle), dimensionless.
+        force: Force of all contacts, N.
+        rings: Positions of the contacts.
+        position: Smallest root mean square error of the position, shape (n_ring, n_angle), mm.
+        relative_force: Smallest standard deviation of the force divided by the force, shape (n_ring, n_angle),
+            dimensionless.
+        condition: Ratio of the standard deviations of the position in the worst and in the best direction, shape
+            (n_ring, n_angle), dimensionless.
     """
 
     force: float
@@ -79,10 +80,10 @@ class LimitMap:
 
     @classmethod
     def of(cls, charge_map: ChargeMap, noise: NoiseModel, force: float, rings: Rings) -> "LimitMap":
-        """Compute the limits at every position of the rings.
+        """Compute the Cramer-Rao limits at every position of the rings.
 
         Args:
-            charge_map: Charges as a function of the contact.
+            charge_map: Map that computes the charges of contacts.
             noise: Noise of the readings.
             force: Force of the contacts, N.
             rings: Positions of the contacts.
@@ -90,9 +91,10 @@ class LimitMap:
         contact = rings.contacts(force)
         limits = limits_at(charge_map, contact, noise)
 
-        # The singular values are the inverse standard deviations in the best and in the worst direction.
+        # The two singular values are the inverse standard deviations of the position in the best and in the worst
+        # direction. The smaller singular value is zero at a fold, so the ratio is limited to 1e12.
         largest, smallest = singular_values(scaled_derivatives(charge_map, contact, noise)).T
-        condition = largest / np.maximum(smallest, 1e-12 * largest)  # at most 1e12, at a fold
+        condition = largest / np.maximum(smallest, 1e-12 * largest)
         return cls(
             force,
             rings,
@@ -102,8 +104,11 @@ class LimitMap:
         )
 
     def statistics(self) -> dict[str, float]:
-        """Compute statistics of the errors. The weight of a position is the area that it represents."""
-        # A position represents a part of its ring, whose area is proportional to the distance from the centre.
+        """Compute the median, the root mean square and the maximum of the errors over the disk, for JSON.
+
+        The weight of a position is the area that it represents. Errors of the force are in percent of the force.
+        """
+        # The area that a position represents is proportional to its distance from the centre.
         n_angle = self.position.shape[1]
         area = np.repeat(self.rings.distance, n_angle)
         position = self.position.ravel()
@@ -122,20 +127,22 @@ class LimitMap:
 
 @dataclass(frozen=True)
 class Identification:
-    """Result of `identify`.
+    """Result of `identify`, which states how well the charges of a sensor determine contacts.
 
     Attributes:
-        sensor: Sensor.
-        probe: Probe.
+        sensor: Sensor that was analysed.
+        probe: Probe that presses the film.
         noise: Noise of the readings.
         charges: Charge map of the sensor with fast derivatives.
         area: Working area with folds and ambiguous pairs.
-        maps: Limits for the smallest force, for 1 N if it is in the range of forces, and for the largest force.
-        inner_maps: Limits for the same forces within the working area; empty if the working area has the radius 0.
-        side_force: Limits for the same forces if the side force of the probe is unknown; empty with fewer than six
-            electrodes.
-        mirror: Positions outside the working area where a press has the charges of a press inside the working area.
-            None if the positions were not computed, or if there is no working area.
+        maps: Error limits on the searched disk for the smallest force, for 1 N if 1 N is in the range of forces, and
+            for the largest force.
+        inner_maps: Error limits within the working area for the same forces; empty if the working area has the
+            radius 0.
+        side_force: Error limits for the same forces if the side force of the probe is unknown. Empty with fewer than
+            six electrodes, for a probe that is not circular, or if the working area has the radius 0.
+        mirror: Share of the presses outside the working area that have the charges of a press inside the working area.
+            None if the share was not computed, if there is no working area, or if the working area reaches the clamp.
     """
 
     sensor: Sensor
@@ -157,23 +164,25 @@ class Identification:
         error: float = DEFAULT_ERROR,
         executor: Executor | None = None,
     ) -> "Identification":
-        """Identify the sensor of a forward map within the radius and the forces of the map.
+        """Compute how well the charges of a sensor determine contacts in the domain of its forward map.
+
+        The mirror region is not computed.
 
         Args:
-            forward_map: Solved forward map.
+            forward_map: Forward map of the sensor.
             noise: Noise of the readings. The white noise must be positive.
-            error: Largest Cramer-Rao position error allowed in the working area, mm.
-            executor: Executor that runs the solves of the side forces; this process if absent.
+            error: Largest Cramer-Rao position error that is allowed in the working area, mm.
+            executor: Executor that runs the solves of the side forces; None for this process.
         """
-        check_determined(len(forward_map.electrodes))
+        check_electrode_count(len(forward_map.electrodes))
         charges = with_fast_derivatives(forward_map)
 
-        # Limits are computed for the smallest and the largest force, and for 1 N if it is between them.
+        # The limits are computed for the smallest and the largest force, and for 1 N if 1 N lies between both.
         min_force, max_force = charges.domain.force_range
         middle_force = min(max(min_force, 1.0), max_force)
         forces = sorted({min_force, middle_force, max_force})
 
-        # Limits up to the search radius, and within the working area
+        # Compute the limits on the whole disk of the map, and within the working area.
         area = working_area(charges, noise, error=error)
         maps = _limit_maps(charges, noise, forces, charges.domain.radius)
         inner_maps = _limit_maps(charges, noise, forces, area.radius)
@@ -182,9 +191,9 @@ class Identification:
 
     @property
     def determined_share(self) -> float:
-        """Share of the searched disk in which the error does not exceed its limit for any force, dimensionless.
+        """Share of the searched disk in which the position error does not exceed its limit for any force.
 
-        The disk includes the regions on both sides of folds. In these regions, different contacts may have the same
+        The disk includes the regions on both sides of folds. Contacts on opposite sides of a fold may have the same
         charges. Other information, such as preceding frames, is then necessary to distinguish these contacts.
         """
         is_allowed = np.all([limits.position <= self.area.error for limits in self.maps], axis=0)
@@ -192,26 +201,27 @@ class Identification:
 
     @property
     def summary(self) -> str:
-        """Description of the working area. With six electrodes or more, the side force is described as well."""
+        """Sentences that describe the working area, and the error of the side force if its limits were computed."""
         if not self.side_force:
             return self._area_summary
         return f"{self._area_summary} {self._side_force_summary}"
 
     @property
     def _area_summary(self) -> str:
-        """Description of the working area."""
+        """Sentences that describe the working area, and the larger area in which preceding frames are needed."""
         area = self.area
         if not (len(area.folds) or len(area.pairs)):
             return area.summary
         return (
             f"{area.summary} If preceding frames distinguish contacts with the same charges, the position error is at "
-            f"most {area.error:.3g} mm on {100.0 * self.determined_share:.0f} % of the disk of {area.searched:.3g} mm "
-            f"that was searched. The working area is {100.0 * (area.radius / area.searched) ** 2:.0f} % of this disk."
+            f"most {area.error:.3g} mm on {100.0 * self.determined_share:.0f} % of the disk of "
+            f"{area.search_radius:.3g} mm that was searched. The working area is "
+            f"{100.0 * (area.radius / area.search_radius) ** 2:.0f} % of this disk."
         )
 
     @property
     def _side_force_summary(self) -> str:
-        """Sentence that lists the forces at which the side force can be estimated, with its error at each force."""
+        """Sentence that lists the forces at which the side force can be estimated, with the error at each force."""
         estimable = [limits for limits in self.side_force if limits.is_estimable]
         if not estimable:
             return (
@@ -225,7 +235,7 @@ class Identification:
         return f"The side force of the probe can be estimated {', '.join(errors)} (median)."
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the results as values for JSON. An infinite radius becomes None."""
+        """Return the results as a dictionary for JSON, in which an infinite radius is None."""
         area = self.area
         return {
             "sensor": self.sensor.name,
@@ -240,7 +250,7 @@ class Identification:
                 "error_radius_mm": area.error_radius,
                 "unfolded_radius_mm": area.unambiguous_radius,
                 "error_mm": area.error,
-                "searched_mm": area.searched,
+                "searched_mm": area.search_radius,
                 "determined_share": self.determined_share,
                 "words": self.summary,
             },
@@ -253,7 +263,7 @@ class Identification:
         }
 
     def _errors_by_distance(self) -> dict[str, list[float]]:
-        """Return the median and the largest position error on each ring for each force, for JSON."""
+        """Return the median and the largest position error on each ring for JSON, with two lists for each force."""
         errors = {"distance_mm": self.maps[0].rings.distance.tolist()}
         for limits in self.maps:
             errors[f"median_position_mm_at_{limits.force:g}_N"] = np.median(limits.position, axis=1).tolist()
@@ -261,7 +271,7 @@ class Identification:
         return errors
 
     def _listed_pairs(self) -> list[dict[str, Any]]:
-        """Return the first `MAX_LISTED_PAIRS` ambiguous pairs for JSON."""
+        """Return the first `MAX_LISTED_PAIRS` ambiguous pairs as dictionaries for JSON."""
         pairs = self.area.pairs
         return [
             {
@@ -285,25 +295,26 @@ def identify(
 ) -> Identification:
     """Compute how well the charges of a sensor determine contacts.
 
-    The function solves a forward map, and finds the working area and the error limits within this area. It then finds
-    the presses outside the working area that cannot be noticed (the mirror region).
+    The function builds a forward map, and computes the working area and the error limits. The function also computes
+    the mirror region, which contains the presses outside the working area that have the same charges as a press inside
+    the working area.
 
     Args:
-        sensor: Sensor.
+        sensor: Sensor to be analysed.
         probe: Probe that presses the film.
-        noise: Noise of the readings, whose white noise must be positive; the level `reference` if absent.
+        noise: Noise of the readings, whose white noise must be positive. If None, the noise level is `reference`.
         force_range: Smallest and largest force, N.
-        radius: Distance from the centre up to which contacts are searched, mm; the distance of the outermost corner of
-            an electrode if absent.
-        error: Largest Cramer-Rao position error allowed in the working area, mm.
-        executor: Executor that runs the solves; this process if absent.
+        radius: Distance from the centre up to which contacts are analysed, mm. If None, the distance is chosen by
+            `map_to_search`.
+        error: Largest Cramer-Rao position error that is allowed in the working area, mm.
+        executor: Executor that runs the solves; None for this process.
 
     Raises:
-        SceneError: If there are fewer than three electrodes, if there is no white noise, or if the film cannot be
-            pressed as required.
-        SolveError: If an equilibrium or the allowed interpolation error is not reached.
+        SceneError: If there are fewer than three electrodes, if there is no white noise, or if a press in the domain
+            cannot exist.
+        SolveError: If a press has no equilibrium, or the interpolation error of the forward map is too large.
     """
-    check_determined(len(sensor.electrodes))
+    check_electrode_count(len(sensor.electrodes))
     noise = noise or noise_model("reference")
     if noise.white <= 0.0:
         raise SceneError(
@@ -322,10 +333,15 @@ def identify(
 
 
 def search_radius(sensor: Sensor, probe: Probe) -> float:
-    """Return the radius of the search for the working area, mm.
+    """Return the radius of the disk in which the working area is searched for, mm.
 
-    The radius is the distance of the outermost corner of an electrode from the centre. It is limited by
-    `MAX_SEARCH_RADIUS`. The working area is mostly bounded by a fold near the electrodes that surround it.
+    In most cases, a fold near the outer electrodes bounds the working area. The radius of the disk is therefore the
+    distance of the outermost corner of an electrode from the centre. If the outermost corner is near the clamp, the
+    radius is smaller, because the probe must not reach the clamp.
+
+    Args:
+        sensor: Sensor with the electrodes.
+        probe: Probe that presses the film.
     """
     corners = [sensor.calibration.place(np.array(electrode.corners)) for electrode in sensor.electrodes]
     outermost = float(np.hypot(*np.concatenate(corners).T).max())
@@ -335,22 +351,23 @@ def search_radius(sensor: Sensor, probe: Probe) -> float:
 def map_to_search(
     sensor: Sensor, probe: Probe, force_range: tuple[float, float], executor: Executor | None = None
 ) -> ForwardMap:
-    """Solve a forward map over the search radius. If the charges cannot be interpolated there, use a smaller radius.
+    """Build a forward map for the search for the working area.
 
-    The radius is multiplied by `RADIUS_REDUCTION` at most `MAX_REDUCTIONS` times. After that, an error is raised.
+    The first radius of the map is `search_radius`. If the charges cannot be interpolated accurately up to this radius,
+    the radius is multiplied by `RADIUS_REDUCTION`, at most `MAX_REDUCTIONS` times.
 
     Args:
-        sensor: Sensor.
-        probe: Probe of the presses.
+        sensor: Sensor of the forward map.
+        probe: Probe that presses the film.
         force_range: Smallest and largest force, N.
-        executor: Executor that runs the solves; this process if absent.
+        executor: Executor that runs the solves; None for this process.
 
     Returns:
-        The forward map, whose domain has the radius that was reached.
+        The forward map with the largest of these radii at which the map is accurate.
 
     Raises:
-        SceneError: If the film cannot be pressed as required.
-        SolveError: If an equilibrium or the allowed interpolation error is not reached.
+        SceneError: If a press in the domain cannot exist.
+        SolveError: If the map with the smallest of these radii cannot be built.
     """
     radius = search_radius(sensor, probe)
     for _ in range(MAX_REDUCTIONS):
@@ -358,18 +375,19 @@ def map_to_search(
             return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
         except SolveError:
             radius *= RADIUS_REDUCTION
-    # The last radius is outside the loop, because its error is not caught.
+
+    # The last attempt is outside the loop, so that its error reaches the caller.
     return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
 
 
 def _limit_maps(charges: ChargeMap, noise: NoiseModel, forces: list[float], radius: float) -> tuple[LimitMap, ...]:
-    """Compute a map of the error limits for each force.
+    """Compute the error limits on a disk for each of several forces.
 
     Args:
-        charges: Charges as a function of the contact.
+        charges: Map that computes the charges of contacts.
         noise: Noise of the readings.
-        forces: Forces, N.
-        radius: Largest distance of a position from the centre, mm.
+        forces: Forces of the contacts, N.
+        radius: Radius of the disk, mm.
 
     Returns:
         A map of the limits for each force. There are no maps if the radius is 0.
@@ -381,7 +399,14 @@ def _limit_maps(charges: ChargeMap, noise: NoiseModel, forces: list[float], radi
 
 
 def _median(values: Array, weights: Array) -> float:
-    """Compute the weighted median of values; both arguments have the shape (n,)."""
+    """Compute the weighted median of values.
+
+    Half of the total weight belongs to values up to the weighted median.
+
+    Args:
+        values: Values, shape (n,).
+        weights: Positive weights of the values, shape (n,).
+    """
     order = np.argsort(values)
     cumulative_weight = np.cumsum(weights[order])
     middle = np.searchsorted(cumulative_weight, 0.5 * cumulative_weight[-1])

@@ -1,9 +1,10 @@
-"""The mirror region: positions outside the working area where a press has the same charges as a press inside it.
+"""Computation of the mirror region of a sensor.
 
-If all electrodes lie on one circle of radius R, the mirror region covers almost the whole film. A point load at the
-distance r from the centre has nearly the same influence on the points of this circle as a point load at R^2 / r. The
-reason is that an inversion in the circle preserves the ratios of the distances to the points of the circle. No method
-can notice a press in the mirror region, because its charges are those of a press in the working area.
+A press in the mirror region lies outside the working area and has the same charges as a press inside the working area.
+No method can therefore notice from the charges that the press lies outside. If all electrodes lie on one circle of
+radius R, the mirror region covers almost the whole film. An inversion in this circle preserves the ratios of the
+distances to the points of the circle. A point load at the distance r from the centre therefore has nearly the same
+influence on the points of the circle as a point load at the distance R^2 / r.
 """
 
 from concurrent.futures import Executor
@@ -21,16 +22,16 @@ from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 DETECTABLE_SIGMAS = 5.0
-"""Difference of charges above which a press can be noticed, in standard deviations of the noise.
+"""Difference from the charges of every press in the working area above which a press outside can be noticed.
 
-It is the smallest limit of the misfit in `isocharge.serve`.
+The difference is in standard deviations of the noise. It is the smallest limit of the misfit in `isocharge.serve`.
 """
 
 FORCE_COUNT = 5
 """Number of forces of the presses at each position."""
 
 FORCE_RATIO = 10.0
-"""Largest ratio of the largest to the smallest of these forces, dimensionless."""
+"""Upper bound of the ratio of the largest to the smallest force of the presses, dimensionless."""
 
 N_RINGS = 32
 """Number of rings between the working area and the clamp."""
@@ -39,26 +40,27 @@ N_SECTORS = 48
 """Number of sectors of each ring."""
 
 N_CANDIDATES = 1024
-"""Number of contacts from which the search for the nearest contact starts."""
+"""Number of contacts among which the starting points of the search for the nearest contact are chosen."""
 
 INTERIOR = 0.98
-"""Distance from the centre up to which a contact counts as inside the working area, in units of its radius.
+"""Distance from the centre up to which a contact counts as inside the working area, in radii of the working area.
 
-A contact on the edge does not explain the charges; the search only stopped there.
+If the search for the nearest contact stops at the edge of the area, the contact on the edge does not explain the
+charges.
 """
 
 
 @dataclass(frozen=True)
 class MirrorRegion:
-    """Share of the presses outside the working area that have the same charges as a press inside it, at each position.
+    """Share of the presses at each position outside the working area that have the charges of a press in this area.
 
     Attributes:
         inner: Radius of the working area, mm.
         outer: Largest distance of the presses from the centre, mm.
-        forces: Forces of the presses, shape (n_force,), N.
+        forces: Forces of the presses at each position, shape (n_force,), N.
         share: Share of the forces at which a press has the charges of a press in the working area, shape (n_ring,
-            n_sector), dimensionless. The rings have equal widths. The first sector begins at the x axis, and the others
-            follow anticlockwise.
+            n_sector), dimensionless. The rings between `inner` and `outer` have equal widths. The first sector begins
+            at the x axis, and the others follow anticlockwise.
     """
 
     inner: float
@@ -68,18 +70,17 @@ class MirrorRegion:
 
     @classmethod
     def of(cls, charges: ChargeMap, radius: float, whole_film: ChargeMap, noise: NoiseModel) -> "MirrorRegion":
-        """Compare presses outside the working area with all presses inside it.
+        """Compute which presses outside the working area have the same charges as a press inside the working area.
+
+        The presses lie in the middle of each sector of each ring between the working area and the edge of the film.
 
         Args:
             charges: Accurate charge map of the working area.
             radius: Radius of the working area, mm.
             whole_film: Charge map of the whole film.
             noise: Noise of the readings.
-
-        Returns:
-            The mirror region, from presses in the middle of each sector of each ring.
         """
-        # Forces, and the middles of the rings and sectors between the working area and the edge of the map
+        # Choose the forces, and the middles of the rings and sectors between the working area and the edge of the map.
         min_force, max_force = charges.domain.force_range
         forces = np.geomspace(max(min_force, max_force / FORCE_RATIO), max_force, FORCE_COUNT)
         outer_radius = whole_film.domain.radius
@@ -87,32 +88,34 @@ class MirrorRegion:
         ring_distance = 0.5 * (ring_edges[1:] + ring_edges[:-1])
         sector_angle = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
 
-        # Presses with every combination of ring, sector and force
+        # Create a press for every combination of ring, sector and force.
         grids = np.meshgrid(ring_distance, sector_angle, forces, indexing="ij")
         distance, angle, force = (grid.ravel() for grid in grids)
         contact = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), force])
 
-        # Whether a press in the working area has the same charges, and the share of the forces for which this is true
+        # Find the presses whose charges a press in the working area also has. Then average over the forces.
         is_mirrored = has_mirror(within(charges, radius), whole_film.charges(contact), noise)
         share_of_forces = is_mirrored.reshape(N_RINGS, N_SECTORS, FORCE_COUNT).mean(axis=2)
         return cls(radius, outer_radius, forces, share_of_forces)
 
     @property
     def distance(self) -> Array:
-        """Distance of the middle of each ring from the centre, shape (n_ring,), mm."""
+        """Distance from the centre of the film to the middle of each ring, shape (n_ring,), mm."""
         edges = np.linspace(self.inner, self.outer, len(self.share) + 1)
         return np.asarray(0.5 * (edges[1:] + edges[:-1]))
 
     @property
     def total_share(self) -> float:
-        """Share of the presses outside the working area that have the same charges as a press inside it,
-        dimensionless."""
+        """Share of all presses outside the working area that have the charges of a press in this area, dimensionless.
+
+        The weight of a press is the area of its sector.
+        """
+        # The area of a sector is proportional to the distance from the centre.
         return float(np.average(self.share.mean(axis=1), weights=self.distance))
 
     @property
     def summary(self) -> str:
-        """Sentence about the share of presses outside the working area that have the same charges as a press inside
-        it."""
+        """Sentence that states the share of the presses outside the working area that cannot be noticed."""
         presses = (
             f"presses of {self.forces[0]:.2g} to {self.forces[-1]:.2g} N from {self.inner:.3g} to {self.outer:.3g} mm "
             "from the centre"
@@ -125,7 +128,7 @@ class MirrorRegion:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result for JSON."""
+        """Return the mirror region as a dictionary for JSON, with the mean share on each ring."""
         return {
             "share": self.total_share,
             "from_mm": self.inner,
@@ -137,15 +140,15 @@ class MirrorRegion:
 
 
 def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
-    """Return a mask of the charges that a press in a domain also causes, up to the noise.
+    """Return for each of several presses whether a press inside a domain causes the same charges, up to the noise.
 
     Args:
         inside: Charge map of the domain.
-        charge: Charges without noise, shape (n, n_electrode), pC.
+        charge: Charges of the given presses without noise, shape (n, n_electrode), pC.
         noise: Noise of the readings.
 
     Returns:
-        Whether a press in the domain causes the charges of each row, shape (n,).
+        Whether a press inside the domain causes the charges of each row, shape (n,).
     """
     nearest_contact, residual = search(inside, charge, noise.sigma(charge), candidates=N_CANDIDATES)
     is_same_charge = np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS
@@ -153,7 +156,15 @@ def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
 
 
 def is_interior(domain: Domain, contact: Array) -> Booleans:
-    """Return which contacts, shape (n, 3), lie inside a domain and not on its edge, shape (n,)."""
+    """Return whether each contact lies inside a domain and not on its edge.
+
+    Args:
+        domain: Positions and forces of the domain.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        Whether each contact lies inside, shape (n,).
+    """
     unit_x, unit_y, unit_log_force = domain.to_unit(contact).T
     is_position_inside = np.hypot(unit_x, unit_y) < INTERIOR
     is_force_inside = np.abs(unit_log_force) < INTERIOR
@@ -169,20 +180,20 @@ def mirror_region(
     *,
     executor: Executor | None = None,
 ) -> MirrorRegion | None:
-    """Solve a coarse map of the whole film, and find the mirror region of a sensor.
+    """Compute the mirror region of a sensor, from a coarse charge map of the whole film.
 
-    Outside the working area, a probe that is not round is replaced by a disk with the same reach.
+    Outside the working area, a probe that is not round is replaced by a round probe with the same reach.
 
     Args:
-        sensor: Sensor.
+        sensor: Sensor with the film and the electrodes.
         probe: Probe that presses the film.
         charges: Accurate charge map of the working area.
         radius: Radius of the working area, mm.
         noise: Noise of the readings.
-        executor: Executor that runs the solves; this process if absent.
+        executor: Executor that runs the solves; None for this process.
 
     Returns:
-        The mirror region; None if there is no working area, or if it reaches the clamp.
+        The mirror region; None if there is no working area, or if the working area reaches the clamp.
 
     Raises:
         SceneError: If some presses cannot exist.

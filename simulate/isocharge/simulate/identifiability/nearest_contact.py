@@ -1,7 +1,8 @@
 """Search for the contact whose charges are nearest to given charges.
 
-Let Q be the given charges, q(c) the charges of a contact c, and sigma the standard deviation of the noise of each
-charge. The distance of q(c) from Q is |(Q - q(c)) / sigma|. The distance is minimised over the contacts of a domain.
+Let Q be the given charges, Q(c) the charges of a contact c, and sigma the standard deviation of the noise of each
+charge. The distance between Q and Q(c) is the norm |(Q - Q(c)) / sigma|. The distance is minimised over the contacts of
+a domain.
 """
 
 from collections.abc import Callable
@@ -16,40 +17,42 @@ from isocharge.simulate.numerics.disk import INNER_RADIUS
 from isocharge.simulate.numerics.disk_least_squares import MAX_STEPS, MIN_CHANGE, minimise
 
 STEPS = 8
-"""Number of steps from a start near the solution. Most charges need five."""
+"""Largest number of steps of a descent from a starting point near the solution. Most descents need five steps."""
 
 CANDIDATES = 4096
 """Number of contacts among which the starting points of a search are chosen.
 
-The contacts are distributed over the domain, and a quarter of them lie on the edge of the disk.
+The contacts are distributed over the domain. A quarter of them lie on the edge of the disk.
 """
 
 START_SEPARATION = 0.25
-"""Smallest distance between the starts of one search in unit coordinates, in which the radius of the domain is one.
+"""Smallest distance between the starting points of one search, in radii of the domain, dimensionless.
 
-Starts that are nearer to each other mostly lead to the same local minimum.
+Starting points that are nearer to each other mostly lead to the same local minimum.
 """
 
 CHUNK = 2048
-"""Number of charges that are compared with all candidates at once, which limits the memory."""
+"""Number of rows of charges that are compared with all candidates at once, which limits the required memory."""
 
 
 def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, start: Array) -> tuple[Array, Array]:
-    """Find the contacts that explain charges best by a least-squares descent from starting points near the solution.
+    """Find the contacts whose charges are nearest to given charges, from starting points near the solution.
+
+    A least-squares descent leads from each starting point to a contact.
 
     Args:
-        charge_map: Charges as a function of the contact.
+        charge_map: Map that computes the charges of contacts.
         noise: Noise of the readings.
-        charge: Charges to explain, shape (n, n_electrode), pC.
-        start: Contacts (x, y, F) from which the search starts, shape (n, 3), mm and N.
+        charge: Given charges, shape (n, n_electrode), pC.
+        start: Contacts (x, y, F) from which the descents start, shape (n, 3), mm and N.
 
     Returns:
-        Contacts within the domain of the map, shape (n, 3). Distances of their charges from the given charges, in
-        standard deviations of the noise, shape (n,).
+        Contacts (x, y, F) within the domain of the map, shape (n, 3), mm and N. Distances of their charges from the
+        given charges, shape (n,), in standard deviations of the noise.
     """
 
     def predicted_sigma(_: Integers, predicted: Array) -> Array:
-        """Return the standard deviations of the noise of the predicted charges, pC."""
+        """Return the standard deviations of the noise of the predicted charges, of the same shape, pC."""
         return noise.sigma(predicted)
 
     contact, residual = _descend(charge_map, charge, predicted_sigma, start, STEPS)
@@ -59,24 +62,25 @@ def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, sta
 def explain(
     charge_map: ChargeMap, charge: Array, sigma: Array, start: Array, *, min_change: float = MIN_CHANGE
 ) -> tuple[Array, Array]:
-    """Find the contacts that explain charges best by a least-squares descent from given starting points.
+    """Find the contacts whose charges are nearest to given charges, from any starting points.
 
-    Unlike in `nearest_contact`, the standard deviations of the charges are given, and the starting points need not be
-    near the solution.
+    A least-squares descent leads from each starting point to a contact. In contrast to `nearest_contact`, the standard
+    deviations of the charges are given, and the starting points need not be near the solution.
 
     Args:
-        charge_map: Charges as a function of the contact.
-        charge: Charges to explain, shape (n, n_electrode), pC.
+        charge_map: Map that computes the charges of contacts.
+        charge: Given charges, shape (n, n_electrode), pC.
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
-        start: Contacts (x, y, F) from which the search starts, shape (n, 3), mm and N.
-        min_change: Change of the squared distance below which the descent ends, relative to 1 + its value.
+        start: Contacts (x, y, F) from which the descents start, shape (n, 3), mm and N.
+        min_change: A descent ends if the squared distance changes by less than `min_change` times 1 + its value.
 
     Returns:
-        Contacts within the domain of the map, shape (n, 3). Residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
+        Contacts (x, y, F) within the domain of the map, shape (n, 3), mm and N. Residuals, which are the given charges
+        minus the charges of the contacts, divided by `sigma`, shape (n, n_electrode), dimensionless.
     """
 
     def given_sigma(rows: Integers, _: Array) -> Array:
-        """Return the given standard deviations that belong to some rows of the charges, pC."""
+        """Return the given standard deviations of the charges in some rows, shape (k, n_electrode), pC."""
         return np.asarray(sigma[rows])
 
     return _descend(charge_map, charge, given_sigma, start, MAX_STEPS, min_change)
@@ -90,24 +94,24 @@ def _descend(
     max_steps: int,
     min_change: float = MIN_CHANGE,
 ) -> tuple[Array, Array]:
-    """Minimise the distance |(Q - Q(c)) / sigma| of the charges of contacts c from given charges Q.
+    """Minimise the distance |(Q - Q(c)) / sigma| between given charges Q and the charges Q(c) of contacts c.
 
-    For each row of charges, a least-squares descent leads from the start to a local minimum.
-
-    The unknowns are x, y and ln F in unit coordinates, in which the domain is the unit disk times [-1, 1].
+    For each row of charges, a least-squares descent leads from a starting point to a local minimum. The unknowns are
+    x, y and ln F in unit coordinates. In these coordinates, the domain is the unit disk times the interval [-1, 1].
 
     Args:
-        charge_map: Charges as a function of the contact.
-        charge: Charges to explain, shape (n, n_electrode), pC.
-        sigma_of: Function from rows of the charges and the predicted charges to standard deviations, pC.
-        start: Contacts (x, y, F), shape (n, 3), mm and N.
-        max_steps: Largest number of steps.
-        min_change: Change of the squared distance below which the descent ends, relative to 1 + its value.
+        charge_map: Map that computes the charges of contacts.
+        charge: Given charges, shape (n, n_electrode), pC.
+        sigma_of: Function that computes standard deviations, shape (k, n_electrode), pC. Its arguments are the indices
+            of k rows of the given charges, and the predicted charges for these rows.
+        start: Contacts (x, y, F) from which the descents start, shape (n, 3), mm and N.
+        max_steps: Largest number of steps of a descent.
+        min_change: A descent ends if the squared distance changes by less than `min_change` times 1 + its value.
 
     Returns:
-        Contacts (x, y, F), shape (n, 3). Residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
+        Contacts (x, y, F), shape (n, 3), mm and N. Residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
-    # Centre and half width of the domain in (x, y, ln F)
+    # Centre and half width of the domain along x, y and ln F
     radius = INNER_RADIUS * charge_map.domain.radius
     force_range = charge_map.domain.force_range
     min_log_force, max_log_force = np.log(force_range)
@@ -116,9 +120,9 @@ def _descend(
     divisor = np.where(half_width > 0.0, half_width, 1.0)  # the half width of ln F is zero if there is a single force
 
     def to_contact(unit_coordinates: Array) -> Array:
-        """Convert unit coordinates into contacts (x, y, F), both of shape (k, 3)."""
-        log_contact = unit_coordinates * half_width + centre
-        force = np.clip(np.exp(log_contact[:, 2]), *force_range)
+        """Convert unit coordinates, shape (k, 3), into contacts (x, y, F), shape (k, 3), mm and N."""
+        log_contact = unit_coordinates * half_width + centre  # (x, y, ln F)
+        force = np.clip(np.exp(log_contact[:, 2]), *force_range)  # rounding must not move it out of the range
         return np.column_stack([log_contact[:, :2], force])
 
     def residuals(rows: Integers, unit_coordinates: Array) -> tuple[Array, Array]:
@@ -126,14 +130,15 @@ def _descend(
 
         Args:
             rows: Indices of the rows, shape (k,).
-            unit_coordinates: Contacts c in unit coordinates, shape (k, 3).
+            unit_coordinates: Contacts c in unit coordinates, one for each of these rows, shape (k, 3).
 
         Returns:
-            Residuals, shape (k, n_electrode), and derivatives, shape (k, 3, n_electrode).
+            Residuals, shape (k, n_electrode). Their derivatives with respect to the unit coordinates, shape (k, 3,
+            n_electrode).
         """
         predicted, slopes = linearised(charge_map, to_contact(unit_coordinates))
         sigma = sigma_of(rows, predicted)
-        derivatives = -slopes * half_width / sigma[..., None]  # sigma counts as constant
+        derivatives = -slopes * half_width / sigma[..., None]  # the small derivative of sigma is neglected
         return (charge[rows] - predicted) / sigma, derivatives.swapaxes(1, 2)
 
     log_start = np.column_stack([start[:, :2], np.log(start[:, 2])])  # (x, y, ln F)
@@ -151,20 +156,24 @@ def search(
     candidates: int = CANDIDATES,
     min_change: float = MIN_CHANGE,
 ) -> tuple[Array, Array]:
-    """Find the nearest contacts by descents from the best candidates among contacts distributed over the domain.
+    """Find the contacts whose charges are nearest to given charges, without given starting points.
+
+    The given charges are compared with the charges of candidates, which are contacts that are distributed over the
+    domain. For each row of charges, least-squares descents start from the candidates with the nearest charges.
 
     Args:
-        charge_map: Charges as a function of the contact.
-        charge: Charges to explain, shape (n, n_electrode), pC.
+        charge_map: Map that computes the charges of contacts.
+        charge: Given charges, shape (n, n_electrode), pC.
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
         starts: Number of descents for each row of charges.
-        candidates: Number of contacts among which the starts are chosen.
-        min_change: Change of the squared distance below which a descent ends, relative to 1 + its value.
+        candidates: Number of candidates.
+        min_change: A descent ends if the squared distance changes by less than `min_change` times 1 + its value.
 
     Returns:
-        Contacts and residuals of the best descent; see `explain`.
+        Contacts (x, y, F), shape (n, 3), mm and N, and residuals, shape (n, n_electrode), of the best descent for each
+        row; see `explain`.
     """
-    # Charges of the candidates, and pairs of candidates that lie close together
+    # Compute the charges of the candidates, and find the pairs of candidates that lie close together.
     unit_candidates = _unit_candidates(candidates)
     candidate_contacts = charge_map.domain.to_contact(INNER_RADIUS * unit_candidates)
     candidate_contacts[:, 2] = np.clip(candidate_contacts[:, 2], *charge_map.domain.force_range)
@@ -172,14 +181,15 @@ def search(
     positions = unit_candidates[:, :2]
     is_neighbour = scipy.spatial.distance.cdist(positions, positions) < START_SEPARATION
 
-    # For each row of charges, the candidates with the nearest charges
+    # Find the candidates with the nearest charges for each row of charges. If there are no charges, the loop processes
+    # one empty chunk.
     nearest_candidates = []
-    for chunk_start in range(0, max(len(charge), 1), CHUNK):  # without charges, there is one empty chunk
+    for chunk_start in range(0, max(len(charge), 1), CHUNK):
         chunk = slice(chunk_start, chunk_start + CHUNK)
         nearest_candidates.append(_nearest_rows(charge[chunk], sigma[chunk], candidate_charges, is_neighbour, starts))
 
-    # One descent from the nearest candidate of each row of charges, one from the second nearest, and so on. They run
-    # together, because the charge map is faster for many contacts at once.
+    # For each row of charges, one descent starts from the nearest candidate, one from the second nearest, and so on.
+    # All descents run together, because the charge map is faster for many contacts at once.
     candidates_of_descents = np.concatenate(nearest_candidates).T  # shape (starts, n)
     contact, residual = explain(
         charge_map,
@@ -198,13 +208,16 @@ def search(
 
 
 def _unit_candidates(count: int) -> Array:
-    """Return contacts that are evenly distributed over the domain (Sobol sequence), a quarter of them on the edge.
+    """Return contacts that are evenly distributed over a domain (Sobol sequence).
+
+    A quarter of the contacts lie on the edge of the disk.
 
     Args:
         count: Number of contacts.
 
     Returns:
-        Contacts in unit coordinates (x, y, ln F), in which the domain is the unit disk times [-1, 1], shape (count, 3).
+        Contacts in the coordinates (x, y, ln F), shape (count, 3). The coordinates are scaled such that the domain is
+        the unit disk times the interval [-1, 1].
     """
     radius_sample, angle_sample, force_sample = scipy.stats.qmc.Sobol(3, scramble=False).random(count).T
     radius = np.sqrt(radius_sample)  # uniform over the area of the disk
@@ -219,24 +232,26 @@ def _nearest_rows(
 ) -> Integers:
     """Find the candidates with the nearest charges for each row of charges.
 
-    Candidates that are neighbours of each other are not returned together. A few searches for the
-    smallest distance are faster than sorting all distances.
+    Two candidates that are neighbours of each other are not both returned for the same row. The smallest distance is
+    searched for several times, because this is faster than sorting all distances.
 
     Args:
-        charge: Charges, shape (n, n_electrode), pC.
+        charge: Given charges, shape (n, n_electrode), pC.
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
         candidate_charges: Charges of the candidates, shape (n_candidate, n_electrode), pC.
         is_neighbour: Whether each pair of candidates lies close together, shape (n_candidate, n_candidate).
         count: Number of candidates to find for each row of charges.
 
     Returns:
-        Indices of the candidates in ascending order of the distance, shape (n, count).
+        Indices of the candidates in ascending order of the distance of their charges, shape (n, count).
     """
-    # sum((Q - Q_c)^2 / sigma^2) = sum(Q_c^2 / sigma^2 - 2 Q Q_c / sigma^2) + const., as one matrix product
+    # The squared distance of the charges Q_c of a candidate from the given charges Q is
+    #   sum((Q - Q_c)^2 / sigma^2) = sum(Q_c^2 / sigma^2 - 2 Q Q_c / sigma^2) + const.
+    # Without the constant, the squared distances of all rows and candidates are one matrix product.
     inverse_variance = sigma**-2.0
     weights = np.hstack([inverse_variance, -2.0 * charge * inverse_variance])
     powers = np.hstack([candidate_charges**2, candidate_charges])
-    squared_distance = weights @ powers.T  # shape (n, n_candidate), without the constant
+    squared_distance = weights @ powers.T  # shape (n, n_candidate)
     nearest = np.empty((len(charge), count), dtype=np.intp)
     for rank in range(count):
         nearest_candidate = squared_distance.argmin(axis=1)

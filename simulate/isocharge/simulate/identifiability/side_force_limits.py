@@ -1,8 +1,8 @@
 """Cramer-Rao limits of contacts with an unknown side force.
 
-Such a contact has five parameters: x, y, the force F, and the side force (Fx, Fy). The limits of the five parameters
-are computed for a side force of zero. The sensor must have at least six electrodes. With five electrodes, five
-parameters always fit the five charges, even if the model of the film is wrong.
+A contact with a side force has five parameters: x, y, the force F, and the side force (Fx, Fy). The limits of the five
+parameters are computed for a side force of zero. The sensor must have at least six electrodes. With only five
+electrodes, five parameters would fit any five charges, even if the model of the film were wrong.
 """
 
 from concurrent.futures import Executor
@@ -23,8 +23,7 @@ MIN_ELECTRODES = 6
 """Smallest number of electrodes for which the limits are computed."""
 
 MAX_SIDE_FORCE_ERROR = 0.1
-"""Largest median error of the side force, divided by the force, at which the side force counts as estimable,
-dimensionless."""
+"""Largest median error of the side force at which the side force counts as estimable, divided by the force."""
 
 RING_COUNT = 10
 """Number of rings on which the limits are computed."""
@@ -35,13 +34,15 @@ ANGLE_COUNT = 36
 
 @dataclass(frozen=True)
 class SideForceLimits:
-    """Limits of contacts with an unknown side force. All contacts have the same force, and lie in the working area.
+    """Cramer-Rao limits of contacts with an unknown side force.
+
+    All contacts have the same force, and lie on rings in the working area.
 
     Attributes:
         force: Force of the contacts, N.
-        side_force: Root mean square error of the side force divided by the force, shape (n,), dimensionless.
-        position: Root mean square error of the position, shape (n,), mm.
-        relative_force: Standard deviation of the force divided by the force, shape (n,), dimensionless.
+        side_force: Smallest root mean square error of the side force divided by the force, shape (n,), dimensionless.
+        position: Smallest root mean square error of the position, shape (n,), mm.
+        relative_force: Smallest standard deviation of the force divided by the force, shape (n,), dimensionless.
     """
 
     force: float
@@ -53,23 +54,23 @@ class SideForceLimits:
     def of(
         cls, side_force_map: SideForceMap, charge_map: ChargeMap, noise: NoiseModel, force: float, radius: float
     ) -> "SideForceLimits":
-        """Compute the limits at positions that are spread evenly over a disk.
+        """Compute the limits of contacts on concentric rings.
 
         Args:
-            side_force_map: Derivatives of the charges with respect to the side force.
-            charge_map: Charges of contacts without a side force.
+            side_force_map: Map that computes the derivatives of the charges with respect to the side force.
+            charge_map: Map that computes the charges of contacts without a side force.
             noise: Noise of the readings.
             force: Force of the contacts, N.
-            radius: Radius of the disk, mm.
+            radius: Radius of the outermost ring, mm.
         """
-        # Derivatives of the charges with respect to x, y, ln F, Fx / F and Fy / F
+        # The parameters of a contact are x, y, ln F, Fx / F and Fy / F. The derivative of a charge Q with respect to
+        # Fx / F is F times its derivative with respect to Fx.
         contact = Rings.spread(radius, RING_COUNT, ANGLE_COUNT).contacts(force)
         charge, contact_jacobian = linearised(charge_map, contact)
-        # d(Q) / d(Fx / F) = F d(Q) / d(Fx)
         relative_side_force_jacobian = force * side_force_map.jacobian(contact)
-        jacobian = np.concatenate([contact_jacobian, relative_side_force_jacobian], axis=2)
+        jacobian = np.concatenate([contact_jacobian, relative_side_force_jacobian], axis=2)  # (n, n_electrode, 5)
 
-        # The last two parameters are those of the side force.
+        # The last two parameters are the components of the side force.
         limits = cramer_rao(charge, jacobian, noise)
         variance = np.diagonal(limits.covariance, axis1=1, axis2=2)  # shape (n, 5)
         *_, side_x_variance, side_y_variance = variance.T
@@ -86,7 +87,10 @@ class SideForceLimits:
         return self._median(self.side_force) <= MAX_SIDE_FORCE_ERROR
 
     def statistics(self) -> dict[str, Any]:
-        """Compute statistics of the errors. The weight of a position is the area that it represents."""
+        """Compute the weighted median and the maximum of the errors, for JSON.
+
+        Errors of the force and of the side force are in percent of the force.
+        """
         return {
             "force_N": self.force,
             "side_force_median_percent": 100.0 * self._median(self.side_force),
@@ -99,9 +103,12 @@ class SideForceLimits:
         }
 
     def _median(self, values: Array) -> float:
-        """Compute the weighted median of values at the positions.
+        """Compute the weighted median of the values at the contacts.
 
-        The weight of a position is the area that it represents.
+        The weight of a contact is the area that its position represents.
+
+        Args:
+            values: Values in the order of the contacts, ring by ring, shape (n,).
         """
         relative_area = np.repeat(np.arange(1, RING_COUNT + 1), ANGLE_COUNT)  # proportional to the radius of the ring
         order = np.argsort(values)
@@ -118,18 +125,19 @@ def side_force_limits(
     radius: float,
     executor: Executor | None = None,
 ) -> tuple[SideForceLimits, ...]:
-    """Compute the limits for each force.
-
-    The result is empty if the sensor has fewer than `MIN_ELECTRODES` electrodes or no working area. It is also empty if
-    the probe is not circular, because only circular probes have a side force map.
+    """Compute the limits of contacts with an unknown side force, for each of several forces.
 
     Args:
         forward_map: Forward map of the sensor.
-        charge_map: Map with the same charges and fast derivatives.
+        charge_map: Map that computes the same charges as the forward map, with fast derivatives.
         noise: Noise of the readings.
-        forces: Forces, N.
+        forces: Forces of the contacts, N.
         radius: Radius of the working area, mm.
         executor: Executor that runs the solves; None for this process.
+
+    Returns:
+        The limits for each force. The result is empty if the sensor has fewer than `MIN_ELECTRODES` electrodes or no
+        working area. It is also empty if the probe is not circular, because no `SideForceMap` exists for such a probe.
     """
     if len(forward_map.electrodes) < MIN_ELECTRODES or radius <= 0.0 or not forward_map.probe.is_axisymmetric:
         return ()

@@ -1,4 +1,4 @@
-"""Working area: the disk within which the charges determine the contact."""
+"""Computation of the working area, which is the disk within which the charges determine the contact."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.forward.charge_map import ChargeMap, check_determined
+from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.identifiability.ambiguous_pairs import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
@@ -15,40 +15,43 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings
 
 DEFAULT_ERROR = 1.0
-"""Default of the largest Cramer-Rao position error in a working area, mm. It is the radius of the default probe."""
+"""Default value of the largest Cramer-Rao position error in a working area, mm.
+
+This value is the radius of the default probe.
+"""
 
 RADIUS_STEP = 0.1
-"""Step to which radii of working areas are rounded down, mm."""
+"""The radius of a working area is rounded down to a multiple of this step, mm."""
 
 MAX_CONFIRMATIONS = 4
 """Largest number of times that the error is evaluated again on finer rings within the area.
 
-Near an electrode, the error may exceed its limit between two of the first rings.
+Near an electrode, the error may exceed its limit between two neighbouring rings of the first evaluation.
 """
 
 Bound = Literal["fold", "ambiguous pair", "error", "search"]
 """Reason for the radius of a working area. "search" means that only the radius of the search bounds the area.
 
-The error grows without limit towards a fold, so an area that ends before a fold mostly has the bound "error".
+The error grows without limit towards a fold. An area that ends just before a fold therefore mostly has the bound
+"error".
 """
 
 
 @dataclass(frozen=True)
 class WorkingArea:
-    """Largest disk about the centre of the film within which the charges determine the contact.
+    """Largest disk around the centre of the film within which the charges determine the contact.
 
     Attributes:
         radius: Radius of the disk, mm, rounded down to 0.1 mm; 0 if there is no such disk.
         bound: Reason for the radius.
-        fold_radius: Distance of the nearest fold from the centre, mm; infinite without folds. With more than three
-            electrodes, a fold is a point where the derivative of the map is singular.
+        fold_radius: Distance of the nearest fold from the centre, mm; infinite if there are no folds.
         error_radius: Radius within which the position error is at most `error` for every force, mm.
         error: Largest allowed Cramer-Rao position error (root mean square), mm.
-        searched: Radius of the search, mm.
-        force_range: Smallest and largest force, N.
-        folds: Positions on folds, shape (n, 2), mm.
+        search_radius: Radius of the disk that was searched for the working area, mm.
+        force_range: Smallest and largest force of the contacts, N.
+        folds: Positions (x, y) on folds, shape (n, 2), mm.
         pairs: Pairs of distant contacts with the same charges.
-        electrodes: Number of electrodes.
+        electrodes: Number of electrodes of the sensor.
     """
 
     radius: float
@@ -56,7 +59,7 @@ class WorkingArea:
     fold_radius: float
     error_radius: float
     error: float
-    searched: float
+    search_radius: float
     force_range: tuple[float, float]
     folds: Array
     pairs: AmbiguousPairs
@@ -64,15 +67,15 @@ class WorkingArea:
 
     @property
     def unambiguous_radius(self) -> float:
-        """Radius of the largest disk without folds and ambiguous pairs, regardless of the error, mm."""
-        return _round_down(min(self.fold_radius, self.pairs.radius, self.searched))
+        """Radius of the largest disk without folds and ambiguous pairs, mm. The position error may exceed its limit."""
+        return _round_down(min(self.fold_radius, self.pairs.radius, self.search_radius))
 
     @property
     def summary(self) -> str:
-        """Description of the working area and of what limits it, in a few sentences."""
+        """Sentences that describe the working area and the reason for its radius."""
         min_force, max_force = self.force_range
         sentences = [f"Working area: up to {self.radius:.3g} mm from the centre, {min_force:g} to {max_force:g} N."]
-        is_limited_by_error = self.error_radius < min(self.searched, self.fold_radius, self.pairs.radius)
+        is_limited_by_error = self.error_radius < min(self.search_radius, self.fold_radius, self.pairs.radius)
         if is_limited_by_error:
             if self.unambiguous_radius > self.radius:
                 sentences.append(f"Up to {self.unambiguous_radius:.3g} mm, the charges determine the contact uniquely.")
@@ -80,7 +83,7 @@ class WorkingArea:
                 f"Beyond {self.radius:.3g} mm, the position error exceeds {self.error:.3g} mm at {min_force:g} N."
             )
         if np.isfinite(self.fold_radius):
-            # With more than three charges, the fold consists of single points.
+            # With three electrodes, folds are lines. With more electrodes, they are single points.
             fold = "the fold" if self.electrodes == 3 else "the points where it loses rank"
             sentences.append(
                 f"The map folds {self.fold_radius:.1f} mm from the centre: contacts on both sides of {fold} give the "
@@ -89,7 +92,7 @@ class WorkingArea:
         if len(self.pairs):
             sentences.append(self.pairs.summary)
         if self.bound == "search":
-            sentences.append(f"The search ended at {self.searched:.3g} mm.")
+            sentences.append(f"The search ended at {self.search_radius:.3g} mm.")
         return " ".join(sentences)
 
 
@@ -98,49 +101,53 @@ def working_area(
 ) -> WorkingArea:
     """Find the working area within the domain of a charge map.
 
-    The working area ends where the position error exceeds its limit, at the nearest fold, at the nearest ambiguous
-    pair, or at the edge of the domain. A forward map is first replaced by splines. Any other map, such as a fit to
-    measured charges, is evaluated about 400,000 times. Without the search for ambiguous pairs, it is evaluated 130,000
-    times.
+    The radius of the working area is the smallest of four radii: the radius at which the position error exceeds its
+    limit, the distance of the nearest fold, the radius of the nearest ambiguous pair, and the radius of the domain.
+
+    A forward map is first replaced by splines, which are faster. Any other charge map, such as a fit to measured
+    charges, is evaluated for about 400,000 contacts. Without the search for ambiguous pairs, the charge map is
+    evaluated for about 130,000 contacts.
 
     Args:
-        charge_map: Charges as a function of the contact.
+        charge_map: Map that computes the charges of contacts.
         noise: Noise of the readings. The white noise must be positive.
-        error: Largest allowed Cramer-Rao position error for every force, mm.
-        search_pairs: Whether to search for distant contacts with the same charges as well.
+        error: Largest Cramer-Rao position error that is allowed for every force, mm.
+        search_pairs: Whether to search for pairs of distant contacts with the same charges.
 
     Raises:
-        SceneError: If there are fewer than three charges.
+        SceneError: If the map has fewer than three electrodes.
     """
-    check_determined(len(charge_map.electrodes))
+    check_electrode_count(len(charge_map.electrodes))
     charge_map = with_fast_derivatives(charge_map)
-    searched = charge_map.domain.radius
+    search_radius = charge_map.domain.radius
     min_force, max_force = charge_map.domain.force_range
     middle_force = float(np.sqrt(min_force * max_force))
     forces = sorted({min_force, middle_force, max_force})
-    rings = Rings.spread(searched)
+    rings = Rings.spread(search_radius)
 
-    # Distance of the nearest fold for any of the forces
-    searches = [find_folds(charge_map, rings, force, noise) for force in forces]
-    folds = np.concatenate([search.points for search in searches])
+    # Find the distance of the nearest fold among the folds for all forces.
+    folds_of_forces = [find_folds(charge_map, rings, force, noise) for force in forces]
+    folds = np.concatenate([folds_of_force.points for folds_of_force in folds_of_forces])
     fold_x, fold_y = folds.T
     fold_radius = float(np.hypot(fold_x, fold_y).min(initial=np.inf))
 
-    # Distance at which the error first exceeds its limit, on the rings or at the positions with the largest errors
+    # Find the distance at which the error first exceeds its limit, on the rings or at the positions between the rings
+    # where the error has a local maximum.
     error_radius = np.inf
-    for force, search in zip(forces, searches, strict=True):
+    for force, folds_of_force in zip(forces, folds_of_forces, strict=True):
         ring_radius = _error_radius(charge_map, rings, force, noise, error)
-        weakest_radius = _nearest_exceeding(charge_map, search.weakest, force, noise, error)
+        weakest_radius = _nearest_exceeding_distance(charge_map, folds_of_force.weakest, force, noise, error)
         error_radius = min(error_radius, ring_radius, weakest_radius)
-    error_radius = _confirmed(charge_map, error_radius, forces, noise, error)
+    error_radius = _confirm_error_radius(charge_map, error_radius, forces, noise, error)
     pairs = find_ambiguous_pairs(charge_map, noise, min_force) if search_pairs else AmbiguousPairs.none()
 
-    # The smallest of these radii bounds the working area.
+    # The smallest of the following radii bounds the working area. If the error never exceeds its limit, `error_radius`
+    # is the radius of the search, and the error is not a bound.
     radii: dict[Bound, float] = {
-        "search": searched,
+        "search": search_radius,
         "fold": fold_radius,
         "ambiguous pair": pairs.radius,
-        "error": error_radius if error_radius < searched else np.inf,
+        "error": error_radius if error_radius < search_radius else np.inf,
     }
     bound = min(radii, key=lambda reason: radii[reason])
     return WorkingArea(
@@ -149,7 +156,7 @@ def working_area(
         fold_radius=fold_radius,
         error_radius=error_radius,
         error=error,
-        searched=searched,
+        search_radius=search_radius,
         force_range=(min_force, max_force),
         folds=folds,
         pairs=pairs,
@@ -157,18 +164,21 @@ def working_area(
     )
 
 
-def _confirmed(charge_map: ChargeMap, radius: float, forces: list[float], noise: NoiseModel, error: float) -> float:
+def _confirm_error_radius(
+    charge_map: ChargeMap, radius: float, forces: list[float], noise: NoiseModel, error: float
+) -> float:
     """Evaluate the position error on finer rings within a radius, and reduce the radius if the error exceeds its limit.
 
     Args:
-        charge_map: Charges as a function of the contact.
+        charge_map: Map that computes the charges of contacts.
         radius: Radius within which the error does not exceed its limit on coarser rings, mm.
         forces: Forces of the contacts, N.
         noise: Noise of the readings.
         error: Largest allowed position error, mm.
 
     Returns:
-        Confirmed radius, mm. A radius that is equal to that of the domain is returned unchanged.
+        Radius within which the error does not exceed its limit on the finer rings either, mm. The radius of the domain
+        is returned unchanged, because it was not reduced by the error on the coarser rings.
     """
     if radius >= charge_map.domain.radius:
         return radius
@@ -192,42 +202,48 @@ def _error_radius(charge_map: ChargeMap, rings: Rings, force: float, noise: Nois
     limit, the distance of the outermost ring is returned.
 
     Args:
-        charge_map: Charges as a function of the contact.
+        charge_map: Map that computes the charges of contacts.
         rings: Positions at which the error is evaluated.
         force: Force of the contacts, N.
         noise: Noise of the readings.
         error: Largest allowed position error, mm.
     """
     position_error = rings.per_ring(limits_at(charge_map, rings.contacts(force), noise).position)
-    largest_error = position_error.max(axis=1)  # of each ring
-    exceeding = np.flatnonzero(~(largest_error <= error))  # including NaN
-    if not exceeding.size:
+    largest_error = position_error.max(axis=1)  # shape (n_ring,)
+    exceeding_rings = np.flatnonzero(~(largest_error <= error))  # an error that is NaN exceeds the limit
+    if not exceeding_rings.size:
         outermost_distance = rings.distance[-1]
         return float(outermost_distance)
-    first_exceeding = int(exceeding[0])
-    if first_exceeding == 0:
+    first_exceeding = int(exceeding_rings[0])
+    if first_exceeding == 0:  # even the innermost ring has too large errors
         return 0.0
     rings_around_limit = [first_exceeding - 1, first_exceeding]
     log_errors = np.log(largest_error[rings_around_limit])
     return float(np.interp(np.log(error), log_errors, rings.distance[rings_around_limit]))
 
 
-def _nearest_exceeding(charge_map: ChargeMap, position: Array, force: float, noise: NoiseModel, error: float) -> float:
-    """Return the smallest distance (mm) from the centre at which the position error exceeds its limit, or infinity.
+def _nearest_exceeding_distance(
+    charge_map: ChargeMap, position: Array, force: float, noise: NoiseModel, error: float
+) -> float:
+    """Return the smallest distance (mm) from the centre to a given position at which the error exceeds its limit.
+
+    The distance is infinite if the error does not exceed its limit at any of the given positions.
 
     Args:
-        charge_map: Charges as a function of the contact.
+        charge_map: Map that computes the charges of contacts.
         position: Positions (x, y), shape (n, 2), mm.
-        force: Force of the contacts, N.
+        force: Force of the contacts at these positions, N.
         noise: Noise of the readings.
         error: Largest allowed position error, mm.
     """
     contact = np.column_stack([position, np.full(len(position), force)])
-    is_exceeding = ~(limits_at(charge_map, contact, noise).position <= error)  # including NaN
+    is_exceeding = ~(limits_at(charge_map, contact, noise).position <= error)  # an error that is NaN exceeds the limit
     return float(np.hypot(*position.T).min(initial=np.inf, where=is_exceeding))
 
 
 def _round_down(radius: float) -> float:
     """Round a radius (mm) down to a multiple of `RADIUS_STEP`."""
-    steps = np.floor(radius / RADIUS_STEP * (1.0 + 1e-9))  # the factor allows for rounding of the quotient
-    return float(f"{steps * RADIUS_STEP:.12g}")  # removes the rounding error of the product
+    # The factor compensates the rounding error of the quotient. The conversion into decimal digits removes the rounding
+    # error of the product.
+    steps = np.floor(radius / RADIUS_STEP * (1.0 + 1e-9))
+    return float(f"{steps * RADIUS_STEP:.12g}")

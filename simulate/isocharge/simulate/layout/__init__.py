@@ -1,1 +1,1 @@
-"""Design of electrode layouts: design case, table of charges, position error, and search of the positions."""
+"""Design of electrode layouts, which searches for the electrode positions with the smallest position errors."""

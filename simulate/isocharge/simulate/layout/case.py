@@ -1,4 +1,4 @@
-"""Design case of a layout: film, presses, goal of the minimisation, nuisances, and distance rules."""
+"""Design case, which states the requirements of an electrode layout and the rules for the electrode positions."""
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,16 +28,16 @@ DEFAULT_SIDE = 3.0
 """Side of new squares if the sensor has no square electrodes, mm."""
 
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-"""Names of new electrodes. The first names that the kept electrodes do not use are assigned."""
+"""Names of new electrodes. New electrodes get the first of these names that no kept electrode has."""
 
 MAX_SEARCH_PRESSES = 300
-"""Largest number of presses in the exchange. The refinement uses a fine grid."""
+"""Largest number of presses for which the first stage of the search (exchange on a grid) evaluates a layout."""
 
 FINE_GRID_STEPS = 50
-"""Number of steps of the fine grid from the centre outwards."""
+"""Number of steps of the fine grid of presses from the centre to the largest distance of a press."""
 
 WEIGHT_MAP_HEADER = "x_mm,y_mm,weight"
-"""Header of the CSV file of a weight map."""
+"""First line of the CSV file of a weight map."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class Nuisances:
     """Prior standard deviations of parameters that are not known exactly when a press is measured.
 
     Attributes:
-        probe_radius: Standard deviation of the probe radius, mm. It includes an unknown distribution of the pressure.
-            Outside the footprint, only the second moment of the pressure matters. Distributions between a uniform
-            pressure and that of a rigid flat punch differ like probes whose radii differ by 5 %.
+        probe_radius: Standard deviation of the probe radius, mm. It also accounts for the unknown distribution of the
+            contact pressure. A uniform pressure and the pressure under a rigid flat punch have the same effect outside
+            the footprint as two probes whose radii differ by 5 %.
         pretension: Standard deviation of the pretension after a calibration, MPa.
         gain: Standard deviation of the relative gain of each electrode, dimensionless.
     """
@@ -63,16 +63,16 @@ class Nuisances:
 
 
 NO_NUISANCES = Nuisances(probe_radius=0.0, pretension=0.0, gain=0.0)
-"""Nuisances of a press for which everything except the contact is known exactly."""
+"""Standard deviations of zero, for a press of which only the position and the force are unknown."""
 
 
 @dataclass(frozen=True)
 class WeightMap:
-    """Weights of the position error as a function of the position.
+    """Weights of the position error in the goal of a design, as a function of the position.
 
     Attributes:
-        name: Name of the file.
-        table: Rows of x, y (mm) and weight (dimensionless), shape (n, 3).
+        name: Name of the file that contains the weights.
+        table: Rows with x (mm), y (mm) and the weight (dimensionless) of a position, shape (n, 3).
     """
 
     name: str
@@ -92,18 +92,23 @@ class WeightMap:
         positions = self.table[:, :2]
         values = self.table[:, 2]
         nearest_weights = scipy.interpolate.NearestNDInterpolator(positions, values)(presses)
+
+        # Linear interpolation needs a triangulation of the positions, which does not exist if they lie on one line.
         spans_plane = np.linalg.matrix_rank(positions - positions[0]) == 2
-        if not spans_plane:  # linear interpolation needs a triangulation of the positions
+        if not spans_plane:
             return np.asarray(nearest_weights)
-        linear_weights = scipy.interpolate.LinearNDInterpolator(positions, values)(presses)  # NaN outside
+        linear_weights = scipy.interpolate.LinearNDInterpolator(positions, values)(presses)  # NaN outside the table
         return np.asarray(np.where(np.isnan(linear_weights), nearest_weights, linear_weights))
 
 
 NamedGoal = Literal["worst", "rms"]
 
 Goal = NamedGoal | WeightMap
-"""Quantity that a design minimises: the largest error, the root mean square of the errors, or their weighted root mean
-square."""
+"""Quantity that a design minimises.
+
+The quantity is the largest position error ("worst"), the root mean square of the position errors ("rms"), or the
+weighted root mean square with the weights of a `WeightMap`.
+"""
 
 
 def read_goal(text: str) -> Goal:
@@ -113,15 +118,15 @@ def read_goal(text: str) -> Goal:
         text: "worst", "rms", or the path of a CSV file with the header `WEIGHT_MAP_HEADER`.
 
     Returns:
-        The name of the goal, or the weights in the file.
+        The text if it is the name of a goal, and otherwise the weights in the file.
 
     Raises:
-        InputError: If the text is not a goal, or the file cannot be read.
+        InputError: If the file cannot be read, or its content is not a weight map.
     """
     if text in get_args(NamedGoal):
         return cast(NamedGoal, text)
     try:
-        # An empty file also results in a ValueError, because it has no header line.
+        # If the file is empty, the assignment raises a ValueError, because there is no header line.
         header, *lines = read_whole(Path(text)).decode("utf-8-sig").splitlines()
         if header.replace(" ", "") != WEIGHT_MAP_HEADER:
             raise ValueError(f"the columns are {header!r}")
@@ -137,31 +142,32 @@ def read_goal(text: str) -> Goal:
 
 
 DEFAULT_PROBE = Circle(1.0)
-"""Default probe of a design case, mm."""
+"""Default probe of a design case, which has a radius of 1 mm."""
 
 
 @dataclass(frozen=True)
 class DesignCase:
-    """Requirements of a design.
+    """Requirements of an electrode layout that is to be designed.
 
     Attributes:
-        sensor: Sensor with the film, its coefficients and readout, and the electrodes that may be kept.
-        electrodes: Number of electrodes, including those that are kept.
+        sensor: Sensor with the film, its piezoelectric coefficients and readout, and the electrodes that may be kept.
+        electrodes: Number of electrodes of the new layout, including the kept electrodes.
         radius: Largest distance of a press from the centre of the film, mm.
-        goal: Quantity that is minimised.
+        goal: Quantity that the design minimises.
         keep: Names of the electrodes of the sensor that keep their positions.
-        probe: Circular probe.
+        probe: Circular probe that presses the film.
         force: Force of the presses, N.
         noise: Noise of the readings.
         nuisances: Standard deviations of the parameters that are not known exactly.
         side: Side of the new squares, mm; None for the side of the squares of the sensor.
-        gap: Smallest distance between two electrodes along x or along y, mm.
-        rim: Smallest distance of an electrode from the rim of the film, mm.
+        gap: Smallest allowed gap between two electrodes, mm. It is sufficient if the gap along x or the gap along y is
+            large enough.
+        rim: Smallest allowed distance of an electrode from the rim of the film, mm.
         seed: Seed of the random layouts from which the search starts.
 
     Raises:
-        InputError: If a number is out of range, or all electrodes are kept.
-        SceneError: If the film cannot be pressed as required.
+        InputError: If a number is out of range, or no electrode is left to be placed.
+        SceneError: If a press within the radius cannot exist.
         SensorError: If a kept electrode does not exist.
     """
 
@@ -180,10 +186,12 @@ class DesignCase:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check that the electrodes can be placed.
+        """Check the requirements.
 
         Raises:
-            InputError: If a value is not allowed, or the kept electrodes are not part of the sensor.
+            InputError: If a value is not allowed, or the kept electrodes do not satisfy the rules.
+            SceneError: If a press within the radius cannot exist.
+            SensorError: If a kept electrode does not exist.
         """
         if not MIN_ELECTRODES <= self.electrodes <= MAX_ELECTRODES:
             raise InputError(
@@ -204,13 +212,14 @@ class DesignCase:
         self._check_kept_electrodes()
 
     def _check_kept_electrodes(self) -> None:
-        """Check that the kept electrodes exist, leave room for a new one, and fit to the new squares.
+        """Raise an error if the kept electrodes do not satisfy the rules for kept electrodes.
 
-        Kept electrodes must be at their nominal positions. With the readout 'edge', the new squares must have the same
-        side as the kept squares.
+        The kept electrodes must exist and must be at their nominal positions. At least one electrode must be new. With
+        the readout 'edge', all squares must have the same side.
 
         Raises:
-            InputError: If the kept electrodes do not satisfy these rules.
+            InputError: If a rule is violated.
+            SensorError: If a kept electrode does not exist.
         """
         if len(set(self.keep)) < len(self.keep):
             raise InputError(f"keep: expected different names, got {', '.join(self.keep)}")
@@ -226,7 +235,7 @@ class DesignCase:
         for electrode in self.kept_electrodes:
             lower_left, lower_right, *_ = electrode.corners
             side = lower_right[0] - lower_left[0]
-            if electrode.square and abs(side - self.square_side) > 1e-6:
+            if electrode.square and abs(side - self.square_side) > 1e-6:  # allows for rounding errors
                 raise InputError(
                     f"side: with the readout 'edge' all squares have one side, got {self.square_side:g} mm"
                 )
@@ -235,8 +244,8 @@ class DesignCase:
     def square_side(self) -> float:
         """Side of the new squares, mm.
 
-        If the side is not given, it is the side of the first square of the sensor, or `DEFAULT_SIDE` if the sensor has
-        no square.
+        If the attribute `side` is None, the new squares have the side of the first square of the sensor. If the sensor
+        has no square, the side of the new squares is `DEFAULT_SIDE`.
         """
         if self.side is not None:
             return float(self.side)
@@ -253,7 +262,7 @@ class DesignCase:
 
     @property
     def new_count(self) -> int:
-        """Number of electrodes to place."""
+        """Number of new electrodes, whose positions the design chooses."""
         return self.electrodes - len(self.keep)
 
     @property
@@ -263,34 +272,41 @@ class DesignCase:
 
     @property
     def search_presses(self) -> Array:
-        """Positions of the presses of the exchange, shape (n, 2), mm."""
-        z = self.radius * lattice(MAX_SEARCH_PRESSES)
-        return np.stack([z.real, z.imag], axis=1)
+        """Positions (x, y) of the presses for which the exchange evaluates a layout, shape (n, 2), mm."""
+        complex_positions = self.radius * lattice(MAX_SEARCH_PRESSES)  # x + iy
+        return np.stack([complex_positions.real, complex_positions.imag], axis=1)
 
     @property
     def fine_grid(self) -> Array:
-        """Positions of presses on a fine grid, shape (n, 2), mm.
+        """Positions (x, y) of presses on a fine grid, shape (n, 2), mm.
 
-        A coarse grid misses the largest error, which occurs mostly beside an electrode.
+        The grid is fine because the largest position error mostly occurs beside an electrode, within a small region.
         """
         return square_grid(self.radius, self.radius / FINE_GRID_STEPS)
 
     def weights(self, presses: Array) -> Array:
-        """Return the weights of presses in the minimised quantity, shape (n,), for positions of shape (n, 2), mm."""
+        """Return the weight of each press in the minimised quantity.
+
+        Args:
+            presses: Positions (x, y), shape (n, 2), mm.
+
+        Returns:
+            Weights, shape (n,), dimensionless. All weights are 1 if the goal is not a weight map.
+        """
         return self.goal.weigh(presses) if isinstance(self.goal, WeightMap) else np.ones(len(presses))
 
     def clearance(self, positions: Array) -> Array:
-        """Compute by how much single squares satisfy the distance rules.
+        """Compute the margins with which single squares satisfy the distance rules.
 
-        A square must have the distance `rim` from the rim of the film, and the distance `gap` from the bounding boxes
-        of the kept electrodes.
+        A square must have at least the distance `rim` from the rim of the film, and at least the gap `gap` to the
+        bounding boxes of the kept electrodes.
 
         Args:
-            positions: Centres of the squares, shape (n, 2), mm.
+            positions: Centres (x, y) of the squares, shape (n, 2), mm.
 
         Returns:
-            Smallest difference between an actual and a required distance, shape (n,), mm; negative if a rule is
-            violated.
+            Smallest margin of each square, which is an actual distance minus a required distance, shape (n,), mm. It is
+            negative if the square violates a rule.
         """
         # The corner that is farthest from the centre of the film determines the distance from the rim.
         half_side = 0.5 * self.square_side
@@ -300,56 +316,62 @@ class DesignCase:
 
         for electrode in self.kept_electrodes:
             lower_left_corners, upper_right_corners = electrode.boxes
-            for low, high in zip(lower_left_corners, upper_right_corners, strict=True):
-                # Gaps along x and y, shape (n, 2). A gap is negative if square and box overlap along this axis.
-                # One of the gaps must be large enough, so the larger gap counts.
-                axis_gaps = np.maximum(low - positions, positions - high) - half_side
+            for lower_left, upper_right in zip(lower_left_corners, upper_right_corners, strict=True):
+                # Compute the gaps along x and y, shape (n, 2). A gap is negative if the square and the box overlap
+                # along this axis. It is sufficient if one gap is large enough, so the larger gap counts.
+                axis_gaps = np.maximum(lower_left - positions, positions - upper_right) - half_side
                 clearances.append(axis_gaps.max(axis=1) - self.gap)
         return np.asarray(np.min(clearances, axis=0))
 
     def pair_clearance(self, positions: Array, others: Array) -> Array:
-        """Compute by how much the distances between pairs of new squares exceed the required distance.
+        """Compute the margins with which pairs of new squares satisfy the rule for the gap between two electrodes.
 
         Args:
-            positions: Centres of the first squares, shape (n, 2), mm.
-            others: Centres of the second squares, shape (m, 2), mm.
+            positions: Centres (x, y) of the first squares, shape (n, 2), mm.
+            others: Centres (x, y) of the second squares, shape (m, 2), mm.
 
         Returns:
-            Excess distance, shape (n, m), mm; negative if the rule is violated.
+            Actual gap minus required gap for each pair, shape (n, m), mm. It is negative if a pair violates the rule.
         """
-        # The gap between two squares along an axis is the distance of their centres along this axis minus one side.
-        # The rule must be satisfied along x or along y, so the larger distance counts.
+        # The gap between two squares along an axis is the distance of their centres along this axis, minus one side. It
+        # is sufficient if the gap along x or the gap along y is large enough, so the larger distance counts.
         distance = np.abs(positions[:, None] - others).max(axis=2)
         return np.asarray(distance - self.square_side - self.gap)
 
     def all_clearances(self, positions: Array) -> Array:
-        """Compute the excess distances of all rules for a layout, shape (n + n (n - 1) / 2,), mm.
+        """Compute the margins with which a layout satisfies all distance rules.
 
         Args:
-            positions: Centres of the new squares, shape (n, 2), mm.
+            positions: Centres (x, y) of the new squares, shape (n, 2), mm.
+
+        Returns:
+            The margin of each square, followed by the margin of each pair of squares, shape (n + n (n - 1) / 2,), mm.
+            A margin is negative if a rule is violated.
         """
         pairs = np.triu_indices(len(positions), 1)
         return np.concatenate([self.clearance(positions), self.pair_clearance(positions, positions)[pairs]])
 
     def layout(self, positions: Array) -> Sensor:
-        """Create the sensor with new squares and the kept electrodes. The new squares are named anticlockwise.
+        """Create the sensor that has the kept electrodes and new squares at given positions.
+
+        The new squares get their names in anticlockwise order, beginning at the x axis.
 
         Args:
-            positions: Centres of the new squares, shape (n, 2), mm.
+            positions: Centres (x, y) of the new squares, shape (n, 2), mm.
         """
         angle = np.arctan2(positions[:, 1], positions[:, 0]) % (2.0 * np.pi)
         anticlockwise = positions[np.argsort(angle)]
         unused_names = [name for name in NAMES if name not in self.keep]
         squares = [
             Electrode.of_square(name, (x, y), self.square_side)
-            for name, (x, y) in zip(unused_names, anticlockwise.tolist(), strict=False)  # some names remain unused
+            for name, (x, y) in zip(unused_names, anticlockwise.tolist(), strict=False)  # more names than squares
         ]
         electrodes = tuple(sorted((*self.kept_electrodes, *squares), key=lambda electrode: electrode.name))
         name = f"{self.sensor.name}-{self.electrodes}-over-{self.radius:g}mm"
         return replace(self.sensor, name=name, electrodes=electrodes, calibration=Calibration())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all parameters of the case except the sensor and the weights, as values for JSON."""
+        """Return the requirements as a dictionary for JSON, without the sensor and without the table of weights."""
         return {
             "electrodes": self.electrodes,
             "radius_mm": self.radius,
@@ -371,6 +393,15 @@ class DesignCase:
 
 
 def _check_length(name: str, value: float, minimum: float) -> None:
-    """Raise an InputError if a length (mm) is not finite, or if it is smaller than the minimum (mm)."""
+    """Raise an error if a length is not finite or is smaller than a minimum.
+
+    Args:
+        name: Name of the length in the error message.
+        value: Length to be checked, mm.
+        minimum: Smallest allowed length, mm.
+
+    Raises:
+        InputError: If the length is not allowed.
+    """
     if not (np.isfinite(value) and value >= minimum):
         raise InputError(f"{name}: expected a length from {minimum:g} mm, got {value} mm")

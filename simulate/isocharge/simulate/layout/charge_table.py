@@ -1,14 +1,15 @@
-"""Table of the charges of electrodes anywhere on the film, and of their derivatives with respect to the parameters.
+"""Table from which the charges of electrodes at any position on the film are computed.
 
-The parameters are the contact and the nuisances. The equilibrium of a round film under a press depends on the distance
-of the press from the centre, but not on the electrodes. A conformal map transforms the circle of the probe into the
-circle |z| = rho (`mesh.placement`). In the coordinates of this map, the stress is smooth except for a kink on the
-circle.
+The table also contains the derivatives of the charges with respect to the position and the force of the press, the
+probe radius and the pretension. The equilibrium of a round film under a press depends on the distance of the press from
+the centre, but not on the electrodes. A conformal map (see `mesh.placement`) transforms the edge of the probe into a
+circle |z| = rho. In the coordinate z of the conformal map, the stress is smooth except for a kink on the circle.
 
-The equilibrium is solved at Chebyshev nodes in `distance_coordinate`. The stress and its finite differences with
-respect to the parameters are sampled on a polar grid in z. The rows of the grid are equally spaced in |z| within the
-circle, and in ln|z| between the circle and the rim. The table is interpolated with polynomials in the distance
-coordinate, and with local cubic polynomials on the grid. The charge of an electrode is its area times the mean charge
+The equilibrium is solved at a few distances from the centre, which are Chebyshev nodes in `distance_coordinate`. The
+stress and its derivatives, which are computed by finite differences, are stored on a polar grid in z. The rows of the
+grid are equally spaced in |z| within the circle, and equally spaced in ln|z| between the circle and the rim. Between
+the solved distances, the table is interpolated by polynomials in the distance coordinate. Between the nodes of the
+grid, the table is interpolated by local cubic polynomials. The charge of an electrode is its area times the mean charge
 per area.
 """
 
@@ -40,26 +41,29 @@ from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
 
 COLUMNS = ("charge", "x", "y", "ln force", "probe radius", "pretension")
-"""Columns of a row: the charge, pC, and its derivatives with respect to x and y (pC/mm), ln F (pC), the probe radius
-(pC/mm) and the pretension (pC/MPa)."""
+"""Columns of a row, which contains the results for one press and one electrode.
+
+The columns are the charge (pC) and its derivatives with respect to x and y (pC/mm), ln F (pC), the probe radius (pC/mm)
+and the pretension (pC/MPa).
+"""
 
 INNER_ROWS = 10
-"""Number of rows of the grid within the circle of the probe."""
+"""Number of rows of the polar grid within the footprint of the probe."""
 
 OUTER_ROWS = 49
-"""Number of rows of the grid between the circle of the probe and the rim."""
+"""Number of rows of the polar grid between the edge of the probe and the rim of the film."""
 
 ANGLES = 64
-"""Number of columns of the grid, at equal angles."""
+"""Number of columns of the polar grid, at equal angles."""
 
 MARGIN = 0.03
-"""Width of the gap of the grid on either side of the circle, in units of rho, dimensionless.
+"""Width of the gap of the polar grid on either side of the circle |z| = rho, in units of rho, dimensionless.
 
-In the gap, the finite differences would be wrong because of the kink of the stress.
+The gap contains no nodes, because the finite differences would be wrong there: the stress has a kink on the circle.
 """
 
 RELATIVE_STEP = 0.02
-"""Step of the finite differences with respect to position and probe radius, in units of the probe radius."""
+"""Step of the finite differences with respect to the position and the probe radius, in units of the probe radius."""
 
 LOG_FORCE_STEP = 0.05
 """Step of the finite differences with respect to ln F, dimensionless."""
@@ -68,40 +72,43 @@ PRETENSION_STEP = 0.1
 """Step of the finite differences with respect to the pretension, MPa."""
 
 WIDE_RADIUS = 0.25
-"""Radius of the table above which more distances are solved, in film radii."""
+"""Largest distance of a press in the table above which more distances are solved, in film radii, dimensionless."""
 
 N_DISTANCES = 5
-"""Number of distances that are solved for a radius of the table up to `WIDE_RADIUS`."""
+"""Number of solved distances if the largest distance of a press is at most `WIDE_RADIUS`."""
 
 N_DISTANCES_WIDE = 8
-"""Number of distances that are solved for a radius of the table above `WIDE_RADIUS`."""
+"""Number of solved distances if the largest distance of a press is above `WIDE_RADIUS`."""
 
 GAUSS_RULES = ((1.4, 10), (2.5, 4), (np.inf, 2))
-"""Integration rules of squares.
+"""Integration rules of squares in ascending order of the distance between the square and the press.
 
-Each pair consists of the largest distance of a square from a press and the number of Gauss points per side up to this
-distance. The unit of the distances is the sum of half the diagonal of the square and the probe radius. The kink of the
-stress crosses only squares within the first distance.
+Each rule consists of the largest distance at which it is used, and of the number of Gauss points per side of a square.
+The unit of the distances is the sum of half the diagonal of the square and the probe radius. The kink of the stress
+crosses only squares to which the first rule applies.
 """
 
 PRESS_CHUNK = 256
-"""Number of presses that are evaluated at once, which limits the memory to about 100 MB."""
+"""Number of presses that are evaluated at once, which limits the required memory to about 100 MB."""
 
 POINT_CHUNK = 20_000
-"""Number of points that are evaluated at once, which limits the memory to about 100 MB."""
+"""Number of integration points that are evaluated at once, which limits the required memory to about 100 MB."""
 
 
 @dataclass(frozen=True)
 class ChargeTable:
-    """Charges of electrodes under a given probe and force, for presses anywhere within a disk.
+    """Table from which the charges of electrodes of any shape are computed, for presses with one probe and one force.
+
+    The presses may lie anywhere in a disk around the centre of the film.
 
     Attributes:
         film_radius: Radius of the film, mm.
-        probe: Probe.
+        probe: Circular probe that presses the film.
         piezo: Piezoelectric coefficients d31 and d32, pC/N.
-        distance: Distances of the solved presses from the centre, shape (n_distance,), mm.
-        stress: Stress (s11, s22, s12), MPa, and its derivatives in the frame of the press, shape (n_distance * 3,
-            n_node * 6). The numbers have single precision.
+        distance: Distances of the solved presses from the centre of the film, shape (n_distance,), mm.
+        stress: Stress (s11, s22, s12) in MPa and its derivatives in the frame of the press, at the nodes of the polar
+            grid. The array has the shape (n_distance * 3, n_node * 6) and single precision. The first axis contains the
+            stress components of each distance. The second axis contains the `COLUMNS` of each node.
     """
 
     film_radius: float
@@ -114,19 +121,19 @@ class ChargeTable:
     def solve(
         cls, sensor: Sensor, probe: Circle, force: float, radius: float, executor: Executor | None = None
     ) -> "ChargeTable":
-        """Solve the presses of the table.
+        """Create a table by solving presses at a few distances from the centre.
 
         Args:
-            sensor: Sensor with the film, the coefficients and the surface of the readout.
-            probe: Probe.
+            sensor: Sensor with the film, its piezoelectric coefficients and the surface at which the stress is read.
+            probe: Circular probe that presses the film.
             force: Force of the presses, N.
             radius: Largest distance of a press from the centre, mm.
-            executor: Executor that runs the solves; this process if absent.
+            executor: Executor that runs the solves; None for this process.
 
         Raises:
-            SolveError: If an equilibrium is not reached.
+            SolveError: If a press has no equilibrium.
         """
-        # All presses have the mesh that the outermost press needs.
+        # All presses are solved with the mesh that the outermost press needs.
         film = sensor.film
         basic_settings = SolveSettings(theory=theory_for(sensor, probe, (force, force)), layer=layer_for(film, force))
         outermost_press = (radius, 0.0)
@@ -141,46 +148,48 @@ class ChargeTable:
         solve = partial(_stress_at, film, sensor.surface, probe, force, settings)
         solved = list(track(in_order(executor, solve, distance.tolist()), "solving the film", n_distance))
 
-        # The axes (distance, column of a row, node, stress component) become (distance, component, node, column).
+        # The axes (distance, column, node, stress component) become (distance, stress component, node, column).
         component_before_node = np.stack(solved).transpose(0, 3, 2, 1)
         stress = component_before_node.reshape(3 * n_distance, -1).astype(np.float32)
         return cls(film.radius, probe, (sensor.piezo.d31, sensor.piezo.d32), distance, stress)
 
     def rows(self, presses: Array, centres: Array, side: float, others: tuple[Electrode, ...] = ()) -> Array:
-        """Compute the charges of squares and of other electrodes, and the derivatives of these charges.
+        """Compute the charges of square and other electrodes under presses, and the derivatives of these charges.
 
-        The charges are means over the areas of the electrodes, regardless of the readout of the sensor.
+        The charge per area is averaged over the area of an electrode, even if the sensor has the edge readout.
 
         Args:
             presses: Positions (x, y) of the presses, shape (n, 2), mm.
-            centres: Centres of the squares, shape (m, 2), mm.
+            centres: Centres (x, y) of the squares, shape (m, 2), mm.
             side: Side of the squares, mm.
             others: Further electrodes of any shape.
 
         Returns:
-            Rows with the columns `COLUMNS`, shape (n, m + len(others), 6), with the squares first.
+            One row with the columns `COLUMNS` for each press and electrode, shape (n, m + len(others), 6). The squares
+            precede the other electrodes.
         """
         chunks = []
         for start in range(0, len(presses), PRESS_CHUNK):
             pressed = _PressedFilm.of(self, presses[start : start + PRESS_CHUNK])
-            square_rows = pressed.squares(centres, side)
-            other_rows = [pressed.electrode(electrode) for electrode in others]
+            square_rows = pressed.square_rows(centres, side)
+            other_rows = [pressed.electrode_rows(electrode) for electrode in others]
             chunks.append(np.concatenate([square_rows, *other_rows], axis=1))
         return np.concatenate(chunks)
 
 
 @dataclass(frozen=True)
 class _PressedFilm:
-    """Charge per area on the polar grids of several presses.
+    """Charge per area under several presses, at the nodes of the polar grid of each press.
 
     Attributes:
-        table: Charge table.
+        table: Charge table from which the charges per area were interpolated.
         presses: Positions x + iy of the presses, shape (n,), mm.
         direction: Unit vector from the centre to each press as a complex number, shape (n,).
-        pole: Poles of the conformal maps, shape (n,).
-        rho: Radii of the circle of the probe in the coordinates of the conformal maps, shape (n,).
-        density: Charge per area, pC/mm^2, and its derivatives on the grids, with derivatives with respect to the
-            position in the frame of the press, shape (n * n_node, 6).
+        pole: Parameter of the conformal map of each press, shape (n,), dimensionless.
+        rho: Radius of the circle to which the conformal map of each press maps the edge of the probe, shape (n,),
+            dimensionless.
+        density: Charge per area (pC/mm^2) and its derivatives with the columns `COLUMNS`, shape (n * n_node, 6). The
+            derivatives with respect to the position are along and across the direction of the press.
     """
 
     table: ChargeTable
@@ -192,18 +201,18 @@ class _PressedFilm:
 
     @classmethod
     def of(cls, table: ChargeTable, presses: Array) -> "_PressedFilm":
-        """Interpolate the table for presses.
+        """Interpolate the charges per area under several presses from a charge table.
 
         Args:
-            table: Charge table.
+            table: Charge table that covers the presses.
             presses: Positions (x, y) of the presses, shape (n, 2), mm.
         """
         position = presses @ np.array([1.0, 1j])  # x + iy
         direction = np.exp(1j * np.angle(position))
         relative_distance = np.abs(position) / table.film_radius
 
-        # The stress is interpolated over the distance, and its components are multiplied by the piezoelectric
-        # coefficients and added. One matrix product does both.
+        # The stress is interpolated between the distances of the table. Its components are multiplied by the
+        # piezoelectric coefficients and added. One matrix product performs both steps.
         nodes = distance_coordinate(table.distance / table.film_radius)
         coordinate = distance_coordinate(relative_distance)
         distance_weights = lagrange_values(nodes, barycentric_weights(nodes), coordinate)
@@ -212,22 +221,22 @@ class _PressedFilm:
         flat_weights = weights.reshape(len(position), -1).astype(np.float32)
         density = (flat_weights @ table.stress).reshape(-1, len(COLUMNS))
 
-        # Conformal map of each press, which transforms the circle of the probe into the circle |z| = rho
+        # Compute the conformal map of each press, which transforms the edge of the probe into the circle |z| = rho.
         relative_radius = np.full(len(position), table.probe.radius / table.film_radius)
         pole, rho = automorphism_onto(relative_distance, relative_radius)
         return cls(table, position, direction, pole, rho, density)
 
-    def squares(self, centres: Array, side: float) -> Array:
-        """Compute the rows of all presses and squares.
+    def square_rows(self, centres: Array, side: float) -> Array:
+        """Compute the charges of squares and their derivatives for all presses.
 
         Squares near a press are integrated with more Gauss points than distant squares; see `GAUSS_RULES`.
 
         Args:
-            centres: Centres of the squares, shape (m, 2), mm.
+            centres: Centres (x, y) of the squares, shape (m, 2), mm.
             side: Side of the squares, mm.
 
         Returns:
-            Rows, shape (n, m, 6).
+            Rows with the columns `COLUMNS`, shape (n, m, 6).
         """
         complex_centres = centres @ np.array([1.0, 1j])  # x + iy
         distance = np.abs(complex_centres - self.presses[:, None])  # shape (n, m)
@@ -239,21 +248,21 @@ class _PressedFilm:
         chosen_rule = np.searchsorted([largest_distance for largest_distance, _ in GAUSS_RULES], relative_distance)
         rows = np.empty((*distance.shape, len(COLUMNS)))
         for rule_index, (_, points_per_side) in enumerate(GAUSS_RULES):
-            unit_points, weights = gauss_square(points_per_side)
+            unit_points, weights = gauss_square(points_per_side)  # on the unit square, with weights that sum to 1
             press_index, square_index = np.nonzero(chosen_rule == rule_index)
             chunk_size = POINT_CHUNK // len(unit_points)
             for start in range(0, len(square_index), chunk_size):
                 press_chunk = press_index[start : start + chunk_size]
                 square_chunk = square_index[start : start + chunk_size]
                 points = centres[square_chunk, None] + side * (unit_points - 0.5)
-                rows[press_chunk, square_chunk] = side**2 * self.means(press_chunk, points, weights)
+                rows[press_chunk, square_chunk] = side**2 * self.mean_rows(press_chunk, points, weights)
         return rows
 
-    def electrode(self, electrode: Electrode) -> Array:
-        """Compute the charge and its derivatives for one electrode of any shape and all presses.
+    def electrode_rows(self, electrode: Electrode) -> Array:
+        """Compute the charge of one electrode of any shape, and the derivatives of this charge, for all presses.
 
         Args:
-            electrode: Electrode, at its nominal position.
+            electrode: Electrode at its nominal position.
 
         Returns:
             Rows with the columns `COLUMNS`, shape (n, 1, 6).
@@ -265,21 +274,21 @@ class _PressedFilm:
         means = []
         for press_chunk in np.array_split(np.arange(len(self.presses)), n_chunk):
             chunk_points = np.broadcast_to(points, (len(press_chunk), *points.shape))
-            means.append(self.means(press_chunk, chunk_points, weights))
+            means.append(self.mean_rows(press_chunk, chunk_points, weights))
         return electrode.area * np.concatenate(means)[:, None]
 
-    def means(self, press_index: Integers, points: Array, weights: Array) -> Array:
-        """Compute weighted means of the charge per area and its derivatives.
+    def mean_rows(self, press_index: Integers, points: Array, weights: Array) -> Array:
+        """Compute weighted means of the charge per area and of its derivatives over points on the film.
 
         The values at the points are interpolated from the polar grid of each press.
 
         Args:
-            press_index: Indices of the presses, shape (k,).
-            points: Points on the film for each press, shape (k, n_point, 2), mm.
+            press_index: Index of the press to which each mean belongs, shape (k,).
+            points: Points (x, y) over which each mean is computed, shape (k, n_point, 2), mm.
             weights: Weights of the points, which add up to one, shape (n_point,).
 
         Returns:
-            Means with the columns `COLUMNS` per area, shape (k, 6).
+            Means with the columns `COLUMNS`, divided by the area, shape (k, 6).
         """
         n_mean = len(press_index)
         direction = self.direction[press_index]
@@ -287,7 +296,7 @@ class _PressedFilm:
         points_in_press_frame = complex_points / direction[:, None]
         nodes, node_weights = self._nodes_around(press_index, points_in_press_frame, weights)
 
-        # Each mean is a weighted sum over the nodes of the grid around all its points.
+        # Each mean is a weighted sum over the nodes of the grid that surround its points.
         flat_weights = node_weights.reshape(n_mean, 1, -1).astype(np.float32)
         node_density = self.density[nodes.reshape(n_mean, -1)]  # shape (k, n_point * n_row * n_column, 6)
         mean: Array = np.matmul(flat_weights, node_density)[:, 0].astype(float)
@@ -301,22 +310,25 @@ class _PressedFilm:
         return mean
 
     def _nodes_around(self, press_index: Integers, points: Complexes, point_weights: Array) -> tuple[Integers, Array]:
-        """Return the nodes of the polar grids around points, and their weights for cubic interpolation.
+        """Find the nodes of the polar grids that surround given points, and their weights for cubic interpolation.
 
         Args:
-            press_index: Indices of the presses, shape (k,).
+            press_index: Index of the press to whose grid each row of points belongs, shape (k,).
             points: Points x + iy in the frame of the press, shape (k, n_point), mm.
             point_weights: Weights of the points, by which the weights of the nodes are multiplied, shape (n_point,).
 
         Returns:
-            Indices into `density`, and weights, each of shape (k, n_point, n_row, n_column).
+            Indices of the nodes in `density`, and their weights, each of shape (k, n_point, n_row, n_column), where
+            n_row and n_column are 4.
         """
-        # Nearest rows of each point, shape (k, n_point, n_row), and columns, shape (k, n_point, n_column), with weights
+        # Find the four nearest rows and the four nearest columns of each point, and their weights, shape (k, n_point,
+        # 4).
         row, column = self._grid_coordinates(press_index, points)
         rows, row_weights = _row_weights(row)
         columns, column_weights = cubic_weights(column, ANGLES, periodic=True)
 
-        # Combine each row with each column. The grids of all presses follow each other in `density`, row by row.
+        # Combine each row with each column. The array `density` contains the grid of one press after the other, and
+        # each grid row by row.
         rows_per_press = INNER_ROWS + OUTER_ROWS
         first_row_of_press = press_index[:, None, None, None] * rows_per_press
         nodes = (first_row_of_press + rows[..., :, None]) * ANGLES + columns[..., None, :]
@@ -326,24 +338,26 @@ class _PressedFilm:
     def _grid_coordinates(self, press_index: Integers, points: Complexes) -> tuple[Array, Array]:
         """Compute the fractional rows and columns of points on the polar grids.
 
-        Points beyond the rim are moved to the rim.
+        A fractional row of 2.5, for example, lies in the middle between the rows 2 and 3. Points beyond the rim are
+        moved to the rim.
 
         Args:
-            press_index: Indices of the presses, shape (k,).
+            press_index: Index of the press to whose grid each row of points belongs, shape (k,).
             points: Points x + iy in the frame of the press, shape (k, n_point), mm.
 
         Returns:
             Fractional rows and columns, each of shape (k, n_point).
         """
-        # Coordinate z of the conformal map of the press, which maps the probe onto the disk |z| <= rho
+        # Compute the coordinate z of the conformal map of the press, which maps the footprint onto the disk |z| <= rho.
         pole = self.pole[press_index, None]
         rho = self.rho[press_index, None]
         relative_points = points / self.table.film_radius
-        unit_points = relative_points / np.maximum(np.abs(relative_points), 1.0)  # within the rim
+        unit_points = relative_points / np.maximum(np.abs(relative_points), 1.0)  # moves points beyond the rim
         z = (unit_points - pole) / (1.0 - pole * unit_points)
         radius = np.abs(z)
 
-        # Rows are equally spaced in |z| within the circle, and in ln|z| outside; see `_grid_points`.
+        # Invert the formulas of `_grid_points`: the rows are equally spaced in |z| within the circle |z| = rho, and in
+        # ln|z| outside.
         inner_row = radius / (rho * (1.0 - MARGIN)) * (INNER_ROWS - 1)
         outer_fraction = 1.0 - np.log(np.maximum(radius, rho)) / np.log(rho * (1.0 + MARGIN))
         outer_row = INNER_ROWS + outer_fraction * (OUTER_ROWS - 1)
@@ -354,6 +368,8 @@ class _PressedFilm:
 
 def _piezo_in_press_frame(piezo: tuple[float, float], direction: Complexes) -> Array:
     """Rotate the piezoelectric coefficients from the axes of the film into the frame of each press.
+
+    Axis 1 of the frame of a press is the direction from the centre of the film to the press.
 
     Args:
         piezo: Coefficients d31 and d32, pC/N.
@@ -373,16 +389,17 @@ def _piezo_in_press_frame(piezo: tuple[float, float], direction: Complexes) -> A
 
 
 def _row_weights(row: Array) -> tuple[Integers, Array]:
-    """Compute the rows and weights of cubic interpolation, separately on both sides of the circle of the probe.
+    """Find the rows of the polar grid between which values are interpolated, and the weights of these rows.
 
-    The inner rows come first. Fractional rows up to half a row beyond the last inner row are interpolated from inner
-    rows only, and all others from outer rows only.
+    The interpolation does not cross the edge of the probe, where the stress has a kink. Fractional rows up to half a
+    row beyond the last inner row are interpolated from inner rows only. All other fractional rows are interpolated from
+    outer rows only.
 
     Args:
-        row: Fractional rows, any shape.
+        row: Fractional rows, any shape. The inner rows have smaller numbers than the outer rows.
 
     Returns:
-        Indices of the four rows and their weights, each of shape (..., 4).
+        Indices of four rows for each fractional row, and the weights of these rows, each of shape (..., 4).
     """
     is_inner = (row < INNER_ROWS - 0.5)[..., None]
     inner_rows, inner_weights = cubic_weights(row, INNER_ROWS)
@@ -395,20 +412,20 @@ def _row_weights(row: Array) -> tuple[Integers, Array]:
 def _stress_at(
     film: Film, surface: Surface, probe: Circle, force: float, settings: SolveSettings, distance: float
 ) -> Array:
-    """Solve a press on the positive x axis, and compute the stress on the grid and its derivatives.
+    """Compute the stress and its derivatives on the polar grid of a press on the positive x axis.
 
     The derivatives are computed by finite differences between solved presses.
 
     Args:
-        film: Film.
-        surface: Surface at which the stress is read.
-        probe: Probe.
-        force: Force, N.
-        settings: Settings of the solver.
+        film: Film that is pressed.
+        surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
+        probe: Circular probe that presses the film.
+        force: Force of the press, N.
+        settings: Theory and mesh of the solves.
         distance: Distance of the press from the centre, mm.
 
     Returns:
-        Stress (s11, s22, s12), MPa, and its derivatives in the order of `COLUMNS`, shape (6, n_node, 3).
+        Stress (s11, s22, s12) in MPa, and its derivatives in the order of `COLUMNS`, shape (6, n_node, 3).
     """
     points = _grid_points(film.radius, probe.radius, distance)
     unchanged_press = press(film, probe, (distance, 0.0), force, settings)
@@ -420,9 +437,17 @@ def _stress_at(
         radius_change: float = 0.0,
         pretension_change: float = 0.0,
     ) -> Array:
-        """Return the stress on the grid after changes of some quantities, shape (n_node, 3), MPa.
+        """Solve a press that differs from the unchanged press, and return its stress on the grid.
 
-        The solve starts from the unchanged press.
+        Args:
+            x_change: Change of the position along x, mm.
+            y_change: Change of the position along y, mm.
+            log_force_change: Change of the logarithm of the force, dimensionless.
+            radius_change: Change of the probe radius, mm.
+            pretension_change: Change of the pretension, MPa.
+
+        Returns:
+            Stress (s11, s22, s12), shape (n_node, 3), MPa.
         """
         changed_film = replace(film, pretension=film.pretension + pretension_change)
         changed_probe = Circle(probe.radius + radius_change)
@@ -432,12 +457,18 @@ def _stress_at(
         return touch_stress(changed_press, points, surface)
 
     def central_difference(change: str, step: float) -> Array:
-        """Return the derivative of the stress with respect to a change, which is an argument of `changed_stress`."""
+        """Return the derivative of the stress with respect to one argument of `changed_stress`, shape (n_node, 3).
+
+        Args:
+            change: Name of the argument.
+            step: Step of the central difference, in the unit of the argument.
+        """
         return (changed_stress(**{change: step}) - changed_stress(**{change: -step})) / (2.0 * step)
 
     stress = touch_stress(unchanged_press, points, surface)
     length_step = RELATIVE_STEP * probe.radius
-    # The pretension may be zero and cannot become negative, so its difference is one-sided.
+
+    # The pretension may be zero and must not become negative, so its finite difference is one-sided.
     pretension_derivative = (changed_stress(pretension_change=PRETENSION_STEP) - stress) / PRETENSION_STEP
     return np.stack(
         [
@@ -452,10 +483,11 @@ def _stress_at(
 
 
 def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Array:
-    """Compute the points of the grid of a press on the positive x axis.
+    """Compute the points of the polar grid of a press on the positive x axis.
 
-    The grid is polar in the coordinate z of a conformal map, which transforms the footprint into a circle about the
-    centre. The rows of the grid are equally spaced in |z| within the footprint, and in ln|z| outside.
+    The grid is polar in the coordinate z of a conformal map. The conformal map transforms the edge of the probe into a
+    circle |z| = rho around the centre. The rows of the grid are equally spaced in |z| within the circle, and equally
+    spaced in ln|z| outside the circle.
 
     Args:
         film_radius: Radius of the film, mm.
@@ -463,9 +495,9 @@ def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Ar
         distance: Distance of the press from the centre, mm.
 
     Returns:
-        Points (x, y), shape (n_node, 2), mm.
+        Points (x, y) on the film, row by row, shape (n_node, 2), mm.
     """
-    # Polar grid in the plane of z, with a small gap on both sides of the circle |z| = rho
+    # Create the grid in the plane of z, with a small gap on both sides of the circle |z| = rho.
     pole, rho = automorphism_onto(np.array(distance / film_radius), np.array(probe_radius / film_radius))
     inner_radii = rho * (1.0 - MARGIN) * np.linspace(0.0, 1.0, INNER_ROWS)
     outer_radii = (rho * (1.0 + MARGIN)) ** np.linspace(1.0, 0.0, OUTER_ROWS)
@@ -473,7 +505,8 @@ def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Ar
     directions = np.exp(2j * np.pi * np.arange(ANGLES) / ANGLES)
     z = radii[:, None] * directions
 
-    # Inverse of the conformal map z = (p - pole) / (1 - pole p)
+    # Map the grid onto the film by the inverse of the conformal map z = (p - pole) / (1 - pole p) of a point p. The
+    # last factor keeps the outermost points on the film despite rounding errors.
     unit_points = ((z + pole) / (1.0 + pole * z)).ravel()
-    points = film_radius * unit_points * (1.0 - 1e-12)  # the outermost points remain on the film despite round-off
+    points = film_radius * unit_points * (1.0 - 1e-12)
     return np.stack([points.real, points.imag], axis=1)

@@ -1,8 +1,8 @@
-"""Design of a layout: search of the electrode positions, and rejection of layouts with ambiguous charges."""
+"""Design of an electrode layout with small position errors, whose charges are not ambiguous."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,23 +24,24 @@ from isocharge.simulate.numerics.disk import Rings
 from isocharge.simulate.sensor.sensor import Sensor
 
 DECIMALS = 3
-"""Number of decimals to which positions in mm are rounded. It corresponds to one micrometre."""
+"""Number of decimals to which electrode positions in mm are rounded. Positions are therefore multiples of 1 um."""
 
 UNAMBIGUOUS = "no folds, no ambiguous pairs"
-"""Summary of a layout without folds and ambiguous pairs."""
+"""Summary of a layout that has neither folds nor ambiguous pairs."""
 
 NOT_SEARCHED = "folds and ambiguous pairs could not be looked for: the charges vary too quickly"
-"""Summary of a layout whose charges cannot be interpolated."""
+"""Summary of a layout whose charges cannot be interpolated accurately enough for the search."""
 
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """Lower limits of the position error of one layout. The limits are computed for the presses of a design case.
+    """Lower limits of the position errors of one layout, for presses on a square grid.
 
     Attributes:
-        presses: Positions of the presses on a square grid, shape (n, 2), mm.
-        noise_alone: Errors caused by the noise if there are no nuisances, shape (n,), mm.
-        with_nuisances: Errors with the nuisances of the case, shape (n,), mm.
+        presses: Positions (x, y) of the presses, shape (n, 2), mm.
+        noise_alone: Root mean square errors that the noise causes if all nuisance parameters are known, shape (n,), mm.
+        with_nuisances: Root mean square errors if the nuisance parameters of the design case are uncertain, shape (n,),
+            mm.
     """
 
     presses: Array
@@ -48,14 +49,18 @@ class ErrorMap:
     with_nuisances: Array
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
-        """Return the largest error, its position and the root mean square, without and with nuisances, for JSON."""
+        """Return the maximum and the root mean square of the errors without and with nuisances, for JSON."""
         return {
             "noise_alone": self._statistics(self.noise_alone),
             "with_nuisances": self._statistics(self.with_nuisances),
         }
 
     def _statistics(self, errors: Array) -> dict[str, Any]:
-        """Return the largest error, its root mean square and the position of the largest error, for JSON."""
+        """Return the largest error, its position, and the root mean square of all errors, for JSON.
+
+        Args:
+            errors: Error of each press, shape (n,), mm.
+        """
         return {
             "worst_mm": float(errors.max()),
             "rms_mm": float(np.sqrt(np.mean(errors**2))),
@@ -68,110 +73,127 @@ class Design:
     """Result of the design of a layout.
 
     Attributes:
-        case: Design case.
+        case: Requirements of the layout.
         sensor: Sensor with the new layout.
-        value: Quantity that the search minimised, for the new layout, mm.
+        minimised_error: Value of the minimised quantity for the new layout, mm. It is the largest error or the weighted
+            root mean square of the errors.
         summary: Sentence about folds and ambiguous pairs of the new layout over the default range of forces.
-        refused: Number of layouts with a smaller error that were rejected because they are ambiguous.
-        before: Errors of the initial sensor; None if it has fewer than three electrodes.
-        after: Errors of the new layout.
+        n_rejected: Number of layouts with a smaller error that were rejected because their charges are ambiguous.
+        errors_before: Errors of the initial sensor; None if it has fewer than three electrodes.
+        errors_after: Errors of the new layout.
     """
 
     case: DesignCase
     sensor: Sensor
-    value: float
+    minimised_error: float
     summary: str
-    refused: int
-    before: ErrorMap | None
-    after: ErrorMap
+    n_rejected: int
+    errors_before: ErrorMap | None
+    errors_after: ErrorMap
 
     @property
     def unambiguous(self) -> bool:
-        """Whether neither folds nor ambiguous pairs were found."""
+        """Whether the search found neither folds nor ambiguous pairs of the new layout."""
         return self.summary == UNAMBIGUOUS
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the case, the layout, the errors before and after, and the result of the checks, for JSON."""
+        """Return the case, the new layout, the errors of both layouts, and the result of the checks, for JSON."""
         return {
             "case": self.case.to_dict(),
             "sensor": self.sensor.name,
             "electrodes_mm": {
                 electrode.name: np.round(electrode.centre, DECIMALS).tolist() for electrode in self.sensor.electrodes
             },
-            "before": self.before.to_dict() if self.before else None,
-            "after": self.after.to_dict(),
+            "before": self.errors_before.to_dict() if self.errors_before else None,
+            "after": self.errors_after.to_dict(),
             "unambiguous": self.unambiguous,
             "folds_and_pairs": self.summary,
-            "refused": self.refused,
+            "refused": self.n_rejected,
         }
 
 
-def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
-    """Find the layout with the smallest position errors that has neither folds nor ambiguous pairs.
+class _CheckedLayout(NamedTuple):
+    """Refined layout that was searched for folds and ambiguous pairs.
 
-    Random layouts are improved on a grid, and the best layouts are refined. The refined layouts are checked in the
-    order of their errors. If all of them are ambiguous, the layout with the smallest error is returned.
+    Attributes:
+        sensor: Sensor with the layout.
+        error: Value of the minimised quantity, mm.
+        summary: Result of the search for folds and ambiguous pairs.
+    """
+
+    sensor: Sensor
+    error: float
+    summary: str
+
+
+def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
+    """Find the layout that has the smallest position errors among the layouts without folds and ambiguous pairs.
+
+    Random layouts are improved on a grid, and the best layouts are refined. In the order of their errors, the refined
+    layouts are then searched for folds and ambiguous pairs. The first layout without folds and ambiguous pairs is
+    returned. If every layout has folds or ambiguous pairs, the layout with the smallest error is returned.
 
     Args:
-        case: Design case.
-        executor: Executor that runs the solves and the refinements; this process if absent. The result does not depend
+        case: Requirements of the layout.
+        executor: Executor that runs the solves and the refinements; None for this process. The result does not depend
             on the executor.
 
     Returns:
-        The layout, its errors, and the errors of the initial sensor if it has at least three electrodes.
+        The layout and its errors, with the errors of the initial sensor if this sensor has at least three electrodes.
 
     Raises:
-        InputError: If the electrodes do not fit.
-        SolveError: If an equilibrium is not reached.
+        InputError: If the electrodes do not fit on the film.
+        SolveError: If a press has no equilibrium.
     """
     # Improve random layouts, and refine the best ones.
     grid, initial_layouts = random_layouts(case)
     table = ChargeTable.solve(case.sensor, case.probe, case.force, case.radius, executor)
     search = Search(case, table)
     optima = search.optima(grid, initial_layouts)
-    # A refined layout is an array of its error, followed by the coordinates of its squares.
+    # A refined layout is an array that contains its error, followed by the coordinates of its squares.
     refined_layouts = list(track(in_order(executor, search.refine, optima), "refining", len(optima)))
     refined_layouts.sort(key=lambda layout: layout[0])
 
-    # Check the layouts in the order of their errors, up to the first layout that is not ambiguous.
+    # Check the layouts in the order of their errors, up to the first layout that is not ambiguous. A layout cannot be
+    # checked if there is no accurate forward map.
     forward_map = _solve_forward_map(case, executor)
-    candidates: list[tuple[Sensor, float, str]] = []
+    checked_layouts: list[_CheckedLayout] = []
     for error, *coordinates in track(refined_layouts, "looking for folds and ambiguous pairs"):
-        centres = np.round(np.array(coordinates).reshape(-1, 2), DECIMALS)  # x and y of one square after the other
+        centres = np.round(np.array(coordinates).reshape(-1, 2), DECIMALS)  # the order is x1, y1, x2, y2, ...
         sensor = case.layout(centres)
         summary = NOT_SEARCHED
         if forward_map is not None:
             summary = ambiguities(case, ChargeSpline.of(replace(forward_map, sensor=sensor)))
-        candidates.append((sensor, float(error), summary))
+        checked_layouts.append(_CheckedLayout(sensor, float(error), summary))
         if summary == UNAMBIGUOUS:
             break
 
-    # If the last candidate is unambiguous, it is chosen, and the candidates before it are refused. Otherwise all
-    # candidates are ambiguous, and the candidate with the smallest error is chosen, which is the first one.
-    has_unambiguous_candidate = summary == UNAMBIGUOUS
-    if has_unambiguous_candidate:
-        n_refused = len(candidates) - 1
-        chosen = candidates[-1]
+    # Only the last layout can be unambiguous. If it is, choose it, and reject all layouts before it. If all layouts are
+    # ambiguous, choose the first layout, which has the smallest error.
+    if checked_layouts[-1].summary == UNAMBIGUOUS:
+        n_rejected = len(checked_layouts) - 1
+        chosen = checked_layouts[-1]
     else:
-        n_refused = 0
-        chosen = candidates[0]
-    sensor, error, summary = chosen
+        n_rejected = 0
+        chosen = checked_layouts[0]
+
     errors_before = error_map(case, table, case.sensor) if len(case.sensor.electrodes) >= 3 else None
-    errors_after = error_map(case, table, sensor)
-    return Design(case, sensor, error, summary, n_refused, errors_before, errors_after)
+    errors_after = error_map(case, table, chosen.sensor)
+    return Design(case, chosen.sensor, chosen.error, chosen.summary, n_rejected, errors_before, errors_after)
 
 
 def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMap | None:
-    """Build the forward map of the film for the default range of forces, which is extended to the force of the case.
+    """Build the forward map with which all layouts of a design case are searched for folds and ambiguous pairs.
 
-    The stress does not depend on the electrodes, so all layouts use the same map.
+    All layouts use the same map, because the stress of the film does not depend on the electrodes. The map covers the
+    default range of forces and the force of the case.
 
     Args:
-        case: Design case.
-        executor: Executor that runs the solves; this process if absent.
+        case: Requirements of the layout.
+        executor: Executor that runs the solves; None for this process.
 
     Returns:
-        Map with the electrodes of the sensor of the case, or None if it does not reach its accuracy.
+        Forward map of the initial sensor; None if the map cannot be built or is not accurate enough.
     """
     default_min_force, default_max_force = DEFAULT_FORCE_RANGE
     force_range = (min(default_min_force, case.force), max(default_max_force, case.force))
@@ -182,16 +204,16 @@ def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMa
 
 
 def ambiguities(case: DesignCase, charges: ChargeMap) -> str:
-    """Search for folds and ambiguous pairs of a layout, and summarise them in a sentence.
+    """Search for folds and ambiguous pairs of a layout, and describe them in a sentence.
 
-    The search covers the smallest and the largest force of the charge map, and the force of the case.
+    The search is done for the smallest and the largest force of the charge map, and for the force of the case.
 
     Args:
-        case: Design case.
-        charges: Charges of the layout as a function of the contact.
+        case: Requirements of the layout, with the radius, the force and the noise.
+        charges: Charge map of the layout.
 
     Returns:
-        `UNAMBIGUOUS`, or a sentence about the folds and pairs.
+        `UNAMBIGUOUS` if there are no folds and no ambiguous pairs. Otherwise a sentence about the folds and pairs.
     """
     min_force, max_force = charges.domain.force_range
     forces = sorted({min_force, case.force, max_force})
@@ -212,17 +234,17 @@ def error_map(case: DesignCase, table: ChargeTable, sensor: Sensor) -> ErrorMap:
     """Compute the position errors of a sensor whose electrodes lie at their nominal positions.
 
     Args:
-        case: Design case, which contains the positions, the noise and the nuisances.
+        case: Design case with the presses, the noise and the nuisances.
         table: Charge table of the case.
-        sensor: Sensor with the layout.
+        sensor: Sensor whose layout is evaluated.
 
     Returns:
-        Position errors for the noise alone, and for the noise and the nuisances, mm.
+        Position errors for the noise alone, and for the noise together with the nuisances.
     """
-    # All electrodes are given by their shapes, so the table is evaluated without squares.
+    # The table is evaluated without squares, because all electrodes of the sensor are passed with their shapes.
     no_squares = np.empty((0, 2))
     unused_side = 1.0
     charge_rows = table.rows(case.fine_grid, no_squares, unused_side, sensor.electrodes)
-    error_by_noise = np.sqrt(ErrorModel.of(case.noise, NO_NUISANCES).squared(charge_rows))
-    error_with_nuisances = np.sqrt(ErrorModel.of(case.noise, case.nuisances).squared(charge_rows))
+    error_by_noise = np.sqrt(ErrorModel.of(case.noise, NO_NUISANCES).squared_errors(charge_rows))
+    error_with_nuisances = np.sqrt(ErrorModel.of(case.noise, case.nuisances).squared_errors(charge_rows))
     return ErrorMap(case.fine_grid, error_by_noise, error_with_nuisances)

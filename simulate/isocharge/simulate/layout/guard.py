@@ -1,11 +1,14 @@
-"""Position of a guard electrode: one further square, whose charge reveals presses outside the working area.
+"""Search for the position of a guard electrode, a square whose charge reveals presses outside the working area.
 
-Electrodes on one circle give a press outside the circle nearly the charges of a press inside it (`mirror_region`). A
-further electrode at another distance from the centre has different charges under both presses. The search first finds
-pairs of contacts with the same charges: a press outside the working area, which cannot be noticed, and a contact inside
-it. For each position of the further square, the search then starts a descent from the inner contact of each pair. The
-search counts the pairs for which the descent still finds a contact with the same charges. The mirror region of the best
-positions is computed by a search over the whole working area.
+If all electrodes lie on one circle, a press outside the circle has nearly the same charges as a press inside the circle
+(see `mirror_region`). A guard electrode at another distance from the centre has different charges under these two
+presses.
+
+The search first finds pairs of contacts that have the same charges without the guard electrode. One contact of a pair
+is a press outside the working area, and the other contact is inside the working area. For each possible position of the
+guard electrode, its charge is added, and a least-squares descent starts from the inner contact of each pair. If the
+descent finds a contact with the same charges, the guard electrode does not reveal the press outside. For the best
+positions, the mirror region is then computed by a search over the whole working area.
 """
 
 from concurrent.futures import Executor
@@ -31,33 +34,37 @@ from isocharge.simulate.numerics.disk import Rings, square_grid, sunflower
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
 
 GRID_STEPS = 6
-"""Number of steps of the grid of candidate positions from the centre to the rim."""
+"""Number of steps, from the centre to the rim of the film, of the grid of possible positions of the guard electrode."""
 
 N_OUTSIDE = 200
-"""Number of presses outside the working area with which candidate positions are compared."""
+"""Approximate number of presses outside the working area with which the possible positions are compared."""
 
 N_FORCES = 3
-"""Number of different forces of these presses."""
+"""Number of different forces of the presses outside the working area."""
 
 SHARE_TOLERANCE = 0.01
-"""Share of unnoticeable presses by which a position may exceed the smallest share and still be chosen for its smaller
-position errors, dimensionless."""
+"""Difference between two shares of unnoticeable presses that counts as negligible, dimensionless.
+
+Among the positions whose share exceeds the smallest share by at most this difference, the position errors decide.
+"""
 
 MAX_CHECKED = 3
-"""Largest number of positions whose mirror region is computed."""
+"""Largest number of positions of the guard electrode for which the mirror region is computed."""
 
 LIMIT_RINGS = 20
+"""Number of rings of the presses whose position errors are compared."""
+
 LIMIT_ANGLES = 36
-"""Numbers of rings and angles of the presses whose position errors are compared."""
+"""Number of presses on each of these rings."""
 
 
 @dataclass(frozen=True)
 class PositionLimits:
-    """Cramer-Rao limits of the position over the working area, for presses with the force that the design case states.
+    """Cramer-Rao limits of the position error in the working area, for presses with the force of a design case.
 
     Attributes:
-        rms: Root mean square over the working area, mm.
-        worst: Largest limit, mm.
+        rms: Root mean square of the limits over the working area, mm.
+        worst: Largest limit in the working area, mm.
     """
 
     rms: float
@@ -65,21 +72,22 @@ class PositionLimits:
 
     @classmethod
     def of(cls, charges: ChargeMap, case: DesignCase) -> "PositionLimits":
-        """Compute the limits of a sensor.
+        """Compute the limits of a sensor from its charge map.
 
         Args:
-            charges: Charge map of the working area.
-            case: Radius of the working area, force and noise.
+            charges: Charge map that covers the working area.
+            case: Design case with the radius of the working area, the force of the presses and the noise.
         """
         rings = Rings.spread(case.radius, LIMIT_RINGS, LIMIT_ANGLES)
         limits = limits_at(charges, rings.contacts(case.force), case.noise).position
-        # A ring represents an area that is proportional to its distance from the centre.
+
+        # The weight of a ring is the area that it represents, which is proportional to its radius.
         mean_square_of_rings = (rings.per_ring(limits) ** 2).mean(axis=1)
         mean_square = np.average(mean_square_of_rings, weights=rings.distance)
         return cls(float(np.sqrt(mean_square)), float(limits.max()))
 
     def to_dict(self) -> dict[str, float]:
-        """Return the limits for JSON."""
+        """Return the limits as a dictionary for JSON."""
         return {"rms_mm": self.rms, "worst_mm": self.worst}
 
 
@@ -88,12 +96,12 @@ class GuardDesign:
     """Result of the search for a guard electrode.
 
     Attributes:
-        case: Requirements. The electrodes of its sensor are kept, and one is added.
+        case: Design case, in which all electrodes of the initial sensor are kept and one electrode is added.
         sensor: Sensor with the guard electrode.
         region_before: Mirror region of the sensor without the guard electrode.
-        region_after: Mirror region of the sensor with it.
+        region_after: Mirror region of the sensor with the guard electrode.
         limits_before: Position limits of the sensor without the guard electrode.
-        limits_after: Position limits of the sensor with it.
+        limits_after: Position limits of the sensor with the guard electrode.
     """
 
     case: DesignCase
@@ -105,20 +113,20 @@ class GuardDesign:
 
     @property
     def guard(self) -> Electrode:
-        """The guard electrode."""
+        """Guard electrode, which is the only electrode that the initial sensor does not have."""
         (name,) = set(self.sensor.electrode_names) - set(self.case.keep)
         return next(electrode for electrode in self.sensor.electrodes if electrode.name == name)
 
     @property
     def summary(self) -> str:
-        """Sentence about the share of presses that cannot be noticed, without and with the guard electrode."""
+        """Text that compares the share of unnoticeable presses without and with the guard electrode."""
         return (
             f"presses outside the working area that cannot be noticed: {100.0 * self.region_before.total_share:.2g} % "
             f"without electrode {self.guard.name}, {100.0 * self.region_after.total_share:.2g} % with it"
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the case, the guard electrode, and the results without and with it, for JSON."""
+        """Return the case, the guard electrode, and the results without and with this electrode, for JSON."""
         return {
             "case": self.case.to_dict(),
             "sensor": self.sensor.name,
@@ -129,53 +137,54 @@ class GuardDesign:
 
 
 def guard_case(sensor: Sensor, radius: float, **settings: Any) -> DesignCase:
-    """Return the design case in which all electrodes of a sensor are kept and one square is added.
+    """Create a design case in which all electrodes of a sensor are kept and one square is added.
 
     Args:
-        sensor: The sensor.
+        sensor: Sensor to which the square is added.
         radius: Radius of the working area, mm.
         settings: Further attributes of `DesignCase`.
 
     Raises:
-        InputError: If a further electrode is not possible, or a setting is not allowed.
-        SceneError: If the film cannot be pressed as required.
+        InputError: If the sensor already has the largest number of electrodes, or a setting is not allowed.
+        SceneError: If a press within the radius cannot exist.
     """
     return DesignCase(sensor, len(sensor.electrodes) + 1, radius, keep=sensor.electrode_names, **settings)
 
 
 def design_guard(case: DesignCase, *, executor: Executor | None = None) -> GuardDesign:
-    """Find the position of one further square with which the fewest presses outside the working area go unnoticed.
+    """Find the position of a guard electrode that leaves the fewest presses outside the working area unnoticed.
 
-    Several positions may have nearly the smallest share of such presses. Among these positions, the position with the
-    smallest position limits in the working area is chosen.
+    If several positions have nearly the smallest share of unnoticed presses, the position with the smallest position
+    limits in the working area is preferred.
 
     Args:
-        case: Case of `guard_case`.
-        executor: Executor that runs the solves; this process if absent.
+        case: Design case that `guard_case` created.
+        executor: Executor that runs the solves; None for this process.
 
     Returns:
-        The sensor with the guard electrode, and what it improves.
+        The sensor with the guard electrode, and its mirror region and position limits without and with this electrode.
 
     Raises:
-        InputError: If no position is free.
-        SceneError: If the working area reaches the clamp.
-        SolveError: If an equilibrium is not reached.
+        InputError: If a square does not fit at any position.
+        SceneError: If a press in the working area or on the rest of the film cannot exist.
+        SolveError: If a press has no equilibrium, or the interpolation error of the forward map is too large.
     """
-    # Estimate the share of unnoticed presses for each position. All sensors have the same film, and therefore the same
-    # solutions of the film.
+    # Estimate the share of unnoticed presses for each position. The forward maps are solved only once, because all
+    # sensors have the same film.
     sensors = [_with_guard(case, position) for position in _free_positions(case)]
     inner_map = ForwardMap.build(case.sensor, case.probe, case.radius, DEFAULT_FORCE_RANGE, executor=executor)
     outer_map = whole_film_map(case.sensor, case.probe, DEFAULT_FORCE_RANGE, executor=executor)
     shares = _estimated_shares(case, inner_map, outer_map, sensors)
 
-    # Sort the sensors with nearly the smallest share by their position limits.
+    # Select the sensors with nearly the smallest share, and sort them by their position limits.
     accepted_share = shares.min() + SHARE_TOLERANCE
     candidates = [sensors[index] for index in np.flatnonzero(shares <= accepted_share)]
     limits = [PositionLimits.of(replace(inner_map, sensor=candidate), case) for candidate in candidates]
     order = np.argsort([limit.rms for limit in limits], kind="stable")
     best_candidates = [candidates[index] for index in order[:MAX_CHECKED]]
 
-    # The shares are estimates. Check the best sensors by a full search until one confirms its estimate.
+    # The shares are only estimates. Compute the mirror regions of the best sensors by a full search, until the share of
+    # a mirror region is also nearly the smallest estimate. Then choose the sensor with the smallest mirror region.
     results: list[tuple[MirrorRegion, Sensor]] = []
     for candidate in track(best_candidates, "computing mirror regions"):
         region = _mirror_region(case, inner_map, outer_map, candidate)
@@ -194,12 +203,16 @@ def design_guard(case: DesignCase, *, executor: Executor | None = None) -> Guard
 
 
 def _free_positions(case: DesignCase) -> Array:
-    """Return the positions at which a further square electrode fits, shape (n, 2), mm.
+    """Return the points of a regular grid over the film at which a further square electrode fits.
 
-    The positions are points of a regular grid over the film.
+    Args:
+        case: Design case with the kept electrodes, the side of the square and the distance rules.
+
+    Returns:
+        Centres (x, y) of the square, shape (n, 2), mm.
 
     Raises:
-        InputError: If no square fits.
+        InputError: If the square does not fit at any point of the grid.
     """
     film_radius = case.sensor.film.radius
     grid = square_grid(film_radius, film_radius / GRID_STEPS)
@@ -210,7 +223,12 @@ def _free_positions(case: DesignCase) -> Array:
 
 
 def _with_guard(case: DesignCase, position: Array) -> Sensor:
-    """Return the sensor of a case with a guard electrode at a position, shape (2,), mm."""
+    """Return the sensor of a design case with a guard electrode, which is added as the last electrode.
+
+    Args:
+        case: Design case with the sensor and the side of the square.
+        position: Centre (x, y) of the guard electrode, shape (2,), mm.
+    """
     x, y = position.tolist()
     name = next(name for name in NAMES if name not in case.sensor.electrode_names)
     guard = replace(Electrode.of_square(name, (x, y), case.square_side), role="guard")
@@ -222,7 +240,14 @@ def _with_guard(case: DesignCase, position: Array) -> Sensor:
 
 
 def _mirror_region(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMap, sensor: Sensor) -> MirrorRegion:
-    """Compute the mirror region of a sensor whose film is that of both maps."""
+    """Compute the mirror region of a sensor from forward maps of another sensor with the same film.
+
+    Args:
+        case: Design case with the radius of the working area and the noise.
+        inner_map: Accurate forward map of the working area.
+        outer_map: Coarse forward map of the whole film.
+        sensor: Sensor whose mirror region is computed.
+    """
     charges = ChargeSpline.of(replace(inner_map, sensor=sensor))
     return MirrorRegion.of(charges, case.radius, replace(outer_map, sensor=sensor), case.noise)
 
@@ -230,20 +255,20 @@ def _mirror_region(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMa
 def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMap, sensors: list[Sensor]) -> Array:
     """Estimate the share of presses outside the working area that cannot be noticed, for several guard electrodes.
 
-    A press is not noticed if some contact in the working area explains its charges. Presses that are noticed without a
-    guard electrode are noticed with any guard electrode. For the other presses, the search for a contact is repeated
-    with the charge of each guard electrode, from the contact that was found without it.
+    A press cannot be noticed if a contact in the working area explains its charges. Presses that are noticed without a
+    guard electrode are also noticed with every guard electrode. For each of the other presses, the charge of the guard
+    electrode is added. A descent then starts from the contact that explains the charges without the guard electrode.
 
     Args:
-        case: Radius of the working area and noise.
+        case: Design case with the radius of the working area and the noise.
         inner_map: Accurate forward map of the working area.
         outer_map: Coarse forward map of the whole film.
         sensors: Sensors whose last electrode is the guard electrode.
 
     Returns:
-        Shares, shape (n_sensor,), dimensionless.
+        Share of the presses for each sensor, shape (n_sensor,), dimensionless.
     """
-    # Contacts in the working area that best explain the charges of presses outside
+    # Without a guard electrode, find the contacts in the working area that best explain the charges of the presses.
     presses = _presses_outside(case, outer_map)
     charge = outer_map.charges(presses)
     inner_charges = ChargeSpline.of(inner_map)
@@ -253,7 +278,8 @@ def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: Forwar
     if not is_mirrored.any():
         return np.zeros(len(sensors))
 
-    # Add the charge of each guard electrode, and search again for contacts that explain the charges of these presses.
+    # For each guard electrode, add its charge, and search again for contacts that explain the charges of the presses
+    # that were not noticed.
     mirrored_presses = presses[is_mirrored]
     shares = []
     for sensor in track(sensors, "comparing positions"):
@@ -270,11 +296,11 @@ def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: Forwar
 
 @dataclass(frozen=True)
 class JoinedMap:
-    """Charge map of the electrodes of two charge maps with the same domain.
+    """Charge map that combines the electrodes of two charge maps with the same domain.
 
     Attributes:
-        first: Map of the first electrodes.
-        second: Map of the other electrodes.
+        first: Charge map of the first electrodes.
+        second: Charge map of the other electrodes.
     """
 
     first: ChargeMap
@@ -282,7 +308,7 @@ class JoinedMap:
 
     @property
     def domain(self) -> Domain:
-        """Contacts for which the map holds."""
+        """Set of contacts for which the map is valid."""
         return self.first.domain
 
     @property
@@ -291,29 +317,35 @@ class JoinedMap:
         return (*self.first.electrodes, *self.second.electrodes)
 
     def charges(self, contact: Array) -> Array:
-        """Return the charges of contacts; see `ChargeMap`."""
+        """Compute the charges of all electrodes; see `ChargeMap`."""
         return np.concatenate([self.first.charges(contact), self.second.charges(contact)], axis=1)
 
     def derivatives(self, contact: Array) -> Array:
-        """Return the derivatives of the charges; see `ChargeMap`."""
+        """Compute the derivatives of the charges of all electrodes; see `ChargeMap`."""
         return np.concatenate([self.first.derivatives(contact), self.second.derivatives(contact)], axis=1)
 
 
 def _presses_outside(case: DesignCase, outer_map: ForwardMap) -> Array:
-    """Return presses that are spread over the film outside the working area, shape (n, 3), mm and N.
+    """Return presses that are distributed evenly over the film outside the working area.
 
-    The presses have `N_FORCES` different forces in turn, in the range of the mirror region.
+    Successive presses have different forces. There are `N_FORCES` forces, which cover the same range as those of
+    `MirrorRegion`.
 
     Args:
-        case: Radius of the working area.
+        case: Design case with the radius of the working area.
         outer_map: Forward map whose domain contains the presses.
+
+    Returns:
+        Presses (x, y, F), shape (n, 3), mm and N.
     """
     min_force, max_force = outer_map.domain.force_range
     forces = np.geomspace(max(min_force, max_force / FORCE_RATIO), max_force, N_FORCES)
 
-    # Spread points over the whole disk, so many that about `N_OUTSIDE` of them lie outside the working area.
+    # Distribute points over the whole disk. Their number is such that about `N_OUTSIDE` points lie outside the working
+    # area.
     outer_radius = outer_map.domain.radius
     share_outside = 1.0 - (case.radius / outer_radius) ** 2
     points = sunflower(round(N_OUTSIDE / share_outside)) * outer_radius  # x + iy, mm
     position = points[np.abs(points) > case.radius]
-    return np.stack([position.real, position.imag, np.resize(forces, position.size)], axis=1)
+    force_of_press = np.resize(forces, position.size)  # repeats the forces
+    return np.stack([position.real, position.imag, force_of_press], axis=1)

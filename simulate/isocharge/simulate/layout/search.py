@@ -1,14 +1,16 @@
-"""Search of the electrode positions: exchange on a grid, then minimisation of the largest error on a fine grid.
+"""Search for electrode positions with small position errors, in two stages.
 
-The exchange (Fedorov 1972; Meyer and Nachtsheim 1995) starts from a random layout. Each square in turn is moved to the
-position at which the error of the whole layout is smallest, until the error no longer decreases. The formula of Sherman
-and Morrison compares all positions of a grid at once (`position_error`). If the goal is the largest error, the exchange
-minimises a power mean of the errors, which approximates the largest error.
+The first stage is an exchange on a grid (Fedorov 1972; Meyer and Nachtsheim 1995), which starts from a random layout.
+Each square in turn is moved to the position of the grid at which the error of the whole layout is smallest, until the
+error no longer decreases. The formula of Sherman and Morrison computes the errors for all positions of the grid at once
+(see `position_error`). If the goal is the largest error, the exchange minimises a power mean of the errors, which
+approximates the largest error.
 
-The largest error mostly occurs near the edge of an electrode, between the presses of a coarse grid. The refinement
-therefore minimises a bound t subject to the constraints ln error(press) <= t. The constraints apply to the presses with
-the largest errors on a fine grid. The method is sequential quadratic programming with a limited change of the
-positions. The presses are selected again in each round.
+The second stage is a refinement. The largest error mostly occurs near the edge of an electrode, between the presses of
+a coarse grid. The refinement therefore considers the presses with the largest errors on a fine grid. The refinement
+minimises a bound t under the constraint that the logarithm of the error of each considered press is at most t. The
+method is sequential quadratic programming. In each round of the refinement, the presses are selected again, and the
+change of the electrode positions is limited.
 """
 
 from dataclasses import dataclass
@@ -22,31 +24,31 @@ from isocharge.common.errors import InputError
 from isocharge.common.progress import track
 from isocharge.simulate.layout.case import DesignCase
 from isocharge.simulate.layout.charge_table import ChargeTable
-from isocharge.simulate.layout.position_error import ErrorModel, with_one_more
+from isocharge.simulate.layout.position_error import ErrorModel, squared_errors_with_candidates
 from isocharge.simulate.numerics.disk import square_grid
 
 STARTS = 24
 """Number of random layouts from which the exchange starts."""
 
 WORST_POWER = 12.0
-"""Power of the errors in the mean that the exchange minimises if the goal is the largest error, dimensionless."""
+"""Exponent of the power mean of the errors that is minimised if the goal is the largest error, dimensionless."""
 
 RMS_POWER = 2.0
-"""Power of the errors in the mean that the exchange minimises for the other goals, dimensionless."""
+"""Exponent of the power mean of the errors that is minimised for all other goals, dimensionless."""
 
 MAX_SWEEPS = 30
-"""Largest number of sweeps, in each of which every square is exchanged once."""
+"""Largest number of sweeps of the exchange. In each sweep, every square is moved once."""
 
 MIN_SWEEP_GAIN = 1e-4
-"""Relative decrease of the error below which the exchange ends, dimensionless."""
+"""The exchange ends if a sweep reduces the error by less than this fraction, dimensionless."""
 
 GRID_STEPS = 20
-"""Number of steps of the grid of positions from the centre outwards."""
+"""Number of steps of the grid of square positions from the centre to the edge of the grid."""
 
 GRID_EXTENT = 1.0 / 3.0
-"""Distance by which the grid of positions extends beyond the presses, in units of the film radius, dimensionless.
+"""Distance by which the grid of square positions extends beyond the presses, in film radii, dimensionless.
 
-The charges of electrodes farther out change little.
+The charges of electrodes that are farther out depend little on the position of a press.
 """
 
 MAX_FINALISTS = 3
@@ -55,32 +57,32 @@ MAX_FINALISTS = 3
 MIN_DIFFERENCE = 2e-3
 """Relative difference of the errors above which two layouts count as different, dimensionless.
 
-Layouts that differ less are mostly rotations of each other.
+Layouts whose errors differ less are mostly rotations of each other.
 """
 
 MAX_ROUNDS = 8
-"""Largest number of rounds of the refinement."""
+"""Largest number of rounds of the refinement of a layout."""
 
 MAX_ITERATIONS = 25
-"""Largest number of quadratic programs in a round."""
+"""Largest number of quadratic programs that are solved in a round of the refinement."""
 
 ACTIVE_ERROR = 0.9
-"""Error above which a press becomes a constraint, relative to the largest error, dimensionless."""
+"""Smallest error, relative to the largest error, at which a press becomes a constraint of the refinement."""
 
 MAX_ACTIVE = 60
-"""Largest number of presses that become constraints."""
+"""Largest number of presses that become constraints of the refinement."""
 
 FIRST_STEP = 0.2
-"""Largest change of a coordinate in the first round, in units of the side of a square.
+"""Largest change of a coordinate of a square in the first round of the refinement, in units of the side of a square.
 
-It is halved after each round without improvement.
+The largest change is halved after each round that does not improve the layout.
 """
 
 LAST_STEP = 0.02
-"""Largest change of a coordinate below which the refinement ends, in units of the side of a square."""
+"""The refinement ends if a round with at most this largest change brings no improvement, in sides of a square."""
 
 MIN_ROUND_GAIN = 1e-3
-"""Relative decrease of the error below which a round counts as without improvement, dimensionless."""
+"""A round improves the layout if it reduces the error by more than this fraction, dimensionless."""
 
 CLEARANCE_TOLERANCE = 1e-3
 """Largest violation of a distance rule that a refined layout may have, mm."""
@@ -89,22 +91,23 @@ DIFFERENCE_STEP = 1e-2
 """Step of the finite differences with respect to the coordinates of the squares, mm."""
 
 ALL_PRESSES = slice(None)
-"""Selection of all presses of the fine grid."""
+"""Selection of all presses, which is used as an index of arrays whose first axis is the press."""
 
 
 def random_layouts(case: DesignCase) -> tuple[Array, list[Integers]]:
-    """Choose random layouts on a grid that satisfy the distance rules.
+    """Create a grid of square positions, and choose random layouts on this grid that satisfy the distance rules.
 
     Args:
-        case: Design case.
+        case: Design case with the number of new squares and the distance rules.
 
     Returns:
-        Positions of the grid, shape (n, 2), mm, and `STARTS` layouts. A layout is an array of indices into the
-        positions of the grid, shape (n_new,).
+        Positions (x, y) of the grid, shape (n, 2), mm. Random layouts, whose number is `STARTS`. A layout contains the
+        index of the grid position of each new square, shape (n_new,).
 
     Raises:
-        InputError: If the squares do not fit.
+        InputError: If the squares do not fit on the grid.
     """
+    # The grid extends to the distance up to which a square is useful, but not into the rim of the film.
     film_radius = case.sensor.film.radius
     useful_radius = case.radius + GRID_EXTENT * film_radius
     allowed_radius = film_radius - case.rim - 0.5 * case.square_side
@@ -114,7 +117,7 @@ def random_layouts(case: DesignCase) -> tuple[Array, list[Integers]]:
 
     rng = np.random.default_rng(case.seed)
     layouts = [_random_layout(case, allowed_grid, rng) for _ in range(STARTS)]
-    is_any_incomplete = any(len(layout) < case.new_count for layout in layouts)
+    is_any_incomplete = any(len(layout) < case.new_count for layout in layouts)  # some squares found no position
     if is_any_incomplete:
         raise InputError(
             f"{case.new_count} new squares of {case.square_side:g} mm do not fit within {grid_radius:.3g} mm of the "
@@ -124,14 +127,14 @@ def random_layouts(case: DesignCase) -> tuple[Array, list[Integers]]:
 
 
 def _random_layout(case: DesignCase, grid: Array, rng: np.random.Generator) -> Integers:
-    """Choose random positions of the grid for the new squares, with the required distances between them.
+    """Choose a random position of the grid for each new square.
 
     The positions are tried in random order. A position is chosen if its square has the required distance from the
-    squares at all positions chosen before.
+    squares at all positions that were chosen earlier.
 
     Args:
-        case: Design case.
-        grid: Allowed positions, shape (n, 2), mm.
+        case: Design case with the number of new squares and the distance rules.
+        grid: Allowed positions (x, y) of a square, shape (n, 2), mm.
         rng: Random number generator.
 
     Returns:
@@ -150,11 +153,11 @@ def _random_layout(case: DesignCase, grid: Array, rng: np.random.Generator) -> I
 
 @dataclass(frozen=True)
 class Search:
-    """Search of the electrode positions for one design case.
+    """Search for the electrode positions that minimise the goal of a design case.
 
     Attributes:
-        case: Design case.
-        table: Charges under the presses of the case.
+        case: Requirements of the layout.
+        table: Charge table for the probe and the force of the case.
     """
 
     case: DesignCase
@@ -167,9 +170,10 @@ class Search:
 
     @cached_property
     def presses(self) -> Array:
-        """Positions of the presses for which a layout is evaluated, shape (n, 2), mm.
+        """Positions (x, y) of the presses for which the refinement evaluates a layout, shape (n, 2), mm.
 
-        The grid is fine only if the largest error is minimised.
+        The presses form a fine grid if the goal is the largest error. For all other goals, the presses are those of the
+        exchange.
         """
         return self.case.fine_grid if self.case.goal == "worst" else self.case.search_presses
 
@@ -180,35 +184,39 @@ class Search:
 
     @cached_property
     def kept_rows(self) -> Array:
-        """Rows of the kept electrodes for all presses, shape (n, n_kept, 6)."""
+        """Rows of the charge table for the kept electrodes and all presses, shape (n, n_kept, 6)."""
         return self.table.rows(self.presses, np.empty((0, 2)), self.case.square_side, self.case.kept_electrodes)
 
     def squared_errors(self, positions: Array, selection: Integers | slice) -> Array:
-        """Compute the squared position errors of a layout.
+        """Compute the squared position errors of a layout for selected presses.
 
         Args:
-            positions: Centres of the new squares, shape (n_new, 2), mm.
-            selection: Selection of presses.
+            positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
+            selection: Indices of the selected presses, shape (n_press,), or `ALL_PRESSES`.
 
         Returns:
             Squared errors, shape (n_press,), mm^2.
         """
         rows = self.table.rows(self.presses[selection], positions, self.case.square_side)
-        return self.model.squared(np.concatenate([rows, self.kept_rows[selection]], axis=1))
+        return self.model.squared_errors(np.concatenate([rows, self.kept_rows[selection]], axis=1))
 
     def optima(self, grid: Array, layouts: list[Integers]) -> list[Array]:
-        """Improve layouts by exchange, and return at most `MAX_FINALISTS` different layouts with the smallest errors.
+        """Improve layouts by exchanges, and return at most `MAX_FINALISTS` of the best improved layouts.
+
+        Layouts with nearly equal errors are mostly rotations of each other, so only one of them is returned.
 
         Args:
-            grid: Positions of the grid, shape (n, 2), mm.
-            layouts: Indices of the positions of each initial layout, each of shape (n_new,).
+            grid: Positions (x, y) of the grid, shape (n, 2), mm.
+            layouts: Initial layouts. A layout contains the index of the grid position of each new square, shape
+                (n_new,).
 
         Returns:
-            Centres of the new squares of each layout, each of shape (n_new, 2), mm, in ascending order of the error.
+            Layouts in ascending order of their errors. A layout contains the centre (x, y) of each new square, shape
+            (n_new, 2), mm.
         """
         exchange = _Exchange.of(self, grid)
         results = [exchange.improve(layout) for layout in track(layouts, "exchanging")]
-        results.sort(key=lambda result: result[0])  # by the error
+        results.sort(key=lambda result: result[0])  # a result is a pair of the error and the layout
 
         # Two layouts count as different if their errors differ. Equal errors mostly belong to rotated layouts.
         finalists: list[Array] = []
@@ -220,53 +228,59 @@ class Search:
                 last_error = error
         return finalists
 
-    def value(self, positions: Array) -> float:
-        """Compute the quantity that the search minimises, mm: the largest error, or the weighted root mean square."""
+    def minimised_error(self, positions: Array) -> float:
+        """Compute the quantity that the search minimises: the largest error or the weighted root mean square, mm.
+
+        Args:
+            positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
+        """
         return float(np.exp(self._log_errors(positions, ALL_PRESSES).max()))
 
     def _log_errors(self, positions: Array, selection: Integers | slice) -> Array:
-        """Compute the logarithms of the errors whose maximum is minimised.
+        """Compute the logarithms of the errors of a layout. The refinement minimises the largest logarithm.
 
         Args:
-            positions: Centres of the new squares, shape (n_new, 2), mm.
-            selection: Selection of presses.
+            positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
+            selection: Indices of the selected presses, shape (n_press,), or `ALL_PRESSES`.
 
         Returns:
-            Logarithm of the error (mm) of each press if the goal is the largest error, shape (n_press,). For other
-            goals, logarithm of the weighted root mean square of the errors (mm), shape (1,).
+            If the goal is the largest error, the logarithm of the error (mm) of each selected press, shape (n_press,).
+            For all other goals, the logarithm of the weighted root mean square of the errors (mm), shape (1,).
         """
         rows = self.table.rows(self.presses[selection], positions, self.case.square_side)
         return self._log_errors_of_rows(np.concatenate([rows, self.kept_rows[selection]], axis=1), selection)
 
     def _log_errors_of_rows(self, rows: Array, selection: Integers | slice) -> Array:
-        """Compute the result of `_log_errors` from the charges and derivatives of all electrodes.
+        """Compute the result of `_log_errors` from the charges of all electrodes and the derivatives of these charges.
 
         Args:
-            rows: Rows of the charge table, shape (n_press, n_electrode, 6).
-            selection: Selection of the presses to which the rows belong.
+            rows: Rows of the charge table for the selected presses and all electrodes, shape (n_press, n_electrode, 6).
+            selection: Indices of the selected presses, shape (n_press,), or `ALL_PRESSES`.
         """
-        squared_error = self.model.squared(rows)
+        squared_error = self.model.squared_errors(rows)
         if self.case.goal != "worst":
             squared_error = np.average(squared_error, weights=self.weights[selection], keepdims=True)
         return np.asarray(0.5 * np.log(squared_error))
 
     def _log_error_jacobian(self, positions: Array, selection: Integers | slice) -> Array:
-        """Compute the derivatives of `_log_errors` with respect to the coordinates by forward differences.
+        """Compute the derivatives of `_log_errors` with respect to the coordinates of the squares.
 
-        If one square moves, the rows of all other electrodes remain unchanged. Only the moved square is integrated
-        again.
+        The derivatives are forward differences. If one square moves, the charges of all other electrodes remain
+        unchanged, so only the charge of the moved square is computed again.
 
         Args:
-            positions: Centres of the new squares, shape (n_new, 2), mm.
-            selection: Selection of presses.
+            positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
+            selection: Indices of the selected presses, shape (n_press,), or `ALL_PRESSES`.
 
         Returns:
-            Derivatives, shape (n_error, 2 n_new), 1/mm.
+            Derivatives with respect to the coordinates in the order x1, y1, x2, y2, ..., shape (n_error, 2 n_new),
+            1/mm.
         """
         kept_rows = self.kept_rows[selection]
         n_new = len(positions)
 
-        # Rows of the new squares, followed by the rows of each square after a step along x and after a step along y
+        # Compute the rows of the new squares, and the rows of each square after a step along x and after a step along
+        # y.
         steps = DIFFERENCE_STEP * np.eye(2)
         moved_positions = (positions[:, None] + steps).reshape(-1, 2)
         all_positions = np.concatenate([positions, moved_positions])
@@ -277,7 +291,7 @@ class Search:
         log_error = self._log_errors_of_rows(np.concatenate([new_rows, kept_rows], axis=1), selection)
         derivatives = []
         for coordinate in range(2 * n_new):
-            square = coordinate // 2  # x and y of a square are two successive coordinates
+            square = coordinate // 2  # the coordinates x and y of a square are adjacent
             changed_rows = new_rows.copy()
             changed_rows[:, square] = moved_rows[:, coordinate]
             all_changed_rows = np.concatenate([changed_rows, kept_rows], axis=1)
@@ -286,54 +300,62 @@ class Search:
         return np.stack(derivatives, axis=1)
 
     def _clearance_jacobian(self, positions: Array) -> Array:
-        """Compute the derivatives of all distance rules with respect to the coordinates by forward differences.
+        """Compute the derivatives of `DesignCase.all_clearances` with respect to the coordinates of the squares.
+
+        The derivatives are forward differences.
 
         Args:
-            positions: Centres of the new squares, shape (n_new, 2), mm.
+            positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
 
         Returns:
-            Derivatives, shape (n_rule, 2 n_new), dimensionless.
+            Derivatives with respect to the coordinates in the order x1, y1, x2, y2, ..., shape (n_rule, 2 n_new),
+            dimensionless.
         """
         clearances = self.case.all_clearances(positions)
-        steps = DIFFERENCE_STEP * np.eye(positions.size).reshape(-1, *positions.shape)  # of one coordinate each
+        # Each step changes a single coordinate; shape (2 n_new, n_new, 2).
+        steps = DIFFERENCE_STEP * np.eye(positions.size).reshape(-1, *positions.shape)
         moved_clearances = [self.case.all_clearances(positions + step) for step in steps]
         return (np.stack(moved_clearances, axis=1) - clearances[:, None]) / DIFFERENCE_STEP
 
     def refine(self, positions: Array) -> Array:
-        """Improve a layout by small steps that satisfy the distance rules.
+        """Improve a layout in rounds. In each round, the change of the coordinates of the squares is limited.
 
-        If a round does not improve the layout, the largest step is halved. The refinement ends when a round with a
-        small step brings no improvement.
+        If a round does not improve the layout, the largest allowed change is halved for the next round. The refinement
+        ends if the largest allowed change is already small, and in any case after `MAX_ROUNDS` rounds.
 
         Args:
-            positions: Centres of the new squares, shape (n_new, 2), mm.
+            positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
 
         Returns:
-            Minimised quantity of the refined layout, mm, followed by its coordinates, mm, shape (1 + 2 n_new,).
+            Error that the search minimises, mm, followed by the coordinates x1, y1, x2, y2, ... of the refined layout,
+            mm, shape (1 + 2 n_new,).
         """
-        step = FIRST_STEP  # in units of the side of a square
-        best_value = self.value(positions)
+        relative_step = FIRST_STEP  # largest change of a coordinate, in units of the side of a square
+        best_error = self.minimised_error(positions)
         for _ in range(MAX_ROUNDS):
-            moved = self._refinement_round(positions, step * self.case.square_side)
-            value = self.value(moved)
-            satisfies_rules = self.case.all_clearances(moved).min() > -CLEARANCE_TOLERANCE
-            if value < best_value * (1.0 - MIN_ROUND_GAIN) and satisfies_rules:
-                positions = moved
-                best_value = value
-            elif step > LAST_STEP:
-                step *= 0.5
+            moved_positions = self._refinement_round(positions, relative_step * self.case.square_side)
+            error = self.minimised_error(moved_positions)
+            satisfies_rules = self.case.all_clearances(moved_positions).min() > -CLEARANCE_TOLERANCE
+            if error < best_error * (1.0 - MIN_ROUND_GAIN) and satisfies_rules:
+                positions = moved_positions
+                best_error = error
+            elif relative_step > LAST_STEP:
+                relative_step *= 0.5
             else:
                 break
-        return np.append(best_value, positions)
+        return np.append(best_error, positions)
 
     def _active_presses(self, positions: Array) -> Integers | slice:
-        """Select the presses whose errors a refinement bounds.
+        """Select the presses whose errors are constraints in a round of the refinement.
 
-        If the goal is the largest error, these are at most `MAX_ACTIVE` presses with nearly the largest error. For
-        other goals, all presses are selected.
+        If the goal is the largest error, the presses with nearly the largest error are selected, at most `MAX_ACTIVE`.
+        For all other goals, all presses are selected.
 
         Args:
-            positions: Centres of the new squares, shape (n_new, 2), mm.
+            positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
+
+        Returns:
+            Indices of the selected presses, shape (n_press,), or `ALL_PRESSES`.
         """
         if self.case.goal != "worst":
             return ALL_PRESSES
@@ -343,43 +365,48 @@ class Search:
         return active
 
     def _refinement_round(self, positions: Array, max_step: float) -> Array:
-        """Run sequential quadratic programming for the presses that have the largest errors.
+        """Improve a layout by sequential quadratic programming for the presses that have the largest errors.
 
-        The variables are the coordinates of the squares and a bound of the logarithmic errors. The bound is minimised,
-        subject to the constraints that no error exceeds it and that the distance rules are satisfied.
+        The variables are the coordinates of the squares and, as the last variable, a bound of the logarithms of the
+        errors. The bound is minimised under two constraints: no logarithm of an error exceeds the bound, and the
+        distance rules are satisfied.
 
         Args:
-            positions: Centres of the new squares, shape (n_new, 2), mm.
+            positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
             max_step: Largest change of a coordinate, mm.
 
         Returns:
-            Changed positions, shape (n_new, 2), mm.
+            Changed centres, shape (n_new, 2), mm. They may violate the distance rules slightly.
         """
         active = self._active_presses(positions)
 
-        # The last variable is the bound of the logarithmic errors.
         def constraints(variables: Array) -> Array:
-            """Return values that must not be negative: the bound minus the log errors, and the excess distances."""
-            moved = variables[:-1].reshape(-1, 2)
+            """Return the bound minus the logarithm of each error, and the margin of each distance rule.
+
+            None of these values must be negative. Their shape is (n_error + n_rule,).
+            """
+            moved_positions = variables[:-1].reshape(-1, 2)
             bound = variables[-1]
-            return np.concatenate([bound - self._log_errors(moved, active), self.case.all_clearances(moved)])
+            error_margins = bound - self._log_errors(moved_positions, active)
+            return np.concatenate([error_margins, self.case.all_clearances(moved_positions)])
 
         def constraint_jacobian(variables: Array) -> Array:
             """Return the derivatives of the constraints with respect to the variables.
 
-            The last variable, the bound, enters only the constraints of the errors, with the derivative 1.
+            The derivative with respect to the bound is 1 for the constraints of the errors, and 0 for the distance
+            rules.
             """
-            moved = variables[:-1].reshape(-1, 2)
-            log_error_jacobian = self._log_error_jacobian(moved, active)
-            clearance_jacobian = self._clearance_jacobian(moved)
+            moved_positions = variables[:-1].reshape(-1, 2)
+            log_error_jacobian = self._log_error_jacobian(moved_positions, active)
+            clearance_jacobian = self._clearance_jacobian(moved_positions)
             coordinate_columns = np.concatenate([-log_error_jacobian, clearance_jacobian])
             bound_column = np.zeros((len(coordinate_columns), 1))
             bound_column[: len(log_error_jacobian)] = 1.0
             return np.concatenate([coordinate_columns, bound_column], axis=1)
 
-        # The search starts with the largest error as the bound, so that all constraints of the errors are satisfied.
+        # The first value of the bound is the largest error, so that all constraints of the errors are satisfied.
         start = np.append(positions, self._log_errors(positions, active).max())
-        gradient = np.append(np.zeros(positions.size), 1.0)  # of the minimised quantity, which is the last variable
+        gradient = np.append(np.zeros(positions.size), 1.0)  # the minimised quantity is the last variable itself
         coordinate_bounds = [(value - max_step, value + max_step) for value in positions.ravel().tolist()]
         bounds = [*coordinate_bounds, (None, None)]  # the last variable is not limited
         solution = scipy.optimize.minimize(
@@ -396,14 +423,17 @@ class Search:
 
 @dataclass(frozen=True)
 class _Exchange:
-    """Exchange of single squares on a grid of positions.
+    """Improvement of layouts by moving one square at a time to the best position of a grid.
+
+    The error of a layout is the power mean of the position errors of the presses. If p is the exponent, the power mean
+    is the p-th root of the weighted mean of the p-th powers of the errors.
 
     Attributes:
         kept_sensitivity: Sensitivities of the kept electrodes (`ErrorModel.sensitivity`), shape (n_press, n_kept, 5).
         candidates: Sensitivities of a square at each position of the grid, shape (n_press, 5, n).
         is_allowed_pair: Whether two squares at a pair of positions satisfy the distance rules, shape (n, n).
-        weights: Weight of each press in the mean of the errors, shape (n_press,), dimensionless.
-        power: Power of the errors in the mean, dimensionless.
+        weights: Weight of each press in the mean, shape (n_press,), dimensionless.
+        power: Exponent of the power mean, dimensionless.
     """
 
     kept_sensitivity: Array
@@ -414,11 +444,11 @@ class _Exchange:
 
     @classmethod
     def of(cls, search: Search, grid: Array) -> "_Exchange":
-        """Create an exchange from a search, and evaluate the sensitivities of a square at every position of a grid.
+        """Prepare exchanges by computing the sensitivities of a square at every position of a grid.
 
         Args:
-            search: Search with its design case and charge table.
-            grid: Positions of the grid, shape (n, 2), mm.
+            search: Search with the design case and the charge table.
+            grid: Positions (x, y) of the grid, shape (n, 2), mm.
         """
         case = search.case
         presses = case.search_presses
@@ -434,44 +464,49 @@ class _Exchange:
             power=WORST_POWER if case.goal == "worst" else RMS_POWER,
         )
 
-    def mean_error(self, other_squares: Integers) -> Array:
-        """Compute the mean of the errors to the given power for a further square at each position of the grid.
+    def mean_powers(self, other_squares: Integers) -> Array:
+        """Compute the mean of the powers of the errors for a further square at each position of the grid.
+
+        The error of each press is raised to the power `power`, and the weighted mean over the presses is computed.
 
         Args:
-            other_squares: Indices of the positions of the other new squares of the layout.
+            other_squares: Indices of the grid positions of the other new squares of the layout, shape (n_new - 1,).
 
         Returns:
             Means, shape (n,). A mean is infinite if the further square violates a distance rule.
         """
         others_sensitivity = self.candidates[:, :, other_squares].swapaxes(1, 2)
         layout_sensitivity = np.concatenate([self.kept_sensitivity, others_sensitivity], axis=1)
-        # Rounding can make the small difference in `with_one_more` negative.
-        squared_error = np.maximum(with_one_more(layout_sensitivity, self.candidates), 1e-12)  # shape (n_press, n)
-        mean = np.average(squared_error ** (0.5 * self.power), axis=0, weights=self.weights)
+        squared_error = squared_errors_with_candidates(layout_sensitivity, self.candidates)  # shape (n_press, n)
+        positive_squared_error = np.maximum(squared_error, 1e-12)  # rounding may make a small value negative
+        mean_power = np.average(positive_squared_error ** (0.5 * self.power), axis=0, weights=self.weights)
         is_allowed = self.is_allowed_pair[other_squares].all(axis=0)
-        mean[~is_allowed] = np.inf
-        return np.asarray(mean)
+        mean_power[~is_allowed] = np.inf
+        return np.asarray(mean_power)
 
     def improve(self, layout: Integers) -> tuple[float, Integers]:
-        """Exchange squares until no exchange of a single square improves the layout.
+        """Move single squares until no such move improves the layout.
 
-        In each sweep, every square in turn is moved to the position with the smallest mean error.
+        In each sweep, every square in turn is moved to the position of the grid with the smallest error of the layout.
 
         Args:
-            layout: Indices of the positions, shape (n_new,).
+            layout: Index of the grid position of each new square, shape (n_new,).
 
         Returns:
-            Power mean of the errors, mm, and the indices of the improved positions, shape (n_new,).
+            Power mean of the errors of the improved layout, mm. Index of the improved grid position of each new square,
+            shape (n_new,).
         """
-        improved = layout.copy()
-        best_value = np.inf
+        improved_layout = layout.copy()
+        best_error = np.inf
         for _ in range(MAX_SWEEPS):
-            for square in range(len(improved)):
-                other_squares = np.delete(improved, square)
-                mean_error = self.mean_error(other_squares)
-                improved[square] = np.argmin(mean_error)
-            value = float(mean_error.min() ** (1.0 / self.power))  # after the exchange of the last square
-            if value > best_value * (1.0 - MIN_SWEEP_GAIN):
+            for square in range(len(improved_layout)):
+                other_squares = np.delete(improved_layout, square)
+                mean_powers = self.mean_powers(other_squares)
+                improved_layout[square] = np.argmin(mean_powers)
+
+            # The smallest mean belongs to the layout after the last square has been moved.
+            error = float(mean_powers.min() ** (1.0 / self.power))
+            if error > best_error * (1.0 - MIN_SWEEP_GAIN):
                 break
-            best_value = value
-        return value, improved
+            best_error = error
+        return error, improved_layout

@@ -1,1 +1,1 @@
-"""Models of the measuring chain: noise of single readings, and an amplifier with memory."""
+"""Models of the noise of single readings, and of amplifiers whose output also depends on earlier charges."""

@@ -1,23 +1,26 @@
-"""Simulation of the measuring chain: how the film, the amplifier and the converter change touch charges over time.
+"""Simulation of how the film, the amplifier and the converter change touch charges over time.
 
-A charge amplifier is a leaky integrator with the time constant tau = R C, so that a step of the charge decays by a
-factor of e within tau. The output of reading n is
+A charge amplifier is a leaky integrator with the time constant tau = R C. After a step of the charge, the output of the
+amplifier decays by a factor of e within the time tau. The output v of the amplifier at reading n is
 
     v[n] = exp(-dt / tau) v[n-1] + g (q[n] - q[n-1]) + b dt,
 
-where q is the charge of the film (touch charge and pyroelectric charge), g the gain and b the bias current. Offset,
-hum, white noise, clipping and the rounding of the converter are then applied to the output. A film with creep responds
-to a unit step of the touch charge with
+where q is the charge of the film, g is the gain, b is the bias current, and dt is the time between two readings. The
+charge of the film is the sum of the touch charge and the pyroelectric charge. After the amplifier, the simulation
+applies the offset, hum, white noise, clipping and the rounding of the converter.
 
-    h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / film_time).
+The response of a film with creep to a unit step of the touch charge is
 
-The logarithm is valid for times from some milliseconds to days. A Prony series with two terms per decade approximates
-the logarithm, and Boltzmann's superposition principle gives the response to any touch charge. The exponential describes
-the cooling of the film when it is stretched, and its return to the initial temperature.
+    h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / film_time),
 
-The built-in levels contain plausible values of hum, offset, bias and mismatch for electric environments with little or
-with strong interference. They were not measured. The levels `clean` and `reference` contain only the memoryless noise
-of `measuring_chain.noise`.
+where t is the time since the step. The logarithm describes the creep of the film, and is valid from some milliseconds
+to days. A Prony series with two terms per decade of time approximates the logarithm. The response to an arbitrary touch
+charge follows from Boltzmann's superposition principle. The exponential term describes the thermoelastic effect: the
+film cools when it is stretched, and then returns to its initial temperature.
+
+The noise levels `bench` and `surgery` contain plausible values of hum, offset, bias and mismatch for environments with
+weak or strong electrical interference. The values of these noise levels were not measured. The noise levels `clean` and
+`reference` contain only noise without memory, which the module `measuring_chain.noise` describes.
 """
 
 import math
@@ -37,38 +40,40 @@ PVDF_PYRO = -30.0 * 9.0
 """Pyroelectric charge of a PVDF electrode of 9 mm^2 per temperature change, pC/K, for -30 uC/(m^2 K).
 
 The sign is negative if a press results in positive charges (d31 > 0), because a warmer film is thicker, and a pressed
-film is thinner."""
+film is thinner.
+"""
 
 FILM_TIME = 1.78e-3 * 1.2 * 0.025 / (2.0 * 1e-5)
 """Time constant with which a PVDF film of 25 um follows the temperature of the air at both faces, s.
 
-The time constant is density * specific heat * thickness / (2 * heat transfer coefficient), with 1.78 g/cm^3,
-1.2 J/(g K) and 10 W/(m^2 K). This heat transfer coefficient is typical of free convection and radiation."""
+The time constant is density * specific heat * thickness / (2 * heat transfer coefficient), with 1.78 g/cm^3, 1.2 J/(g
+K) and 10 W/(m^2 K). The value of the heat transfer coefficient is typical of free convection and radiation.
+"""
 
 
 CREEP_TIMES = 10.0 ** np.arange(-3.0, 6.1, 0.5)
-"""Time constants of the Prony series of creep, s."""
+"""Time constants of the exponential terms in the Prony series of creep, s."""
 
 
 PositiveOrInfinite = Annotated[float, Meta(gt=0.0, description="a positive number or inf")]
-"""Type of a parameter that may be infinite."""
+"""Type of a positive parameter that may be infinite."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Amplifier:
-    """Parameters of a measuring chain with any number of channels.
+    """Parameters of a simulated measuring chain with any number of channels.
 
-    The bounds of the parameters apply to files (`measuring_chain.noise_file`).
+    The bounds that the types of the parameters state are checked only when the parameters are read from a file.
 
     Attributes:
-        noise: Memoryless noise of each reading.
+        noise: Noise of each reading, which does not depend on earlier readings.
         tau: Time constant of the leak, s; infinite for no leak.
         tau_mismatch: Standard deviation of the relative error of the time constant of a channel, dimensionless.
         gain_mismatch: Standard deviation of the relative error of the gain of a channel, dimensionless.
         hum: Amplitude of the mains hum, pC. The phase of the hum differs between channels.
         hum_frequency: Frequency of the mains hum, Hz.
         offset: Standard deviation of the constant offset of a channel, pC.
-        bias: Magnitude of the bias current that every channel integrates, pC/s. Its sign differs between channels.
+        bias: Magnitude of the bias current that every channel integrates, pC/s. The sign is drawn for each channel.
         pyro: Pyroelectric charge of each electrode per temperature change, pC/K; negative for PVDF with d31 > 0.
         pyro_mismatch: Standard deviation of the relative error of the pyroelectric charge of a channel, dimensionless.
         creep: Share of a touch charge that is lost in each decade of time, dimensionless.
@@ -115,68 +120,80 @@ class Amplifier:
             )
 
     def start(self, electrodes: int, rate: float, rng: np.random.Generator) -> "Measurement":
-        """Start a measurement with random mismatches after the amplifier has settled.
+        """Draw the random properties of each channel, and start a measurement with a settled amplifier.
 
         Args:
-            electrodes: Number of channels.
+            electrodes: Number of electrodes, each of which has one channel.
             rate: Readings per second, Hz.
-            rng: Generator of the mismatches and of the noise of all readings.
+            rng: Generator of the properties of the channels and of the noise of all readings.
 
         Returns:
-            The measurement, with the properties of each channel.
+            The measurement, with the drawn properties of each channel.
         """
-        # The order of these calls determines the random numbers of each property.
-        tau = self.tau * (1.0 + self.tau_mismatch * rng.standard_normal(electrodes))
+        # Do not change the order of the statements, because it determines which random numbers each property gets.
+        leak_time = self.tau * (1.0 + self.tau_mismatch * rng.standard_normal(electrodes))
         gain = 1.0 + self.gain_mismatch * rng.standard_normal(electrodes)
         bias = self.bias * rng.choice([-1.0, 1.0], electrodes)
         offset = self.offset * rng.standard_normal(electrodes)
-        phase = rng.uniform(0.0, 2.0 * np.pi, electrodes)
-        pyro = np.full(electrodes, self.pyro)
-        if self.pyro_mismatch:  # without this mismatch, no random numbers are drawn
-            pyro = self.pyro * (1.0 + self.pyro_mismatch * rng.standard_normal(electrodes))
-        return Measurement(self, rate, rng, tau, gain, bias, offset, phase, pyro)
+        hum_phase = rng.uniform(0.0, 2.0 * np.pi, electrodes)
+
+        # Without a mismatch of the pyroelectric charges, no random numbers are drawn for them.
+        pyro_charge_per_K = np.full(electrodes, self.pyro)
+        if self.pyro_mismatch:
+            pyro_charge_per_K = self.pyro * (1.0 + self.pyro_mismatch * rng.standard_normal(electrodes))
+        return Measurement(
+            amplifier=self,
+            rate=rate,
+            rng=rng,
+            leak_time=leak_time,
+            gain=gain,
+            bias=bias,
+            offset=offset,
+            hum_phase=hum_phase,
+            pyro_charge_per_K=pyro_charge_per_K,
+        )
 
 
 @dataclass
 class Measurement:
-    """Running measurement, which is called with successive blocks of touch charges and returns their readings.
+    """Running measurement that converts successive blocks of touch charges into readings.
 
     Attributes:
         amplifier: Parameters of the measuring chain.
         rate: Readings per second, Hz.
         rng: Generator of the noise.
-        tau: Time constant of the leak of each channel, shape (electrodes,), s.
+        leak_time: Time constant of the leak of each channel, shape (electrodes,), s.
         gain: Gain of each channel, shape (electrodes,), dimensionless.
         bias: Bias current of each channel, shape (electrodes,), pC/s.
         offset: Offset of each channel, shape (electrodes,), pC.
-        phase: Phase of the hum of each channel, shape (electrodes,), rad.
-        pyro: Pyroelectric charge of each electrode per temperature change, shape (electrodes,), pC/K.
+        hum_phase: Phase of the hum of each channel, shape (electrodes,), rad.
+        pyro_charge_per_K: Pyroelectric charge of each electrode per temperature change, shape (electrodes,), pC/K.
     """
 
     amplifier: Amplifier
     rate: float
     rng: np.random.Generator
-    tau: Array
+    leak_time: Array
     gain: Array
     bias: Array
     offset: Array
-    phase: Array
-    pyro: Array
+    hum_phase: Array
+    pyro_charge_per_K: Array
     _readings: int = 0
     _film_charge: Array = field(init=False)
     _output: Array = field(init=False)
     _air_temperature: float = field(init=False)
     _film_temperature: float = field(init=False)
-    _relaxation: Array = field(init=False)
+    _creep_filter_state: Array = field(init=False)
     _touch_charge: Array = field(init=False)
 
     def __post_init__(self) -> None:
         """Draw the initial temperatures, and set all charges to their stationary values at these temperatures."""
         amplifier = self.amplifier
 
-        # Draw correlated temperatures of the air and the film. The film has the standard deviation `temperature_rms`.
-        # The low-pass filter of the film reduces the standard deviation of the air by the factor `correlation`, which
-        # is also the correlation of the two stationary temperatures.
+        # Draw correlated temperatures of the air and the film. The temperature of the film has the standard deviation
+        # `temperature_rms`. The film responds to the air as a low-pass filter, which multiplies the standard deviation
+        # of the temperature by the factor `correlation`. This factor is also the correlation of the two temperatures.
         common, independent = amplifier.temperature_rms * self.rng.standard_normal(2)
         variance_ratio = self._variance_ratio
         correlation = math.sqrt(variance_ratio)
@@ -184,26 +201,30 @@ class Measurement:
         self._film_temperature = correlation * common + math.sqrt(1.0 - variance_ratio) * independent
 
         # There is no touch before the measurement, so the film has only its pyroelectric charge.
-        self._film_charge = self.pyro * self._film_temperature
+        self._film_charge = self.pyro_charge_per_K * self._film_temperature
         self._touch_charge = np.zeros_like(self.gain)
-        self._relaxation = np.zeros((CREEP_TIMES.size + 1, 1, self.gain.size))
+        # State of the filters in `_apply_creep`: one filter for each creep time and one for the thermoelastic effect
+        self._creep_filter_state = np.zeros((CREEP_TIMES.size + 1, 1, self.gain.size))
+
+        # The stationary output satisfies output = decay * output + bias / rate for each channel. Without a leak, there
+        # is no stationary output, and the output starts at zero.
         self._output = np.zeros_like(self.gain)
         has_leak = math.isfinite(amplifier.tau)
         if has_leak:
-            # In the stationary state, output = decay * output + bias / rate for each channel.
-            decay = np.exp(-1.0 / (self.rate * self.tau))  # of the output between two readings
+            decay = np.exp(-1.0 / (self.rate * self.leak_time))  # factor of the output from one reading to the next
             self._output = self.bias / (1.0 - decay) / self.rate
 
     def __call__(self, charge: Array, charge_per_K: Array | None = None) -> Array:
         """Simulate the readings of the next block of touch charges.
 
-        The charges pass through the film (temperature, creep, pyroelectric charge), the amplifiers, the hum, the noise
-        and the converter, in this order. The state at the end of the block is stored for the next block.
+        The simulation applies the effects of the film, the amplifiers, the hum, the noise and the converter in this
+        order. The state of the measuring chain at the end of the block is stored for the next block.
 
         Args:
             charge: Touch charges, shape (n, electrodes), pC.
-            charge_per_K: Change of the touch charges per kelvin of the film, because the pretension of a warm film is
-                smaller, shape (n, electrodes), pC/K. None if the temperature does not change the touch charges.
+            charge_per_K: Change of the touch charges per temperature change of the film, shape (n, electrodes), pC/K.
+                The touch charges change because the pretension of a warm film is smaller. None if the temperature does
+                not change the touch charges.
 
         Returns:
             Readings, shape (n, electrodes), pC.
@@ -211,28 +232,29 @@ class Measurement:
         time = (self._readings + np.arange(len(charge))) / self.rate
         self._readings += len(charge)
 
-        # Charge of the film, output of the amplifiers, and disturbances of the output
-        temperature = self._temperature(time)[:, np.newaxis]  # relative to the mean, shape (n, 1), K
-        if charge_per_K is not None:
-            charge = charge + charge_per_K * temperature
-        film_charge = self._relaxed(charge) + self.pyro * temperature
+        # Charge of the film
+        temperature = self._simulate_temperature(time)[:, np.newaxis]  # difference from the mean, shape (n, 1), K
+        touch_charge = charge if charge_per_K is None else charge + charge_per_K * temperature
+        film_charge = self._apply_creep(touch_charge) + self.pyro_charge_per_K * temperature
+
+        # Output of the amplifiers, and disturbances of the output
         output = self._integrate(film_charge) + self.offset
-        hum_angle = 2.0 * np.pi * self.amplifier.hum_frequency * time[:, np.newaxis] + self.phase
+        hum_angle = 2.0 * np.pi * self.amplifier.hum_frequency * time[:, np.newaxis] + self.hum_phase
         output_with_hum = output + self.amplifier.hum * np.sin(hum_angle)
         noisy_output = self.amplifier.noise.add(output_with_hum, self.rng)
         return self._convert(noisy_output)
 
-    def _relaxed(self, charge: Array) -> Array:
-        """Compute the effect of creep and of the thermoelastic effect on touch charges.
+    def _apply_creep(self, charge: Array) -> Array:
+        """Apply creep and the thermoelastic effect to touch charges.
 
-        Both effects are sums of decaying exponentials. Each exponential is computed by a recursive filter of the
-        changes of the charge. The state of the filter is stored for the next call.
+        The response of the charge to a step is a sum of decaying exponentials. For each exponential, a recursive filter
+        is applied to the changes of the charge. The state of each filter is stored for the next call.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
 
         Returns:
-            Charges with creep and thermoelastic effect, same shape, pC.
+            Touch charges with creep and thermoelastic effect, same shape, pC.
         """
         amplifier = self.amplifier
         if not amplifier.creep and not amplifier.thermoelastic:
@@ -240,31 +262,34 @@ class Measurement:
         changes = np.diff(charge, axis=0, prepend=self._touch_charge[np.newaxis])
         self._touch_charge = charge[-1]
 
-        # Time constants and amplitudes of the exponentials: those of the creep, then the thermoelastic effect
+        # The last exponential describes the thermoelastic effect, and all others describe the creep. The creep has two
+        # exponentials per decade of time, so each has half of the amplitude of a decade.
         time_constants = np.append(CREEP_TIMES, amplifier.film_time)
-        creep_amplitudes = np.full(CREEP_TIMES.size, 0.5 * amplifier.creep)  # two terms per decade
+        creep_amplitudes = np.full(CREEP_TIMES.size, 0.5 * amplifier.creep)
         amplitudes = np.append(creep_amplitudes, amplifier.thermoelastic)
-        # With this factor, the creep changes nothing one second after a touch.
-        factor = 1.0 - 0.5 * amplifier.creep * np.exp(-1.0 / CREEP_TIMES).sum()
-        relaxed: Array = factor * charge
+
+        # The constant part of the response is chosen such that the creep is zero one second after a touch.
+        constant_part = 1.0 - 0.5 * amplifier.creep * np.exp(-1.0 / CREEP_TIMES).sum()
+        charge_with_creep: Array = constant_part * charge
         for index, (time_constant, amplitude) in enumerate(zip(time_constants, amplitudes, strict=True)):
             decay = math.exp(-1.0 / (self.rate * time_constant))
             # exponential[n] = decay * exponential[n - 1] + amplitude * changes[n]
-            exponential, self._relaxation[index] = scipy.signal.lfilter(
-                [amplitude], [1.0, -decay], changes, axis=0, zi=self._relaxation[index]
+            exponential, self._creep_filter_state[index] = scipy.signal.lfilter(
+                [amplitude], [1.0, -decay], changes, axis=0, zi=self._creep_filter_state[index]
             )
-            relaxed = relaxed + exponential
-        return relaxed
+            charge_with_creep = charge_with_creep + exponential
+        return charge_with_creep
 
     @property
     def _variance_ratio(self) -> float:
-        """Stationary variance of the temperature of the film divided by that of the air, dimensionless."""
+        """Stationary variance of the film temperature divided by the variance of the air temperature, dimensionless."""
         return self.amplifier.temperature_time / (self.amplifier.temperature_time + self.amplifier.film_time)
 
-    def _temperature(self, time: Array) -> Array:
+    def _simulate_temperature(self, time: Array) -> Array:
         """Simulate the temperature of the film relative to its mean.
 
-        The drift of the air is a first-order autoregressive process, and the film is a first-order low-pass filter.
+        The temperature of the air drifts as a first-order autoregressive process, and changes by the temperature step.
+        The temperature of the film follows the temperature of the air as a first-order low-pass filter.
 
         Args:
             time: Times of the readings, shape (n,), s.
@@ -276,29 +301,35 @@ class Measurement:
         air_decay = math.exp(-1.0 / (self.rate * amplifier.temperature_time))
         film_decay = math.exp(-1.0 / (self.rate * amplifier.film_time))
 
-        # Drift of the air: drift[n] = air_decay * drift[n - 1] + innovations[n]. The innovations are scaled such that
-        # the temperature of the film has the standard deviation `temperature_rms`.
+        # The drift of the air is drift[n] = air_decay * drift[n - 1] + innovations[n]. The innovations are scaled such
+        # that the temperature of the film has the standard deviation `temperature_rms`.
         innovation_std = math.sqrt((1.0 - air_decay * air_decay) / self._variance_ratio) * amplifier.temperature_rms
         innovations = innovation_std * self.rng.standard_normal(time.size)
         air_start = [air_decay * self._air_temperature]
         drift, _ = scipy.signal.lfilter([1.0], [1.0, -air_decay], innovations, zi=air_start)
 
-        # Trapezoidal change of the temperature of the air: ramp up, constant value, ramp down
+        # The temperature step of the air has the shape of a trapezium: it rises, remains constant, and falls again.
         time_since_step = time - amplifier.step_at
         time_until_end = amplifier.step_for - time_since_step
         relative_step = np.clip(np.minimum(time_since_step, time_until_end) / amplifier.step_time, 0.0, 1.0)
-        air = drift + amplifier.step * relative_step
+        air_temperature = drift + amplifier.step * relative_step
 
-        # Low-pass filter of the film: film[n] = film_decay * film[n - 1] + (1 - film_decay) * air[n]
+        # The film is a low-pass filter: film[n] = film_decay * film[n - 1] + (1 - film_decay) * air[n]
         film_start = [film_decay * self._film_temperature]
-        film: Array
-        film, _ = scipy.signal.lfilter([1.0 - film_decay], [1.0, -film_decay], air, zi=film_start)
+        film_temperature: Array
+        film_temperature, _ = scipy.signal.lfilter(
+            [1.0 - film_decay], [1.0, -film_decay], air_temperature, zi=film_start
+        )
+
+        # Store the state for the next call. The step of the air is not stored, because it follows from the time.
         self._air_temperature = float(drift[-1])
-        self._film_temperature = float(film[-1])
-        return film
+        self._film_temperature = float(film_temperature[-1])
+        return film_temperature
 
     def _integrate(self, film_charge: Array) -> Array:
         """Compute the output of the charge amplifiers, which are leaky integrators.
+
+        The last charges and the last output are stored for the next call.
 
         Args:
             film_charge: Charges of the film, shape (n, n_electrode), pC.
@@ -308,11 +339,11 @@ class Measurement:
         """
         changes = np.diff(film_charge, axis=0, prepend=self._film_charge[np.newaxis])
         self._film_charge = film_charge[-1]
-        bias_charge = self.bias / self.rate  # charge of the bias current between two readings
+        bias_charge = self.bias / self.rate  # charge of the bias current between two readings, shape (n_electrode,)
         inputs = self.gain * changes + bias_charge
 
-        # Each channel has its own time constant: output[n] = decay * output[n - 1] + inputs[n]
-        decays = np.exp(-1.0 / (self.rate * self.tau))
+        # Each channel has its own time constant. Its filter is output[n] = decay * output[n - 1] + inputs[n].
+        decays = np.exp(-1.0 / (self.rate * self.leak_time))
         output = np.empty_like(inputs)
         for channel, decay in enumerate(decays):
             start = [decay * self._output[channel]]
@@ -322,7 +353,7 @@ class Measurement:
         return output
 
     def _convert(self, output: Array) -> Array:
-        """Clip the output at the limit of the amplifier, and round it to the steps of the analogue-digital converter.
+        """Clip the output at the limits of the amplifier, and round the output to the codes of the converter.
 
         Args:
             output: Output charges, shape (n, n_electrode), pC.

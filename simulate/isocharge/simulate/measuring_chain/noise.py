@@ -1,10 +1,11 @@
-"""Noise model of the measuring chain. Training, Cramer-Rao limits and the virtual sensor use this model.
+"""Noise model of the measuring chain for the training of networks, for Cramer-Rao limits and for the virtual sensor.
 
-The noise is independent between channels and readings, with the variance
+The noise of different channels and different readings is independent. The noise of a charge Q has the variance
 
-    sigma^2 = white^2 + (gain * Q)^2.
+    sigma^2 = white^2 + (gain * Q)^2,
 
-The module `measuring_chain.amplifier` simulates leak, hum, drift, temperature, mismatch and clipping.
+where `white` is the standard deviation for a charge of zero, and `gain` is the relative noise of large charges. The
+module `measuring_chain.amplifier` simulates the other disturbances, such as leak, hum, drift and clipping.
 """
 
 import math
@@ -18,12 +19,13 @@ from isocharge.common.errors import InputError
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Independent Gaussian noise of each reading.
+    """Gaussian noise that is independent for each reading.
 
     Attributes:
-        name: Name of the level.
-        white: Standard deviation that does not depend on the charge, pC.
-        gain: Standard deviation proportional to the charge, divided by the charge, dimensionless.
+        name: Name of the noise level.
+        white: Standard deviation of the part of the noise that does not depend on the charge, pC.
+        gain: Standard deviation of the part of the noise that is proportional to the charge, divided by the charge,
+            dimensionless.
     """
 
     name: str
@@ -37,19 +39,35 @@ class NoiseModel:
                 raise InputError(f"noise {self.name!r}: {name}: expected a finite number from 0, got {value}")
 
     def sigma(self, charge: Array) -> Array:
-        """Compute the standard deviation (pC) for charges (pC) of any shape; the result has the same shape."""
+        """Compute the standard deviation of the noise for given charges.
+
+        Args:
+            charge: Charges of any shape, pC.
+
+        Returns:
+            Standard deviations of the same shape, pC.
+        """
         return np.hypot(self.white, self.gain * np.asarray(charge))
 
     def variance(self, charge: Array) -> Array:
-        """Compute the variance (pC^2) for charges (pC) of any shape. This is faster than squaring `sigma`."""
+        """Compute the variance of the noise for given charges.
+
+        This method is faster than squaring the result of `sigma`.
+
+        Args:
+            charge: Charges of any shape, pC.
+
+        Returns:
+            Variances of the same shape, pC^2.
+        """
         return self.white**2 + (self.gain * np.asarray(charge)) ** 2
 
     def information(self, charge: Array) -> Array:
         """Compute the Fisher information that one reading provides about its charge.
 
-        For a Gaussian whose mean and standard deviation both depend on the charge, the information is (1 + 2 (d sigma /
-        dQ)^2) / sigma^2 (Kay 1993, equation 3.31). The inverse of the information is the smallest variance of an
-        unbiased estimate of the charge.
+        A reading is Gaussian, and both its mean and its standard deviation sigma depend on the charge Q. The
+        information of the reading is therefore (1 + 2 (d sigma / dQ)^2) / sigma^2 (Kay 1993, equation 3.31). The
+        inverse of the information is the smallest variance that an unbiased estimate of the charge can have.
 
         Args:
             charge: Charges of any shape, pC.
@@ -61,9 +79,17 @@ class NoiseModel:
         return (1.0 + 2.0 * (self.gain**2 * np.asarray(charge)) ** 2 / variance) / variance
 
     def add(self, charge: Array, rng: np.random.Generator) -> Array:
-        """Add noise to charges (pC) of any shape."""
+        """Add random noise to charges.
+
+        Args:
+            charge: Charges without noise, any shape, pC.
+            rng: Generator of the noise.
+
+        Returns:
+            Charges with noise, same shape, pC.
+        """
         return charge + self.sigma(charge) * rng.standard_normal(np.shape(charge))
 
     def to_dict(self) -> dict[str, float | str]:
-        """Return name and parameters for metadata."""
+        """Return the name and the parameters of the noise as a dictionary for the metadata of a model."""
         return {"name": self.name, "white_pC": self.white, "gain": self.gain}

@@ -1,4 +1,4 @@
-"""Noise models and amplifiers for the levels clean, reference, bench and surgery, and their reader from a TOML file."""
+"""Built-in noise models and amplifiers, and functions that read a noise model or an amplifier from a TOML file."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,10 @@ NOISE_LEVELS = {
     "bench": NoiseModel("bench", 0.3, 0.0),
     "surgery": NoiseModel("surgery", 1.0, 0.0),
 }
-"""Noise models of the levels. For `bench` and `surgery`, they are the memoryless part of the amplifiers."""
+"""Noise model of each noise level.
+
+For the levels `bench` and `surgery`, the noise model is the part of the amplifier without memory.
+"""
 
 BENCH = Amplifier(
     noise=NOISE_LEVELS["bench"],
@@ -39,7 +42,7 @@ AMPLIFIER_LEVELS = {
     "bench": BENCH,
     "surgery": replace(BENCH, noise=NOISE_LEVELS["surgery"], hum=5.0, step=0.5),
 }
-"""Amplifiers of the levels."""
+"""Amplifier of each noise level."""
 
 KEY_NAMES = {
     "tau": "tau_s",
@@ -57,9 +60,9 @@ KEY_NAMES = {
     "film_time": "film_time_s",
     "limit": "limit_pC",
 }
-"""Keys of the TOML file by the attributes of `Amplifier`.
+"""Keys of the TOML file that differ from the names of the attributes of `Amplifier`, because the keys contain the unit.
 
-These keys differ from the attributes, because they contain the unit.
+The dictionary maps the name of each attribute to the key.
 """
 
 AmplifierFile = defstruct(
@@ -78,9 +81,10 @@ AmplifierFile = defstruct(
     frozen=True,
     rename=KEY_NAMES,
 )
-"""Content of the TOML file: the noise, and the attributes of `Amplifier` with their bounds.
+"""Content of the TOML file, which consists of the parameters of the noise and the attributes of `Amplifier`.
 
-An absent key has the value of the level `like`.
+The values must be within the bounds of the types of the attributes. If a key is absent, the value of the level `like`
+is used.
 """
 
 
@@ -94,7 +98,10 @@ def load_amplifier(level: str) -> Amplifier:
         tau_s = 1.0          # inf for no leak
 
     Args:
-        level: Name of a level, or path of a TOML file.
+        level: Name of a noise level, or path of a TOML file.
+
+    Returns:
+        The amplifier. The noise of an amplifier from a file is named after the file.
 
     Raises:
         InputError: If the level or the file does not exist, if a key is unknown or its value is out of range, or if
@@ -107,19 +114,20 @@ def load_amplifier(level: str) -> Amplifier:
     file = read_toml(Path(level), "the description of noise", InputError, AmplifierFile)
     changes: dict[str, Any] = {name: value for name, value in structs.asdict(file).items() if value is not None}
 
-    # The keys of the noise are removed from the changes, so that the remaining keys are attributes of the amplifier.
+    # Remove the level and the parameters of the noise, because the remaining keys must be attributes of the amplifier.
     similar_amplifier = AMPLIFIER_LEVELS[changes.pop("like")]
     white = changes.pop("white_pC", similar_amplifier.noise.white)
     gain = changes.pop("proportional", similar_amplifier.noise.gain)
     name = Path(level).stem
     with error_prefix(f"{level}: ", InputError):
-        return replace(similar_amplifier, noise=NoiseModel(name, white, gain), **changes)
+        noise = NoiseModel(name, white, gain)
+        return replace(similar_amplifier, noise=noise, **changes)
 
 
 def noise_model(level: str) -> NoiseModel:
     """Return the built-in noise model of a level, or a noise model that is described in a TOML file.
 
-    The file may describe a complete measuring chain (`load_amplifier`). Only the memoryless noise is returned.
+    If the file describes a complete measuring chain, only the part of its noise without memory is returned.
 
     Example of a file:
 
@@ -128,10 +136,11 @@ def noise_model(level: str) -> NoiseModel:
         proportional = 0.001    # standard deviation divided by the charge
 
     Args:
-        level: Name of a level, or path of a TOML file.
+        level: Name of a noise level, or path of a TOML file.
 
     Raises:
-        InputError: If the level or the file does not exist, or if a key is unknown or its value out of range.
+        InputError: If the level or the file does not exist, if a key is unknown or its value is out of range, or if
+            the resolution of the converter is given without a limit.
     """
     if level in NOISE_LEVELS:
         return NOISE_LEVELS[level]

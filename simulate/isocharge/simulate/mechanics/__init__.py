@@ -1,1 +1,1 @@
-"""Mechanics of the film in dimensionless form: energy, stress, scaling, temperature and the choice of the theory."""
+"""Mechanics of the film in dimensionless form, and the choice of the theory that describes a film."""

@@ -1,10 +1,12 @@
-"""Pressure on the whole film: a static pressure, and the pressure of the air that is trapped behind the film.
+"""Energy of the pressure on the whole film, which consists of a static pressure and the pressure of trapped air.
 
-Let V0 be the volume of a closed cavity, and p0 the pressure of the atmosphere. If the film displaces the volume V, the
-pressure of the trapped air rises by p0 V0 / (V0 - V) - p0 (Boyle's law, at constant temperature). The energy of the air
-is -p0 V0 (ln(1 - V / V0) + V / V0). The static pressure and the pressure of the air act along the direction of the push
-on the area of the undeformed film, as in the theory of plates. In the units of `mechanics.scaling`, V / V0 is the
-product of `compression` and the integral of W over the film.
+Let V0 be the volume of the closed cavity behind the film, and let p0 be the pressure of the atmosphere. If the film
+displaces the volume V at constant temperature, the pressure of the trapped air rises by p0 V0 / (V0 - V) - p0 (Boyle's
+law). The energy of the trapped air is -p0 V0 (ln(1 - V / V0) + V / V0).
+
+Both pressures act perpendicular to the undeformed film and on its undeformed area, as in the theory of plates. In the
+units of `mechanics.scaling`, the ratio V / V0 is the integral of the deflection W over the film, multiplied by the
+dimensionless group `compression`.
 """
 
 from functools import cached_property
@@ -16,12 +18,14 @@ from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.placed_mesh import Geometry
 
 SERIES_BELOW = 1e-3
-"""Compression below which the energy of the air is computed by a series, because the formula with the logarithm loses
-digits."""
+"""Displaced share of the volume of the air below which the energy of the air is computed by a Taylor series.
+
+For smaller values, the formula with the logarithm loses digits.
+"""
 
 
 class BackPressure:
-    """Energy of the static pressure and of the trapped air, for one mesh and one set of dimensionless groups.
+    """Energy of the static pressure and of the trapped air for a given mesh and given dimensionless groups.
 
     Attributes:
         geometry: Elements of the mesh.
@@ -31,84 +35,99 @@ class BackPressure:
     def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
         self.geometry = geometry
         self.groups = groups
-        self._copies = 1.0 / float(geometry.load.sum())  # number of copies of the mesh that cover the film
+        # The nodal loads add up to one divided by the number of copies of the mesh that cover the whole film.
+        self._copies = 1.0 / float(geometry.load.sum())
 
     @cached_property
     def weights(self) -> Array:
-        """Integration weights of the nodes for the volume of the meshed part of the film, shape (n_node,)."""
+        """Weights of the nodes in the integral of the deflection over the meshed part of the film, shape (n_node,)."""
         return self.geometry.gather(self.geometry.mass)
 
     def energy(self, deflection: Array) -> float:
-        """Compute the energy of the pressures on the meshed part of the film for a deflection W, shape (n_node,).
+        """Compute the energy of both pressures on the meshed part of the film.
 
-        The result is the energy of the trapped air minus the work of the static pressure, divided by the number of
-        copies of the mesh that cover the film. The energy is infinite if the film displaces the whole volume of the
-        air.
+        The energy of the whole film is the energy of the trapped air minus the work of the static pressure. The energy
+        of the meshed part is the energy of the whole film divided by the number of copies of the mesh that cover the
+        film.
+
+        Args:
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
+
+        Returns:
+            Energy, dimensionless. It is infinite if the film displaces the whole volume of the air.
         """
         volume = self._volume(deflection)
         static_work = self.groups.static_pressure * volume
-        if self.groups.compression == 0.0:
+        has_trapped_air = self.groups.compression != 0.0
+        if not has_trapped_air:
             return -static_work / self._copies
-        # `_air_energy` is relative to p0 V0. In scaled units, V0 is 1 / compression.
-        air_energy = self.groups.ambient_pressure / self.groups.compression * self._air_energy(deflection)
+        # `_relative_air_energy` is divided by p0 V0. In scaled units, the volume V0 of the air is 1 / compression.
+        energy_unit = self.groups.ambient_pressure / self.groups.compression
+        air_energy = energy_unit * self._relative_air_energy(deflection)
         return (air_energy - static_work) / self._copies
 
     def forces(self, deflection: Array) -> Array:
-        """Compute the derivatives of the energy with respect to W at the nodes, shape (n_node,).
-
-        The derivatives are infinite if the film displaces the whole volume of the air.
+        """Compute the derivatives of the energy with respect to the deflection of each node.
 
         Args:
-            deflection: W at the nodes, shape (n_node,).
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
+
+        Returns:
+            Derivatives, shape (n_node,). They are infinite if the film displaces the whole volume of the air.
         """
         # At constant temperature, the pressure p0 of the air increases by p0 x / (1 - x), where x = V / V0 is the
-        # displaced share of its volume.
-        compression = self.groups.compression * self._volume(deflection)
-        if compression >= 1.0:
+        # displaced share of the volume of the air.
+        displaced_share = self.groups.compression * self._volume(deflection)
+        if displaced_share >= 1.0:
             return np.full_like(deflection, np.inf)
-        air_pressure = 0.0
-        if compression != 0.0:
-            air_pressure = self.groups.ambient_pressure * compression / (1.0 - compression)
+        air_pressure = 0.0  # if no air is trapped, or if no volume is displaced
+        if displaced_share != 0.0:
+            air_pressure = self.groups.ambient_pressure * displaced_share / (1.0 - displaced_share)
         pressure = air_pressure - self.groups.static_pressure
         return pressure * self.weights
 
     def stiffness(self, deflection: Array) -> float:
-        """Compute the factor c of the second derivatives c * weights[i] * weights[j] of the energy.
+        """Compute the factor c in the second derivatives c * weights[i] * weights[j] of the energy.
 
         Args:
-            deflection: W at the nodes, shape (n_node,).
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
         """
-        compression = self.groups.compression * self._volume(deflection)
-        slope = self.groups.ambient_pressure * self.groups.compression / (1.0 - compression) ** 2
-        return float(self._copies * slope)
+        displaced_share = self.groups.compression * self._volume(deflection)
+        pressure_per_volume = self.groups.ambient_pressure * self.groups.compression / (1.0 - displaced_share) ** 2
+        return float(self._copies * pressure_per_volume)
 
     def static_work(self, deflection: Array) -> float:
-        """Compute the work of the static pressure on the meshed part, for W of shape (n_node,)."""
+        """Compute the work of the static pressure on the meshed part of the film.
+
+        Args:
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
+        """
         return self.groups.static_pressure * self._volume(deflection) / self._copies
 
     def _volume(self, deflection: Array) -> float:
-        """Compute the integral of W over the whole film."""
+        """Compute the integral of the scaled deflection W over the whole film."""
         return self._copies * float(self.weights @ deflection)
 
-    def _air_energy(self, deflection: Array) -> float:
-        """Compute the ratio of the energy of the air to p0 V0.
+    def _relative_air_energy(self, deflection: Array) -> float:
+        """Compute the energy of the trapped air, divided by p0 V0.
 
-        The ratio is -ln(1 - x) - x for the relative compression x = V / V0.
+        The result is -ln(1 - x) - x, where x = V / V0 is the displaced share of the volume of the air.
 
         Args:
-            deflection: W at the nodes, shape (n_node,).
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
 
         Returns:
-            Energy, dimensionless; infinite if no air remains.
+            Energy, dimensionless. It is infinite if the film displaces the whole volume of the air.
         """
-        x = self.groups.compression * self._volume(deflection)
-        if x >= 1.0:
+        displaced_share = self.groups.compression * self._volume(deflection)
+        if displaced_share >= 1.0:
             return np.inf
-        if abs(x) >= SERIES_BELOW:
-            return float(-np.log1p(-x) - x)
+        if abs(displaced_share) >= SERIES_BELOW:
+            return float(-np.log1p(-displaced_share) - displaced_share)
 
-        # Taylor series x^2 / 2 + x^3 / 3 + ... + x^6 / 6, evaluated by Horner's scheme
+        # For small x, the formula loses digits. The Taylor series x^2 / 2 + x^3 / 3 + ... + x^6 / 6 is evaluated by
+        # Horner's scheme instead.
         series = 1.0 / 6.0
         for exponent in (5.0, 4.0, 3.0, 2.0):
-            series = 1.0 / exponent + x * series
-        return x**2 * series
+            series = 1.0 / exponent + displaced_share * series
+        return displaced_share**2 * series

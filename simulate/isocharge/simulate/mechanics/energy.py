@@ -1,20 +1,25 @@
-"""Potential energy of the film under a load, with its first and second derivatives.
+"""Potential energy of the film under a load, and its first and second derivatives.
+
+The potential energy of the film is
 
     Pi = stretching energy + bending energy + pressure energy - load * mean(W) - dot(side load, mean(U1, U2)).
 
-The means are taken over the footprint and weighted with the pressure of the probe. The module `mechanics.back_pressure`
-computes the pressure energy, which belongs to the pressure on the whole film.
+The two means are taken over the footprint of the probe and weighted with the pressure of the probe. The module
+`mechanics.back_pressure` computes the pressure energy, which belongs to the pressure on the whole film.
 
 The energy is a function of the scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3). Lengths are in units
-of the film radius a. With the amplitude A of `isocharge.simulate.mechanics.scaling`, the displacements and the
-Green-Lagrange strain are
+of the film radius a. The displacements w and u, and the Green-Lagrange strain E, are
 
-    w = a A W,   u = a A^2 U,   E = A^2 [ sym grad U + grad W (x) grad W / 2 + A^2 (grad U)^T grad U / 2 ].
+    w = a A W,   u = a A^2 U,   E = A^2 [ sym grad U + grad W (x) grad W / 2 + A^2 (grad U)^T grad U / 2 ],
 
-The expression in brackets is the scaled strain E', which is of order one for every force. The stress is that of
-Saint-Venant-Kirchhoff elasticity in plane stress, S = E_young A^2 (C : E' + tau I). Energies are in units of E_young h
-a^2 A^4. If the film is anisotropic, a matrix is added to C and a deviator to tau I (`scaling.Anisotropy`). The bending
-stiffness of an anisotropic film is that of the isotropic film.
+where A is the amplitude of the press, which the module `mechanics.scaling` computes. The expression in brackets is the
+scaled strain E'. The scaled strain is of order one for every force.
+
+The stress follows from Saint-Venant-Kirchhoff elasticity in plane stress as S = E_young A^2 (C : E' + tau I). In this
+formula, C is the elasticity matrix divided by Young's modulus, tau is the scaled pretension, and I is the unit tensor.
+Energies are in units of E_young h a^2 A^4, where h is the thickness of the film. For an anisotropic film, a matrix is
+added to C, and a deviator is added to tau I (`scaling.Anisotropy`). The bending stiffness is always computed for an
+isotropic film.
 """
 
 from dataclasses import replace
@@ -35,19 +40,19 @@ COMPONENT_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 SHIFT = 5.0
 """Shift s of the linear solves with bending; see `Bending`.
 
-It must lie between 0 and 11.56, which is twice the lowest eigenvalue of the film.
+The shift must lie between 0 and 11.56, which is twice the lowest eigenvalue of the film.
 """
 
 
 class ElasticFilm:
-    """The film as a discrete elastic system, for one mesh and one set of dimensionless groups.
+    """Discrete elastic model of the film for a given mesh and given dimensionless groups.
 
     Attributes:
-        geometry: Elements of the mesh.
+        geometry: Integration rules of the elements of the mesh.
         groups: Dimensionless groups of the press.
         membrane: Stretching energy.
         bending: Bending energy; None if the theory omits bending.
-        back: Energy of the pressure on the whole film; None if there is none.
+        back: Energy of the pressure on the whole film; None if no such pressure acts.
     """
 
     def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
@@ -59,7 +64,7 @@ class ElasticFilm:
 
     @property
     def components(self) -> int:
-        """Number of unknowns per node of the linear solves."""
+        """Number of unknowns per node in the linear solves."""
         return 3 if self.bending is None else 4
 
     @property
@@ -68,10 +73,10 @@ class ElasticFilm:
         return self.groups.side_load != (0.0, 0.0)
 
     def energy(self, field: Array) -> float:
-        """Compute the potential energy Pi of a field: the stored energy minus the work of the probe.
+        """Compute the potential energy of a field, which is the stored energy minus the work of the probe.
 
         Args:
-            field: Scaled displacements (U1, U2, W), shape (n_node, 3).
+            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
         """
         in_plane = field[:, :2]
         deflection = field[:, 2]
@@ -86,10 +91,10 @@ class ElasticFilm:
         return stored_energy - work
 
     def residual(self, field: Array) -> Array:
-        """Compute the gradient of Pi: internal minus external forces at the nodes.
+        """Compute the gradient of the potential energy, which is the internal minus the external force at each node.
 
         Args:
-            field: Scaled displacements (U1, U2, W), shape (n_node, 3).
+            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
 
         Returns:
             Forces along (U1, U2, W), shape (n_node, 3).
@@ -100,13 +105,15 @@ class ElasticFilm:
             element_forces[..., 2] += self.bending.forces(deflection)
         residual = np.stack([self.geometry.gather(element_forces[..., i]) for i in range(3)], axis=1)
 
-        # Subtract the external forces: of the probe along W, of the pressure on the whole film, and of the probe in the
-        # plane. `back.forces` is a derivative of the energy, so it already has the opposite sign.
+        # Subtract the force of the probe perpendicular to the film, and its force in the plane of the film.
         residual[:, 2] -= self.groups.load * self.geometry.load
-        if self.back is not None:
-            residual[:, 2] += self.back.forces(deflection)
         if self.has_side_load:
             residual[:, :2] -= np.outer(self.geometry.load, self.groups.side_load)
+
+        # `back.forces` is the derivative of the energy, which is the negative force of the pressure on the whole film.
+        # Therefore the derivative is added.
+        if self.back is not None:
+            residual[:, 2] += self.back.forces(deflection)
         return residual
 
     @property
@@ -120,46 +127,52 @@ class ElasticFilm:
         """Compute the magnitude of the work of the probe, or of the static pressure if there is no probe.
 
         Args:
-            field: Scaled displacements, shape (n_node, 3).
+            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
         """
         if self.groups.load == 0.0 and self.back is not None:
             return abs(self.back.static_work(field[:, 2]))
         return self.groups.load * abs(float(self.geometry.load @ field[:, 2]))
 
     def in_plane_scale(self, field: Array) -> float:
-        """Compute the norm of the in-plane forces of the elements. The in-plane residual is divided by this norm.
+        """Compute the norm of the in-plane forces of the elements, by which the in-plane residual is divided.
 
         Args:
-            field: Scaled displacements, shape (n_node, 3).
+            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
         """
         return float(np.linalg.norm(self.membrane.forces(field)[..., :2]))
 
-    def tangent(self, field: Array, guard: float = 0.0) -> Array:
-        """Compute the element matrices of the linear solve, without the stiffness of trapped air.
+    def tangent(self, field: Array, added_tension: float = 0.0) -> Array:
+        """Compute the tangent matrix of each element, without the stiffness of trapped air.
 
-        The stiffness of trapped air couples all nodes, so `solver.tangent_factor` adds it separately.
+        The stiffness of trapped air couples all nodes of the mesh. Therefore `solver.tangent_factor` adds this
+        stiffness separately.
 
         Args:
-            field: Scaled displacements, shape (n_node, 3).
-            guard: Additional tension, in units of E_young A^2.
+            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
+            added_tension: Tension that is added to the pretension, in units of E_young A^2.
 
         Returns:
             Element matrices, shape (n_element, n_local, components, n_local, components).
         """
-        tangent = Membrane(self.geometry, self.groups.stiffened(guard)).tangent(field)
+        tangent = Membrane(self.geometry, self.groups.stiffened(added_tension)).tangent(field)
         if self.bending is None:
             return tangent
         return self.bending.extend(tangent)
 
 
 class Membrane:
-    """Stretching energy of the geometrically nonlinear membrane.
+    """Stretching energy of a geometrically nonlinear membrane.
 
-    The energy is integral( E' : C : E' / 2 + tau (tr E' - div U) ). The integral of div U over a clamped film is zero.
-    The term div U is subtracted, because its rounding errors would dominate the other terms for a large pretension. Let
-    F_ia = d_ia + A^2 U_i,a for i = 1, 2, and F_3a = W,a. The variation of E' is then sym(F_ia v_i,b) for all three
-    components of a test displacement v. The strain and the stress are derived by Bonet and Wood (2008, chapters 3 and
-    6), and the scaling by Schwerin (1929).
+    The energy is integral( E' : C : E' / 2 + tau (tr E' - div U) ), where E' is the scaled strain, C is the elasticity
+    matrix, tau is the scaled pretension and U is the in-plane displacement. The integral of div U over a clamped film
+    is zero. The term div U is nevertheless subtracted from tr E', because the rounding errors of this term would
+    dominate all other terms for a large pretension.
+
+    The scaled deformation gradient F has the components F_ia = d_ia + A^2 U_i,a for i = 1, 2, and F_3a = W,a. The
+    symbol d_ia is the Kronecker delta, and an index after a comma denotes a derivative. If v is a test displacement
+    with three components, the variation of the strain E' is sym(F_ia v_i,b), summed over i.
+
+    Bonet and Wood (2008, chapters 3 and 6) derive the strain and the stress. Schwerin (1929) derives the scaling.
     """
 
     def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
@@ -171,205 +184,225 @@ class Membrane:
         """
         self.geometry = geometry
         self.groups = groups
-        # Weights of the squares of the slopes of U1, U2 and W in the strain
-        self._scale = np.array([groups.squared_amplitude, groups.squared_amplitude, 1.0])
+        # Weights of the squared slopes of U1, U2 and W in the strain, shape (3,)
+        self._slope_weights = np.array([groups.squared_amplitude, groups.squared_amplitude, 1.0])
 
     @property
     def _deviator(self) -> Array | None:
-        """Difference between the pretension and its mean, over E_young A^2, shape (2, 2); None if isotropic."""
-        return None if self.groups.anisotropy is None else _tensor(self.groups.anisotropy.tension)
+        """Pretension minus its mean in units of E_young A^2, shape (2, 2). None if the pretension is isotropic."""
+        return None if self.groups.anisotropy is None else _symmetric_matrix(self.groups.anisotropy.tension)
 
-    def _stress(self, elastic_strain: Array) -> Array:
-        """Compute the stress C : E' of the film and its coat at the quadrature points, without the pretension.
+    def _elastic_stress(self, scaled_strain: Array) -> Array:
+        """Compute the stress of the film and its coat at the quadrature points, without the pretension.
 
         Args:
-            elastic_strain: Scaled strain E' as (E11, E22, 2 E12), shape (n_element, n_point, 3).
+            scaled_strain: Scaled strain E' as (E11, E22, 2 E12), shape (n_element, n_point, 3).
 
         Returns:
-            (S11, S22, S12), same shape.
+            Scaled stress (S11, S22, S12), same shape.
         """
-        elastic_stress = scaled_stress(elastic_strain, self.groups)
-        if self.geometry.coat is not None:
-            coated_elements, moduli = self.geometry.coat
-            elastic_stress[coated_elements] += (moduli @ elastic_strain[coated_elements][..., None])[..., 0]
+        elastic_stress = scaled_stress(scaled_strain, self.groups)
+        coat = self.geometry.coat
+        if coat is not None:
+            strain_column = scaled_strain[coat.elements][..., None]  # shape (n_coated_element, n_point, 3, 1)
+            elastic_stress[coat.elements] += (coat.moduli @ strain_column)[..., 0]
         return elastic_stress
 
-    def _slope(self, field: Array) -> Array:
+    def _slopes(self, field: Array) -> Array:
         """Compute the derivatives of (U1, U2, W) with respect to (X1, X2) at the quadrature points.
 
         Args:
-            field: Scaled displacements, shape (n_node, 3).
+            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
 
         Returns:
-            Derivatives, shape (n_element, n_point, 2, 3): the derivative, then the component.
+            Derivatives, shape (n_element, n_point, 2, 3). The last two axes are the coordinate and the displacement
+            component.
         """
-        slope = self.geometry.stacked @ field[self.geometry.nodes]
-        return slope.reshape(*self.geometry.gradient.shape[:3], 3)
+        slopes = self.geometry.stacked @ field[self.geometry.nodes]  # shape (n_element, n_point * 2, 3)
+        return slopes.reshape(*self.geometry.gradient.shape[:3], 3)
 
-    def _stretch(self, slope: Array) -> Array:
-        """Compute the scaled deformation gradient F = d_ia + A^2 U_i,a for i = 1, 2 and F_3a = W,a.
+    def _deformation_gradient(self, slopes: Array) -> Array:
+        """Compute the scaled deformation gradient F.
+
+        The components are F_ia = d_ia + A^2 U_i,a for i = 1, 2, and F_3a = W,a, where d_ia is the Kronecker delta.
 
         Args:
-            slope: d(U1, U2, W)/d(X1, X2), shape (..., 2, 3).
+            slopes: Derivatives of (U1, U2, W) with respect to (X1, X2), shape (..., 2, 3).
 
         Returns:
-            F with the indices (..., a, i), shape (..., 2, 3).
+            Components F_ia, shape (..., 2, 3). The last two axes are the indices a and i.
         """
-        stretch: Array = slope * self._scale
-        stretch[..., 0, 0] += 1.0
-        stretch[..., 1, 1] += 1.0
-        return stretch
+        deformation: Array = slopes * self._slope_weights
+        deformation[..., 0, 0] += 1.0
+        deformation[..., 1, 1] += 1.0
+        return deformation
 
     def energy(self, field: Array) -> float:
-        """Compute the stretching energy of a field: integral( E' : C : E' / 2 + tau (tr E' - div U) ).
+        """Compute the stretching energy integral( E' : C : E' / 2 + tau (tr E' - div U) ) of a field.
 
-        Here E' is the scaled strain, C the elasticity matrix, and tau the scaled pretension.
+        In this formula, E' is the scaled strain, C is the elasticity matrix, tau is the scaled pretension, and U is the
+        in-plane displacement.
 
         Args:
-            field: Scaled displacements (U1, U2, W), shape (n_node, 3).
+            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
 
         Returns:
             Energy of the meshed part of the film, dimensionless.
         """
-        slope = self._slope(field)  # shape (n_element, n_point, 2, 3): the derivative, then the component
-        elastic_strain = strain(slope, self.groups.squared_amplitude)
-        energy_density = 0.5 * np.sum(elastic_strain * self._stress(elastic_strain), axis=-1)
+        # The last two axes are the coordinate and the displacement component, shape (n_element, n_point, 2, 3).
+        slopes = self._slopes(field)
+        scaled_strain = strain(slopes, self.groups.squared_amplitude)
+        energy_density = 0.5 * np.sum(scaled_strain * self._elastic_stress(scaled_strain), axis=-1)
 
-        # tr E' - div U is half of the weighted sum of the squared slopes. If the pretension is not uniform in all
-        # directions, its deviator adds a similar term.
-        energy_density += 0.5 * self.groups.tension * np.sum(slope**2 @ self._scale, axis=-1)
+        # The difference tr E' - div U is half of the weighted sum of the squared slopes. If the pretension depends on
+        # the direction, its deviator adds a similar term.
+        energy_density += 0.5 * self.groups.tension * np.sum(slopes**2 @ self._slope_weights, axis=-1)
         if self._deviator is not None:
-            deviator_products = slope * (self._deviator @ slope)
-            energy_density += 0.5 * np.sum(deviator_products @ self._scale, axis=-1)
+            deviator_products = slopes * (self._deviator @ slopes)
+            energy_density += 0.5 * np.sum(deviator_products @ self._slope_weights, axis=-1)
         return float(np.sum(energy_density * self.geometry.weights))
 
     def forces(self, field: Array) -> Array:
         """Compute the internal forces of the elements, which are the gradient of the stretching energy.
 
         Args:
-            field: Scaled displacements, shape (n_node, 3).
+            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
 
         Returns:
             Forces, shape (n_element, n_local, 3).
         """
         geometry = self.geometry
-        slope = self._slope(field)
-        elastic_stress = self._stress(strain(slope, self.groups.squared_amplitude))
+        slopes = self._slopes(field)
+        scaled_strain = strain(slopes, self.groups.squared_amplitude)
+        elastic_stress = self._elastic_stress(scaled_strain)
 
-        # Derivative of the energy density with respect to the slopes, shape (n_element, n_point, 2, 3)
-        traction = _tensor(elastic_stress) @ self._stretch(slope)
-        traction += self.groups.tension * self._scale * slope
+        # The traction is the derivative of the energy density with respect to the slopes, shape (n_element, n_point, 2,
+        # 3). Its terms belong to the elastic stress, to the mean pretension and to the deviator of the pretension.
+        traction = _symmetric_matrix(elastic_stress) @ self._deformation_gradient(slopes)
+        traction += self.groups.tension * self._slope_weights * slopes
         if self._deviator is not None:
-            traction += self._scale * (self._deviator @ slope)
+            traction += self._slope_weights * (self._deviator @ slopes)
 
-        # Integral over the elements, with the derivatives of the basis functions
+        # Integrate the product of the traction and the derivatives of the basis functions over each element.
         weighted_traction = traction * geometry.weights[..., None, None]
-        transposed_gradient = geometry.stacked.transpose(0, 2, 1)
-        return np.asarray(transposed_gradient @ weighted_traction.reshape(len(traction), -1, 3))
+        stacked_traction = weighted_traction.reshape(len(traction), -1, 3)  # shape (n_element, n_point * 2, 3)
+        transposed_gradient = geometry.stacked.transpose(0, 2, 1)  # shape (n_element, n_local, n_point * 2)
+        return np.asarray(transposed_gradient @ stacked_traction)
 
     def tangent(self, field: Array) -> Array:
         """Compute the second derivatives of the stretching energy of the elements.
 
         Args:
-            field: Scaled displacements, shape (n_node, 3).
+            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
 
         Returns:
-            Second derivatives, shape (n_element, n_local, 3, n_local, 3), symmetric under exchange of the two pairs of
-            node and component.
+            Second derivatives, shape (n_element, n_local, 3, n_local, 3). The second and third axes are the node and
+            the component of the first derivative. The last two axes are the node and the component of the second
+            derivative.
         """
         geometry = self.geometry
-        gradient = geometry.gradient
-        slope = self._slope(field)
-        stretch = self._stretch(slope)
+        gradient = geometry.gradient  # shape (n_element, n_point, 2, n_local)
+        slopes = self._slopes(field)
+        deformation = self._deformation_gradient(slopes)
 
-        # Total stress (S11, S22, S12): the elastic stress, the mean pretension, and the deviator of the pretension.
-        # It is multiplied by the integration weights.
-        total_stress = self._stress(strain(slope, self.groups.squared_amplitude))
+        # The total stress (S11, S22, S12) is the sum of the elastic stress, the mean pretension, and the deviator of
+        # the pretension. The total stress is multiplied by the integration weights.
+        total_stress = self._elastic_stress(strain(slopes, self.groups.squared_amplitude))
         total_stress[..., :2] += self.groups.tension
         if self.groups.anisotropy is not None:
             total_stress += self.groups.anisotropy.tension
-        weighted_stress = _tensor(total_stress * geometry.weights[..., None])
+        weighted_stress = _symmetric_matrix(total_stress * geometry.weights[..., None])
 
-        # One block for each pair (i, j) of displacement components: the material part, and for i = j the part of the
-        # stress. The matrix is symmetric, so the blocks below the diagonal are transposed copies.
+        # Compute one block for each pair (i, j) of displacement components. A block consists of the material part and,
+        # for i = j, of the part that is caused by the stress. The matrix is symmetric, so the blocks below the diagonal
+        # are transposed copies of the blocks above the diagonal.
         n_element, _, _, n_local = gradient.shape
         transposed_gradient = np.ascontiguousarray(geometry.stacked.transpose(0, 2, 1))
         matrix = np.empty((n_element, 3, n_local, 3, n_local))
         for i, j in COMPONENT_PAIRS:
-            block = self._moduli(stretch, i, j) * geometry.weights[..., None, None]
+            block = self._material_block(deformation, i, j) * geometry.weights[..., None, None]
             if i == j:
-                block += self._scale[i] * weighted_stress
-            matrix[:, i, :, j] = transposed_gradient @ (block @ gradient).reshape(n_element, -1, n_local)
+                block += self._slope_weights[i] * weighted_stress
+            stacked_product = (block @ gradient).reshape(n_element, -1, n_local)
+            matrix[:, i, :, j] = transposed_gradient @ stacked_product
             if i != j:
                 matrix[:, j, :, i] = matrix[:, i, :, j].transpose(0, 2, 1)
         return matrix.transpose(0, 2, 1, 4, 3)  # the node before the component
 
-    def _moduli(self, stretch: Array, i: int, j: int) -> Array:
-        """Compute the material part of d(traction_ia)/d(slope_jb) for a pair of displacement components.
+    def _material_block(self, deformation: Array, i: int, j: int) -> Array:
+        """Compute second derivatives of the elastic energy density with respect to slopes of two components.
 
-        The result is the product B_i C B_j', where B_i is the derivative of the strain (E11, E22, 2 E12) with respect
-        to the slopes of component i. For the isotropic elasticity matrix C, the product is written out.
+        The result is the product B_i C B_j', where C is the elasticity matrix. The matrix B_i contains the derivatives
+        of the strain (E11, E22, 2 E12) with respect to the slopes of component i. For the isotropic part of C, the
+        product is written out component by component. The part of the second derivatives that is caused by the stress
+        is not included.
 
         Args:
-            stretch: F, shape (n_element, n_point, 2, 3).
-            i: Displacement component of the traction, from 0 to 2.
-            j: Displacement component of the slope, from 0 to 2.
+            deformation: Scaled deformation gradient F, shape (n_element, n_point, 2, 3).
+            i: First displacement component, from 0 to 2.
+            j: Second displacement component, from 0 to 2.
 
         Returns:
-            Second derivatives, shape (n_element, n_point, 2, 2), with the indices a and b.
+            Second derivatives, shape (n_element, n_point, 2, 2). The last two axes are the coordinates of the slopes of
+            components i and j.
         """
-        # Isotropic film
+        # Compute the part of an isotropic film. F_i1 and F_i2 are components of the deformation gradient.
         poisson = self.groups.poisson
         plane_modulus = 1.0 / (1.0 - poisson**2)
         shear_modulus = 0.5 / (1.0 + poisson)
-        f_i1 = stretch[..., 0, i]
-        f_i2 = stretch[..., 1, i]
-        f_j1 = stretch[..., 0, j]
-        f_j2 = stretch[..., 1, j]
+        f_i1 = deformation[..., 0, i]
+        f_i2 = deformation[..., 1, i]
+        f_j1 = deformation[..., 0, j]
+        f_j2 = deformation[..., 1, j]
         block = np.empty((*f_i1.shape, 2, 2))
         block[..., 0, 0] = plane_modulus * f_i1 * f_j1 + shear_modulus * f_i2 * f_j2
         block[..., 1, 1] = plane_modulus * f_i2 * f_j2 + shear_modulus * f_i1 * f_j1
         block[..., 0, 1] = plane_modulus * poisson * f_i1 * f_j2 + shear_modulus * f_i2 * f_j1
         block[..., 1, 0] = plane_modulus * poisson * f_i2 * f_j1 + shear_modulus * f_i1 * f_j2
 
-        # Additional moduli of an orthotropic film and of a coat
+        # Add the part of the additional moduli of an orthotropic film and of a coat.
         if self.groups.anisotropy is not None:
             i_derivative = _strain_derivative(f_i1, f_i2)
             j_derivative = _strain_derivative(f_j1, f_j2)
             block += i_derivative @ self.groups.anisotropy.moduli @ j_derivative.swapaxes(-1, -2)
-        if self.geometry.coat is not None:
-            coated_elements, moduli = self.geometry.coat
-            i_derivative = _strain_derivative(f_i1[coated_elements], f_i2[coated_elements])
-            j_derivative = _strain_derivative(f_j1[coated_elements], f_j2[coated_elements])
-            block[coated_elements] += i_derivative @ moduli @ j_derivative.swapaxes(-1, -2)
+        coat = self.geometry.coat
+        if coat is not None:
+            i_derivative = _strain_derivative(f_i1[coat.elements], f_i2[coat.elements])
+            j_derivative = _strain_derivative(f_j1[coat.elements], f_j2[coat.elements])
+            block[coat.elements] += i_derivative @ coat.moduli @ j_derivative.swapaxes(-1, -2)
         return block
 
 
 class Bending:
-    """Bending energy beta / 2 * integral( (lap W)^2 ) of a clamped film with the dimensionless stiffness beta.
+    """Bending energy of a clamped film.
 
-    The elements are continuous, but their slopes are not. The Laplacian m = lap W is therefore defined weakly by
+    The bending energy is beta / 2 * integral( m^2 ), where beta is the dimensionless bending stiffness and m is the
+    Laplacian of the deflection W. The deflection is continuous, but its slope jumps between elements. The Laplacian is
+    therefore defined weakly by
 
         integral( m phi ) = -integral( dot(grad W, grad phi) )   for every basis function phi.
 
-    Since the basis functions on the rim are included, this definition also clamps the slope at the rim (Ciarlet and
-    Raviart 1974). The integral on the left is lumped on the Gauss-Lobatto nodes. The result is m = -M^-1 L W with a
-    diagonal matrix M. The energy is then beta / 2 W L^T M^-1 L W.
+    This definition also clamps the slope at the rim, because it includes the basis functions on the rim (Ciarlet and
+    Raviart 1974). The integral on the left is computed with the Gauss-Lobatto rule of the nodes. Therefore the matrix M
+    of this integral is diagonal. The Laplacian is then m = -M^-1 L W, where L is the matrix of the integral on the
+    right. The bending energy is beta / 2 * W L^T M^-1 L W.
 
-    The matrix of this energy couples elements that do not touch. The linear solves therefore have an additional unknown
-    mu = sqrt(beta) M^-1 (L - s M) W, where s is a shift:
+    The matrix L^T M^-1 L couples elements that do not touch each other. In order to keep the matrix sparse, the linear
+    solves have an additional unknown mu = sqrt(beta) M^-1 (L - s M) W at each node. The linear system for a right-hand
+    side r is
 
         [ K + beta (2 s L - s^2 M)    sqrt(beta) (L - s M)^T ] [W ]   [r]
-        [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0]
+        [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0],
 
-    The solution W does not depend on s, because the Schur complement is K + beta L^T M^-1 L for every s. The lowest
-    eigenvalue of the film is 5.78. If s lies between 0 and twice this eigenvalue, the first block is positive definite
-    even if K vanishes, as in a thick film without tension. The matrix is then quasi-definite and needs no pivoting
-    (Vanderbei 1995).
+    where K is the matrix without bending and s is a shift. The solution W does not depend on the shift, because the
+    Schur complement is K + beta L^T M^-1 L for every shift. The lowest eigenvalue of the film is 5.78. If the shift
+    lies between 0 and twice the lowest eigenvalue, the first block is positive definite. The first block is positive
+    definite even if K is zero, as in a thick film without tension. The complete matrix is then quasi-definite and needs
+    no pivoting (Vanderbei 1995).
     """
 
     def __init__(self, geometry: Geometry, stiffness: float) -> None:
-        """Compute the matrices L and M of a mesh.
+        """Compute the matrices L and M of a mesh, which are explained in the docstring of the class.
 
         Args:
             geometry: Integration rules of the elements.
@@ -378,63 +411,78 @@ class Bending:
         self.geometry = geometry
         self.stiffness = stiffness
 
-        # Matrix L of each element, shape (n_element, n_local, n_local)
-        weights = np.repeat(geometry.weights, 2, axis=1)[..., None]  # one weight for each of both derivatives
+        # Matrix L of each element, shape (n_element, n_local, n_local). Each quadrature point has two derivatives, and
+        # both derivatives have the weight of the point.
+        weights = np.repeat(geometry.weights, 2, axis=1)[..., None]
         self._laplace = geometry.stacked.transpose(0, 2, 1) @ (weights * geometry.stacked)
 
-        # Diagonal of M at all nodes, including hanging nodes, and its factorisation if there are hanging nodes
+        # Diagonal of M for all nodes, including hanging nodes. If there are hanging nodes, `laplacian` factorises the
+        # matrix M of the other nodes when it is first needed.
         self._mass = replace(geometry, constraint=None).gather(geometry.mass)
-        self._factor: SuperLU | None = None
+        self._mass_factor: SuperLU | None = None
 
     def laplacian(self, deflection: Array) -> Array:
-        """Compute the Laplacian -M^-1 L W of the deflection W, where L W is the integral( dot(grad W, grad phi) ).
+        """Compute the Laplacian m = -M^-1 L W of the deflection W.
 
-        The mass matrix M contains the integrals of products of basis functions phi, lumped on the nodes.
+        Each element of the matrix L is the integral of the product of the gradients of two basis functions. Each
+        element of the mass matrix M is the integral of the product of two basis functions, computed with the quadrature
+        rule of the nodes.
 
         Args:
-            deflection: W at the nodes, shape (n_node,).
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
 
         Returns:
-            lap W at the nodes, shape (n_node,).
+            Laplacian of W at the nodes, shape (n_node,).
         """
-        element_values = (self._laplace @ deflection[self.geometry.nodes][..., None])[..., 0]
-        weak_laplacian = self.geometry.gather(element_values)  # L W
+        deflection_column = deflection[self.geometry.nodes][..., None]  # shape (n_element, n_local, 1)
+        element_values = (self._laplace @ deflection_column)[..., 0]
+        weak_laplacian = self.geometry.gather(element_values)  # L W, shape (n_node,)
         constraint = self.geometry.constraint
         if constraint is None:
             return np.asarray(-weak_laplacian / self._mass)
 
-        # With hanging nodes, the mass matrix is not diagonal. It is factorised once.
-        if self._factor is None:
+        # With hanging nodes, the mass matrix is not diagonal. The matrix is factorised at the first call only. The rows
+        # of the hanging nodes are zero, so ones are added to their diagonal elements to make the matrix regular.
+        if self._mass_factor is None:
             constrained_mass = constraint.T @ diags_array(self._mass) @ constraint
             is_hanging = constraint.diagonal() == 0.0
-            unit_diagonal = diags_array(is_hanging.astype(float))  # the rows of hanging nodes would be zero otherwise
-            self._factor = splu((constrained_mass + unit_diagonal).tocsc())
-        return np.asarray(-(constraint @ self._factor.solve(weak_laplacian)))
+            unit_diagonal = diags_array(is_hanging.astype(float))
+            self._mass_factor = splu((constrained_mass + unit_diagonal).tocsc())
+        return np.asarray(-(constraint @ self._mass_factor.solve(weak_laplacian)))
 
     def energy(self, deflection: Array) -> float:
-        """Compute the bending energy of a deflection W, shape (n_node,)."""
+        """Compute the bending energy of a deflection.
+
+        Args:
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
+
+        Returns:
+            Energy of the meshed part of the film, dimensionless.
+        """
         return float(0.5 * self.stiffness * np.sum(self._mass * self.laplacian(deflection) ** 2))
 
     def forces(self, deflection: Array) -> Array:
         """Compute the internal forces of the elements, which are the gradient of the bending energy.
 
         Args:
-            deflection: W at the nodes, shape (n_node,).
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
 
         Returns:
             Forces, shape (n_element, n_local).
         """
-        laplacian = self.laplacian(deflection)[self.geometry.nodes]
-        return np.asarray(-self.stiffness * (self._laplace @ laplacian[..., None])[..., 0])
+        laplacian_column = self.laplacian(deflection)[self.geometry.nodes][..., None]  # shape (n_element, n_local, 1)
+        return np.asarray(-self.stiffness * (self._laplace @ laplacian_column)[..., 0])
 
     def extend(self, tangent: Array) -> Array:
         """Add bending to the element matrices K of the membrane.
 
-        With the bending stiffness beta, the matrix L of the weak Laplacian, the diagonal mass matrix M and the shift s,
-        the equations for W and for the auxiliary unknown mu are
+        The equations for the deflection W and for an auxiliary unknown mu are
 
             [ K + beta (2 s L - s^2 M)    sqrt(beta) (L - s M)^T ] [W ]   [r]
-            [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0].
+            [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0],
+
+        where beta is the bending stiffness, L is the matrix of the weak Laplacian, M is the diagonal mass matrix, and s
+        is the shift `SHIFT`.
 
         Args:
             tangent: Matrices for (U1, U2, W), shape (n_element, n_local, 3, n_local, 3).
@@ -446,8 +494,9 @@ class Bending:
         mass = np.eye(n_local) * self.geometry.mass[:, None]  # M of each element, shape (n_element, n_local, n_local)
         coupling = np.sqrt(self.stiffness) * (self._laplace - SHIFT * mass)  # symmetric
 
-        # Numbers of the unknowns of a node: 0 for U1, 1 for U2, 2 for W and 3 for mu. In memory, the values of one
-        # unknown at all nodes of an element lie side by side.
+        # The indices of the unknowns of a node are 0 for U1, 1 for U2, 2 for W and 3 for mu. The array is created with
+        # the unknown before the node and then transposed, so that the values of one unknown at all nodes of an element
+        # lie side by side in memory.
         matrix = np.zeros((n_element, 4, n_local, 4, n_local)).transpose(0, 2, 1, 4, 3)
         matrix[:, :, :3, :, :3] = tangent
         matrix[:, :, 2, :, 2] += self.stiffness * (2.0 * SHIFT * self._laplace - SHIFT**2 * mass)
@@ -458,11 +507,11 @@ class Bending:
 
 
 def _strain_derivative(f_i1: Array, f_i2: Array) -> Array:
-    """Compute the derivatives of the strain with respect to the slopes U_i,1 and U_i,2 of one displacement component.
+    """Compute the derivatives of the strain with respect to the slopes U_i,1 and U_i,2 of displacement component i.
 
     Args:
-        f_i1: Element F_i1 of the deformation gradient, shape (...).
-        f_i2: Element F_i2 of the deformation gradient, shape (...).
+        f_i1: Component F_i1 of the scaled deformation gradient, shape (...).
+        f_i2: Component F_i2 of the scaled deformation gradient, shape (...).
 
     Returns:
         Derivatives of (E11, E22, 2 E12), shape (..., 2, 3), with one row for each slope.
@@ -475,6 +524,7 @@ def _strain_derivative(f_i1: Array, f_i2: Array) -> Array:
     return derivative
 
 
-def _tensor(stress: Array) -> Array:
+def _symmetric_matrix(stress: Array) -> Array:
     """Convert stresses (S11, S22, S12), shape (..., 3), into symmetric matrices, shape (..., 2, 2)."""
-    return stress[..., [0, 2, 2, 1]].reshape(*stress.shape[:-1], 2, 2)
+    matrix_elements = stress[..., [0, 2, 2, 1]]  # S11, S12, S12, S22
+    return matrix_elements.reshape(*stress.shape[:-1], 2, 2)

@@ -1,13 +1,14 @@
-"""Change of the pretension with the temperatures of the film and of its ring.
+"""Change of the pretension of a film by the temperatures of the film and of the ring in which it is clamped.
 
-A film that is clamped in a ring cannot expand. If the film becomes warmer by dT and its ring by dR, the elastic strain
-along each axis of the film changes by
+A film that is clamped in a ring cannot expand freely. If the film becomes warmer by dT and the ring by dR, the elastic
+strain along axis i of the film changes by
 
-    strain_i = ring_expansion * dR - expansion_i * dT,
+    strain_i = ring_expansion * dR - expansion_i * dT.
 
-and the pretension changes by the stress of this strain, with the plane-stress stiffness of the film. A drawn film
-expands more across the drawn direction than along this direction, so its tension becomes uneven. The temperature of a
-thin film follows that of the air within seconds. The temperature of a ring needs many minutes to follow.
+The pretension changes by the stress of this strain, which follows from the plane-stress stiffness of the film. A drawn
+film expands more across the drawn direction than along this direction. Therefore its tension becomes uneven. The
+temperature of a thin film follows the temperature of the air within seconds. The ring needs many minutes to reach the
+temperature of the air.
 """
 
 from dataclasses import replace
@@ -21,36 +22,41 @@ from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.sensor import Sensor
 
 
-def tension_change(film: Film, film_K: float, ring_K: float) -> Array:
-    """Compute the change of the pretension that changes of the temperatures of film and ring cause.
+def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> Array:
+    """Compute by how much the pretension changes if the temperatures of the film and of its ring change.
 
-    The strain of the clamped film is the expansion of the ring minus the free expansion of the film. Its stress is the
-    change of the pretension.
+    The elastic strain of the clamped film is the expansion of the ring minus the free expansion of the film. The change
+    of the pretension is the stress of this strain.
 
     Args:
-        film: The film. If it has no expansion coefficients, the result is zero.
-        film_K: Change of the temperature of the film, K.
-        ring_K: Change of the temperature of the ring, K.
+        film: The film. If the film has no expansion coefficients, the result is zero.
+        film_warming_K: Increase of the temperature of the film, K.
+        ring_warming_K: Increase of the temperature of the ring, K.
 
     Returns:
-        (T11, T22, T12) along x and y, shape (3,), MPa.
+        Change of the pretension (T11, T22, T12) in the axes x and y, shape (3,), MPa.
     """
     if film.expansion is None:
         return np.zeros(3)
-    expansion_1, expansion_2 = film.expansion
-    ring_strain = film.ring_expansion * ring_K
-    strain = np.array([ring_strain - expansion_1 * film_K, ring_strain - expansion_2 * film_K, 0.0])
+    expansion_1, expansion_2 = film.expansion  # along the axes 1 and 2 of the film, 1/K
+    ring_strain = film.ring_expansion * ring_warming_K
+    strain_1 = ring_strain - expansion_1 * film_warming_K
+    strain_2 = ring_strain - expansion_2 * film_warming_K
+    strain = np.array([strain_1, strain_2, 0.0])
     change_in_film_axes = film.young * stress(strain, film.poisson, orthotropic_moduli(film))
     return rotate_stress(change_in_film_axes, film.axis)
 
 
-def warmed(sensor: Sensor, film_K: float, ring_K: float = 0.0) -> Sensor:
-    """Return a copy of the sensor with the pretension at other temperatures of the film and of its ring.
+def warmed(sensor: Sensor, film_warming_K: float, ring_warming_K: float = 0.0) -> Sensor:
+    """Return a copy of the sensor with the pretension that the film has at other temperatures of film and ring.
 
     Args:
         sensor: The sensor at the temperatures for which it is described.
-        film_K: Temperature of the film minus the temperature for which the film is described, K.
-        ring_K: Temperature of the ring minus the temperature for which the ring is described, K.
+        film_warming_K: Temperature of the film minus the temperature for which the film is described, K.
+        ring_warming_K: Temperature of the ring minus the temperature for which the ring is described, K.
+
+    Returns:
+        The copy. If the film has no expansion coefficients, the sensor itself is returned.
 
     Raises:
         SensorError: If the film becomes so slack that it is outside the range of the simulator.
@@ -58,13 +64,15 @@ def warmed(sensor: Sensor, film_K: float, ring_K: float = 0.0) -> Sensor:
     film = sensor.film
     if film.expansion is None:
         return sensor
-    change_11, change_22, change_12 = tension_change(film, film_K, ring_K).tolist()
-    pretension = film.pretension + 0.5 * (change_11 + change_22)  # mean along x and y
-    if film.expands_evenly:  # only the mean of the tension changes
-        return replace(sensor, film=replace(film, pretension=pretension))
+    change_11, change_22, change_12 = tension_change(film, film_warming_K, ring_warming_K).tolist()
+    mean_pretension = film.pretension + 0.5 * (change_11 + change_22)
+    if film.expands_evenly:  # only the mean of the pretension changes
+        return replace(sensor, film=replace(film, pretension=mean_pretension))
 
-    # The deviator of the tension consists of half of its difference along x and y, and of its shear.
+    # The deviator of the pretension consists of half of the difference between the pretensions along x and y, and of
+    # the shear.
     half_difference, shear = film.deviator
     warm_half_difference = half_difference + 0.5 * (change_11 - change_22)
     warm_shear = shear + change_12
-    return replace(sensor, film=replace(film, pretension=pretension, deviator=(warm_half_difference, warm_shear)))
+    deviator = (warm_half_difference, warm_shear)
+    return replace(sensor, film=replace(film, pretension=mean_pretension, deviator=deviator))

@@ -1,4 +1,4 @@
-"""Strain and stress of a film, principal stresses, and rotation of stresses."""
+"""Functions that compute the strain, the stress and the principal stresses of a film, and that rotate stresses."""
 
 import numpy as np
 
@@ -6,53 +6,62 @@ from isocharge.common.arrays import Array
 
 
 def principal_stresses(stresses: Array) -> tuple[float, float]:
-    """Compute the smallest and the largest principal stress that occur in an array of stresses.
+    """Compute the smallest and the largest principal stress in an array of stresses.
 
     Args:
         stresses: Stresses (S11, S22, S12), shape (..., 3).
 
     Returns:
-        Smallest and largest principal stress, in the unit of the stresses.
+        Smallest and largest principal stress of all stresses, in the unit of the stresses.
     """
     s11 = stresses[..., 0]
     s22 = stresses[..., 1]
     s12 = stresses[..., 2]
-    mean = 0.5 * (s11 + s22)
-    radius = np.hypot(0.5 * (s11 - s22), s12)  # of Mohr's circle
-    return float((mean - radius).min()), float((mean + radius).max())
+
+    # The principal stresses are the ends of the horizontal diameter of Mohr's circle.
+    centre = 0.5 * (s11 + s22)
+    radius = np.hypot(0.5 * (s11 - s22), s12)
+    smallest = float((centre - radius).min())
+    largest = float((centre + radius).max())
+    return smallest, largest
 
 
-def strain(slope: Array, squared_amplitude: float) -> Array:
-    """Compute the scaled Green-Lagrange strain E' from the derivatives of the scaled displacements.
+def strain(slopes: Array, squared_amplitude: float) -> Array:
+    """Compute the scaled Green-Lagrange strain from the derivatives of the scaled displacements.
+
+    The scaled strain is E' = sym grad U + grad W (x) grad W / 2 + A^2 (grad U)^T grad U / 2, where U and W are the
+    scaled displacements in the plane of the film and perpendicular to it.
 
     Args:
-        slope: Derivatives d(U1, U2, W)/d(X1, X2), shape (..., 2, 3): the derivative, then the component.
+        slopes: Derivatives of (U1, U2, W) with respect to (X1, X2), shape (..., 2, 3). The last two axes are the
+            coordinate and the displacement component.
         squared_amplitude: Square A^2 of the amplitude.
 
     Returns:
-        (E11, E22, 2 E12), shape (..., 3).
+        Scaled strain (E11, E22, 2 E12), shape (..., 3).
     """
-    slope_1 = slope[..., 0, :]  # derivatives of (U1, U2, W) with respect to X1
-    slope_2 = slope[..., 1, :]  # derivatives of (U1, U2, W) with respect to X2
+    slopes_1 = slopes[..., 0, :]  # derivatives of (U1, U2, W) with respect to X1
+    slopes_2 = slopes[..., 1, :]  # derivatives of (U1, U2, W) with respect to X2
 
-    # The squares of the in-plane slopes are smaller than that of W by the factor A^2.
-    square_weights = np.array([squared_amplitude, squared_amplitude, 1.0])
-    strain_11 = slope_1[..., 0] + 0.5 * (slope_1**2) @ square_weights
-    strain_22 = slope_2[..., 1] + 0.5 * (slope_2**2) @ square_weights
-    double_strain_12 = slope_2[..., 0] + slope_1[..., 1] + (slope_1 * slope_2) @ square_weights
+    # The quadratic terms of U1 and U2 have the factor A^2, and the quadratic term of W has the factor 1.
+    product_weights = np.array([squared_amplitude, squared_amplitude, 1.0])
+    strain_11 = slopes_1[..., 0] + 0.5 * (slopes_1**2) @ product_weights
+    strain_22 = slopes_2[..., 1] + 0.5 * (slopes_2**2) @ product_weights
+    double_strain_12 = slopes_2[..., 0] + slopes_1[..., 1] + (slopes_1 * slopes_2) @ product_weights
     return np.stack([strain_11, strain_22, double_strain_12], axis=-1)
 
 
 def stress(strain: Array, poisson: float, moduli: Array | None = None) -> Array:
-    """Compute the plane stress C : E' of a strain, without pretension.
+    """Compute the plane stress of a strain by Hooke's law, without the pretension.
 
     Args:
-        strain: (E11, E22, 2 E12), shape (..., 3).
+        strain: Strain (E11, E22, 2 E12), shape (..., 3).
         poisson: Poisson's ratio.
-        moduli: Symmetric matrix that is added to the isotropic elasticity matrix C over E_young, shape (3, 3).
+        moduli: Symmetric matrix that is added to the elasticity matrix C / E_young of an isotropic material, shape
+            (3, 3). None for an isotropic material.
 
     Returns:
-        (S11, S22, S12), shape (..., 3), in units of E_young times the unit of the strain.
+        Stress (S11, S22, S12), shape (..., 3), in units of E_young times the unit of the strain.
     """
     e11 = strain[..., 0]
     e22 = strain[..., 1]
@@ -64,34 +73,47 @@ def stress(strain: Array, poisson: float, moduli: Array | None = None) -> Array:
     s11 = plane_modulus * (e11 + poisson * e22)
     s22 = plane_modulus * (e22 + poisson * e11)
     s12 = shear_modulus * double_e12
-    isotropic = np.stack([s11, s22, s12], axis=-1)
-    return isotropic if moduli is None else isotropic + strain @ moduli
+    isotropic_stress = np.stack([s11, s22, s12], axis=-1)
+    if moduli is None:
+        return isotropic_stress
+    return isotropic_stress + strain @ moduli
 
 
 def stress_rotation(angle: float) -> Array:
-    """Return the matrix T of `rotate_stress` for an angle (rad), shape (3, 3).
+    """Return the matrix that transforms stresses from a rotated frame to the unrotated frame.
 
-    T C T^T is the elasticity matrix C of a rotated material in the unrotated frame.
+    If C is the elasticity matrix of a material in the rotated frame and T is the returned matrix, then T C T^T is the
+    elasticity matrix of the material in the unrotated frame.
+
+    Args:
+        angle: Angle of the rotated frame, anticlockwise, rad.
+
+    Returns:
+        Matrix for the stress components (s11, s22, s12), shape (3, 3).
     """
     return rotate_stress(np.eye(3), angle).T
 
 
-def rotate_stress(local: Array, angle: float | Array) -> Array:
+def rotate_stress(rotated_frame_stress: Array, angle: float | Array) -> Array:
     """Transform stresses from a rotated frame to the unrotated frame.
 
     Args:
-        local: Stress (s11, s22, s12) in the rotated frame, shape (..., 3).
+        rotated_frame_stress: Stress (s11, s22, s12) in the rotated frame, shape (..., 3).
         angle: Angle of the rotated frame, anticlockwise, rad, a number or of the shape (...).
 
     Returns:
         Stress (s11, s22, s12) in the unrotated frame, shape (..., 3).
     """
-    # Mohr's circle: the mean does not change, and half of the difference and the shear rotate by twice the angle.
-    mean = 0.5 * (local[..., 0] + local[..., 1])
-    half_difference = 0.5 * (local[..., 0] - local[..., 1])
-    shear = local[..., 2]
+    s11 = rotated_frame_stress[..., 0]
+    s22 = rotated_frame_stress[..., 1]
+    s12 = rotated_frame_stress[..., 2]
+
+    # In Mohr's circle, the mean of s11 and s22 does not change. The vector of half of their difference and the shear
+    # stress is rotated by twice the angle.
+    mean = 0.5 * (s11 + s22)
+    half_difference = 0.5 * (s11 - s22)
     cosine = np.cos(2.0 * np.asarray(angle))
     sine = np.sin(2.0 * np.asarray(angle))
-    rotated_difference = half_difference * cosine - shear * sine
-    rotated_shear = half_difference * sine + shear * cosine
-    return np.stack([mean + rotated_difference, mean - rotated_difference, rotated_shear], axis=-1)
+    new_half_difference = half_difference * cosine - s12 * sine
+    new_s12 = half_difference * sine + s12 * cosine
+    return np.stack([mean + new_half_difference, mean - new_half_difference, new_s12], axis=-1)

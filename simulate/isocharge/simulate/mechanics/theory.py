@@ -1,11 +1,16 @@
-"""The choice between the theories of the film, and estimates of the error that an omitted term causes.
+"""Choice of the theory of the film, and estimates of the errors that are caused by the omitted terms of a theory.
 
-All theories are special cases of one formulation with two optional terms. The first term is *bending*. Bending matters
-near the rim and near the probe, and for the stress at the surface of the film. Bending matters up to the distance l =
-sqrt(D / N), the bending length, where D is the bending stiffness and N the tension force per length. If the pretension
-and the induced tension are small, bending carries the load. The second term is *stretching*, the effect of the induced
-stress on the deflection. Without stretching the film is linear, and the charges are computed from the linear deflection
-in a second step. The pretension is always included. The terms determine the name of the theory::
+All theories are special cases of one formulation with two optional terms.
+
+The first term is *bending*, the resistance of the film to bending. Bending is important near the rim and near the
+probe, and for the stress at the surfaces of the film. The effect of bending reaches as far as the bending length
+sqrt(D / N), where D is the bending stiffness and N is the tension force per length. If the pretension and the induced
+tension are small, the bending stiffness carries the load.
+
+The second term is *stretching*, the effect of the induced stress on the deflection. Without stretching, the deflection
+is a linear function of the force. The charges are then computed from the linear deflection in a second step.
+
+All theories include the pretension. The two terms and the pretension determine the name of a theory::
 
     stretching  bending   theory
     no          yes       linear plate, pre-tensioned linear plate
@@ -28,19 +33,22 @@ ACCURACY = 1e-3
 """Default target of the relative error of a charge, dimensionless."""
 
 LINEAR_WEIGHT = 4.0
-"""Ratio of the relative error of a charge by a linear theory to the share of the load that the induced stress
-carries."""
+"""Factor in the estimate of the relative error of a charge that is computed with a linear theory.
+
+The factor multiplies the share of the load that the induced stress carries.
+"""
 
 LOCAL_WEIGHT = 0.4
-"""Factor of the relative error of a charge by a linear theory of a film with a large pretension.
+"""Factor in the estimate of the relative error of a charge that is computed with a linear theory.
 
-It multiplies the ratio of the strain that the footprint induces to the strain of the pretension.
+The factor multiplies the ratio of the strain that the footprint induces to the strain of the pretension. The ratio is
+estimated for a film with a large pretension.
 """
 
 BENDING_WEIGHT = 1.5
-"""Factor of the largest relative error of a charge without bending.
+"""Factor in the estimate of the relative error of a charge that is computed without bending.
 
-It multiplies the ratio of the bending length to the film radius. The largest factor in the reference cases of
+The factor multiplies the ratio of the bending length to the film radius. The largest factor in the reference cases of
 tests/data is 1.41.
 """
 
@@ -48,9 +56,10 @@ MAX_MEMBRANE_BENDING_LENGTH = 0.3
 """Bending length, in film radii, above which a membrane does not describe the film. The error is then infinite."""
 
 PROBE_WEIGHT = 4.0
-"""Factor of the relative error of a charge without bending, for a film with a large pretension.
+"""Factor in the estimate of the relative error of a charge that is computed without bending.
 
-It multiplies the squared ratio of the bending length at the probe to the reach of the probe.
+The factor multiplies the squared ratio of the bending length at the probe to the reach of the probe, and the share of
+the pretension in the tension at the probe.
 """
 
 INDUCED_STRAIN = 0.44
@@ -59,7 +68,7 @@ INDUCED_STRAIN = 0.44
 
 @dataclass(frozen=True)
 class Theory:
-    """The terms of the film theory that are modelled.
+    """Terms that a theory of the film includes.
 
     Attributes:
         stretching: Whether the induced stress affects the deflection.
@@ -81,7 +90,7 @@ class Theory:
 
 
 def bending_length(film: Film, force: float) -> float:
-    """Compute the length over which a clamped edge bends the film, in film radii.
+    """Compute the distance from the clamped edge over which the film is bent, in film radii.
 
     Args:
         film: The film.
@@ -93,48 +102,54 @@ def bending_length(film: Film, force: float) -> float:
 
 
 def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
-    """Estimate the relative change of a charge because the film with pretension bends at the footprint.
+    """Estimate the relative change of a charge that is caused by the bending of the film at the footprint.
 
-    The change is proportional to the squared ratio of the bending length to the reach of the footprint. The tension at
-    the footprint is the sum of the pretension and of the stress S of a membrane without pretension. With the slope W'
-    of this membrane at the footprint, the stress is S = E W'^2 / 2. The equilibrium of the stress with the load is 2 pi
-    R h S W' = F, so W'^3 = F / (pi R h E). If the induced stress dominates, bending hardly changes the charges.
+    The change is proportional to the squared ratio of the bending length to the reach R of the footprint. The tension
+    at the footprint is the sum of the pretension and the induced stress S. The induced stress is estimated for a
+    membrane without pretension. If w' is the slope of the membrane at the footprint, the stress is S = E w'^2 / 2. The
+    vertical force at the footprint is 2 pi R h S w' = F. These two equations result in w'^3 = F / (pi R h E). If the
+    induced stress is much larger than the pretension, bending hardly changes the charges.
 
     Args:
-        film: The film.
-        probe: The probe, whose reach is R.
+        film: The film, with Young's modulus E and thickness h.
+        probe: The probe, whose footprint has the reach R.
         force: Force F, N.
 
     Returns:
         Relative change, dimensionless.
     """
-    slope = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young))
+    slope = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young))  # w'
+    induced_strain = 0.5 * slope**2
     pretension_strain = film.pretension / film.young
-    total_strain = pretension_strain + 0.5 * slope**2
-    # Squared ratio of the bending length sqrt(D / (h S)) to the reach of the footprint; D is the bending stiffness.
+    total_strain = pretension_strain + induced_strain
+
+    # The squared bending length is the bending stiffness over the tension force per length. In squared film radii, it
+    # is the slenderness over the total strain.
     squared_length_ratio = slenderness(film) / total_strain * (film.radius / probe.reach) ** 2
     pretension_share = pretension_strain / total_strain
     return PROBE_WEIGHT * float(squared_length_ratio * pretension_share)
 
 
 def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
-    """Estimate the strain that the footprint induces in a film, divided by the strain of the pretension T.
+    """Estimate the ratio of the strain that the footprint induces in a film to the strain of the pretension.
 
-    If the pretension is large, the slope of the film at the footprint is F / (2 pi R h T). If the bending length
-    exceeds the footprint, bending reduces the slope.
+    For a large pretension T, the slope of the film at the footprint is F / (2 pi R h T). If the bending length exceeds
+    the reach of the footprint, bending reduces the slope. The induced strain is half of the squared slope.
 
     Args:
-        film: The film.
-        probe: The probe, whose reach is R.
+        film: The film, with thickness h.
+        probe: The probe, whose footprint has the reach R.
         force: Force F, N.
 
     Returns:
-        Ratio of the strains, dimensionless. It is zero for a film without pretension.
+        Ratio of the strains, dimensionless. The ratio is zero for a film without pretension.
     """
     if film.pretension == 0.0:
         return 0.0
     pretension_strain = film.pretension / film.young
     membrane_slope = force / (2.0 * np.pi * probe.reach * film.thickness * film.pretension)
+
+    # Squared ratio of the bending length to the reach of the footprint
     squared_length_ratio = slenderness(film) / pretension_strain * (film.radius / probe.reach) ** 2
     slope = membrane_slope / (1.0 + squared_length_ratio)
     return float(0.5 * slope**2 / pretension_strain)
@@ -143,8 +158,9 @@ def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
 def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
     """Estimate the relative error of a charge that is caused by the terms that a theory omits.
 
-    The estimates of the omitted stretching and of the omitted bending are added. A theory without stretching and
-    bending cannot describe a film without pretension. A theory without bending cannot describe a thick film.
+    The error is the sum of an estimate for omitted stretching and an estimate for omitted bending. A theory with
+    neither stretching nor bending cannot describe a film without pretension. A theory without bending cannot describe a
+    thick film.
 
     Args:
         film: The film.
@@ -155,58 +171,67 @@ def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> f
     Returns:
         The error, which is infinite if the theory cannot describe the film.
     """
-    error = 0.0
+    stretching_error = 0.0
     if not theory.stretching:
-        if not theory.bending and film.pretension == 0.0:
+        has_no_stiffness = not theory.bending and film.pretension == 0.0
+        if has_no_stiffness:
             return np.inf
-        error += LINEAR_WEIGHT * DimensionlessGroups.of(film, force, bending=theory.bending).induced
-        error += LOCAL_WEIGHT * induced_at_probe(film, probe, force)
-    if not theory.bending:
-        length = bending_length(film, force)
-        if length > MAX_MEMBRANE_BENDING_LENGTH:
-            return np.inf
-        error += BENDING_WEIGHT * length + bending_at_probe(film, probe, force)
-    return error
+        induced_share = DimensionlessGroups.of(film, force, bending=theory.bending).induced
+        stretching_error = LINEAR_WEIGHT * induced_share + LOCAL_WEIGHT * induced_at_probe(film, probe, force)
+    if theory.bending:
+        return stretching_error
+
+    length = bending_length(film, force)
+    if length > MAX_MEMBRANE_BENDING_LENGTH:  # the film is too thick for a membrane
+        return np.inf
+    bending_error = BENDING_WEIGHT * length + bending_at_probe(film, probe, force)
+    return stretching_error + bending_error
 
 
 def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Theory:
-    """Return the cheapest theory whose error is at most half of the accuracy, or the full theory if there is none.
+    """Return the cheapest theory that is sufficiently accurate, or the full theory if no cheaper theory is sufficient.
+
+    The estimated error of the theory must not exceed half of the required accuracy. The other half is for the mesh.
 
     Args:
         film: The film.
         probe: The probe.
         force: Force of the press, N.
-        accuracy: Target of the relative error of a charge.
+        accuracy: Largest allowed relative error of a charge.
     """
-    is_tense = film.pretension > 0.0
-    full = Theory(stretching=True, bending=True, pretensioned=is_tense)
-    if film.pretension < 0.0 or not film.is_axisymmetric:  # the error estimates hold for axisymmetric films only
-        return full
-    cheapest_first = (  # a linear theory costs less than a nonlinear theory without bending
-        Theory(stretching=False, bending=False, pretensioned=is_tense),
-        Theory(stretching=False, bending=True, pretensioned=is_tense),
-        Theory(stretching=True, bending=False, pretensioned=is_tense),
+    is_pretensioned = film.pretension > 0.0
+    full_theory = Theory(stretching=True, bending=True, pretensioned=is_pretensioned)
+    error_estimate_is_valid = film.pretension >= 0.0 and film.is_axisymmetric
+    if not error_estimate_is_valid:
+        return full_theory
+
+    # Both linear theories cost less than the nonlinear theory without bending.
+    cheapest_first = (
+        Theory(stretching=False, bending=False, pretensioned=is_pretensioned),
+        Theory(stretching=False, bending=True, pretensioned=is_pretensioned),
+        Theory(stretching=True, bending=False, pretensioned=is_pretensioned),
     )
     for theory in cheapest_first:
-        omits_back_pressure = film.has_back_pressure and not theory.stretching  # as do all linear theories
-        if omits_back_pressure:
+        is_linear = not theory.stretching
+        if film.has_back_pressure and is_linear:  # linear theories omit the pressure on the back
             continue
-        if modelling_error(film, probe, force, theory) <= 0.5 * accuracy:  # the other half is for the mesh
+        if modelling_error(film, probe, force, theory) <= 0.5 * accuracy:
             return theory
-    return full
+    return full_theory
 
 
 def theory_for(sensor: Sensor, probe: Probe, force_range: tuple[float, float], accuracy: float = ACCURACY) -> Theory:
     """Return the theory with the fewest terms that is sufficient for all forces of a range.
 
-    If the stress is read at an outer surface of the film, the theory includes bending.
+    If the sensor reads the stress at an outer surface of the film, the theory includes bending.
 
     Args:
         sensor: The sensor.
         probe: The probe.
         force_range: Smallest and largest force, N.
-        accuracy: Target of the relative error of a charge.
+        accuracy: Largest allowed relative error of a charge.
     """
+    # The largest and the smallest force may require different terms, so the terms of both theories are combined.
     theories = [choose_theory(sensor.film, probe, force, accuracy) for force in force_range]
     return Theory(
         stretching=any(theory.stretching for theory in theories),
@@ -226,15 +251,18 @@ def theory_by_name(name: str, film: Film) -> Theory:
     Raises:
         SceneError: If no theory has this name, or the film has no stiffness in this theory.
     """
-    is_tense = film.pretension > 0.0
-    options = [Theory(stretching, bending, is_tense) for stretching in (False, True) for bending in (False, True)]
-    for theory in options:
+    is_pretensioned = film.pretension > 0.0
+    theories = [
+        Theory(stretching, bending, is_pretensioned) for stretching in (False, True) for bending in (False, True)
+    ]
+    for theory in theories:
         short_name = theory.name.removeprefix("pre-tensioned ")
         if name not in (theory.name, short_name):
             continue
-        if theory.name == "linear membrane":  # without the prefix, so the film has no pretension
+        # A linear membrane without the prefix "pre-tensioned " has no pretension, and therefore no stiffness.
+        if theory.name == "linear membrane":
             raise SceneError(
                 "theory 'linear membrane': a film without pretension has no stiffness in it; set a pretension"
             )
         return theory
-    raise SceneError(f"theory: expected one of {[theory.name for theory in options]}, got {name!r}")
+    raise SceneError(f"theory: expected one of {[theory.name for theory in theories]}, got {name!r}")

@@ -1,1 +1,1 @@
-"""Mesh of a press: its elements, the conformal map that places them on the film, and its refinement along coats."""
+"""Meshes of presses: their elements, the positions of the elements on the film, and the refinement along coats."""

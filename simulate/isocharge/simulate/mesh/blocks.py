@@ -1,19 +1,21 @@
-"""The elements of the mesh and their adjacency, which are the same for every position of the probe and every film.
+"""Elements of a mesh and their adjacency, which do not depend on the film and on the position of the probe.
 
-The innermost circle of the mesh encloses the footprint. The mesh consists of three parts:
+The footprint of the probe contains a core polygon with n corners, and is enclosed by the innermost circle of the mesh.
+The mesh consists of three parts:
 
-    1. The core polygon (n corners) is divided into n quadrilaterals that meet at its centroid.
-    2. 2 n blocks, or two layers of 2 n blocks, lie between the core polygon and the innermost circle.
-    3. Rings of 2 n sectors lie between the innermost circle and the rim of the film. The last rings are thin if the
-       film resists bending.
+    1. The core polygon is divided into n quadrilaterals that meet at its centroid.
+    2. The area between the core polygon and the innermost circle is divided into one or two layers of 2 n blocks.
+    3. The area between the innermost circle and the rim of the film is divided into rings of 2 n sectors. If the film
+       resists bending, the rings at the rim are thin.
 
-A polygonal footprint is its own core polygon. A circular footprint has a virtual square as its core polygon, and its
-boundary is the innermost circle. Any other curved footprint has a core polygon and two layers of blocks. The first
-layer ends at the boundary of the footprint, and the second layer at the innermost circle. Each block can be subdivided.
+The core polygon of a polygonal footprint is the footprint itself. The core polygon of a circular footprint is a square
+inside the footprint, and the innermost circle is the boundary of the footprint. Every other curved footprint has a core
+polygon and two layers of blocks. The first layer ends at the boundary of the footprint, and the second layer ends at
+the innermost circle. Each block can be divided into smaller elements.
 
-A press by a circular probe is symmetric about the line from the centre of the film to the probe. If the film is
-symmetric as well, only the upper half is meshed. `Placement` computes the positions of the elements, and `Template`
-numbers their nodes.
+A press with a circular probe is symmetric about the line from the centre of the film to the probe. If the film is also
+symmetric about this line, only the upper half of the film is meshed. The class `Placement` computes the positions of
+the elements, and the class `Template` numbers their nodes.
 """
 
 from dataclasses import asdict, dataclass
@@ -33,9 +35,10 @@ class Resolution:
 
     Attributes:
         order: Polynomial order of the elements.
-        around: Number of elements round the innermost circle. A core polygon of n corners takes the nearest multiple of
-            2 n.
-        rings: Number of rings between the innermost circle and the rim, in equal steps of the logarithm of the radius.
+        around: Number of elements around the innermost circle. It is rounded to the nearest multiple of 2 n, where n is
+            the number of corners of the core polygon.
+        rings: Number of rings between the innermost circle and the rim without the thin rings. The logarithm of the
+            radius increases by the same step in each ring.
         rim: Number of thin rings at the rim, which resolve the boundary layer of bending.
     """
 
@@ -46,7 +49,7 @@ class Resolution:
 
     @property
     def description(self) -> str:
-        """Text with the four numbers of the resolution, such as "order 4, around 8, rings 5, rim 0"."""
+        """Text with the four numbers of the resolution, for example "order 4, around 8, rings 5, rim 0"."""
         return ", ".join(f"{name} {value}" for name, value in asdict(self).items())
 
     def __post_init__(self) -> None:
@@ -58,21 +61,21 @@ class Resolution:
 
 
 class Blocks:
-    """The elements of the mesh for one resolution and one topology of the footprint.
+    """Elements of a mesh for a given resolution and a given topology of the footprint.
 
-    An element has the local coordinates xi, which points outwards, and eta, which points anticlockwise. Both lie in
-    [-1, 1]. The (order + 1)^2 nodes of an element are ordered by eta and then by xi. The elements are ordered from the
-    inside out. The quadrilaterals of the core polygon come first, then the layers up to the innermost circle, and then
-    the rings.
+    Each element has two local coordinates from -1 to 1. The coordinate xi increases outwards, and the coordinate eta
+    increases anticlockwise. The (order + 1)^2 nodes of an element are ordered first by eta and then by xi. The elements
+    are ordered from the inside of the mesh to the outside. The elements of the core polygon come first, followed by the
+    elements of the layers, and by the elements of the rings.
 
     Attributes:
         resolution: Fineness of the mesh.
         topology: Number and kind of the blocks in and around the footprint.
         half: Whether only the upper half of the film is meshed.
         n_corner: Number of corners of the core polygon.
-        split: Number of elements along half an edge of the core polygon.
+        n_half_edge: Number of elements along half an edge of the core polygon.
         n_meshed: Number of corners of the core polygon in the meshed part of the film.
-        n_sector: Number of elements round the innermost circle.
+        n_sector: Number of elements around the innermost circle in the meshed part of the film.
         n_quad: Number of elements in the core polygon.
         n_layer: Number of layers between the core polygon and the innermost circle.
         n_inner: Number of elements inside the innermost circle.
@@ -94,22 +97,23 @@ class Blocks:
         self.topology = topology
         self.half = topology.fills_circle and not whole
 
-        # Each corner of the core polygon belongs to a quadrilateral of split x split elements and to 2 x split sectors.
+        # Each meshed corner of the core polygon belongs to one quadrilateral and to two half edges. The quadrilateral
+        # consists of n_half_edge * n_half_edge elements, and there is one sector for each element of a half edge.
         self.n_corner = topology.n_corner
-        self.split = max(1, round(resolution.around / (2 * self.n_corner)))
+        self.n_half_edge = max(1, round(resolution.around / (2 * self.n_corner)))
         self.n_meshed = self.n_corner // 2 if self.half else self.n_corner
-        self.n_sector = 2 * self.n_meshed * self.split
-        self.n_quad = self.n_meshed * self.split**2
+        self.n_sector = 2 * self.n_meshed * self.n_half_edge
+        self.n_quad = self.n_meshed * self.n_half_edge**2
 
-        # Elements inside the innermost circle, then the rings from the circle to the rim
+        # Count the elements inside the innermost circle, and then all elements including the rings.
         self.n_layer = 2 if topology.is_curved and not topology.fills_circle else 1
         self.n_inner = self.n_quad + self.n_layer * self.n_sector
         self.n_ring = resolution.rings + resolution.rim
         self.n_element = self.n_inner + self.n_sector * self.n_ring
 
-        # Local coordinates of the nodes of an element, on a square grid
-        line = lobatto_nodes(resolution.order)
-        xi, eta = np.meshgrid(line, line, indexing="xy")
+        # The nodes of an element form a square grid. The coordinate xi varies fastest.
+        line_nodes = lobatto_nodes(resolution.order)
+        xi, eta = np.meshgrid(line_nodes, line_nodes, indexing="xy")
         self.xi = xi.ravel()
         self.eta = eta.ravel()
 
@@ -122,12 +126,15 @@ class Blocks:
 
     @property
     def first_layer(self) -> slice:
-        """Elements of the layer next to the core polygon."""
+        """Indices of the elements of the layer next to the core polygon."""
         return slice(self.n_quad, self.n_quad + self.n_sector)
 
     @property
     def last_layer(self) -> slice:
-        """Elements of the layer next to the innermost circle, which is the first layer if there is only one."""
+        """Indices of the elements of the layer next to the innermost circle.
+
+        If there is only one layer, the last layer is the same as the first layer.
+        """
         return slice(self.n_inner - self.n_sector, self.n_inner)
 
     @property
@@ -141,81 +148,90 @@ class Blocks:
         return np.linspace(0.0, 2.0 * np.pi / self.copies, self.n_sector + 1)
 
     @cached_property
-    def boundary(self) -> Array:
-        """Points along the edges of the core polygon.
+    def core_outline(self) -> Array:
+        """Points along the edges of the core polygon, shape (n_sector + 1, n_corner + 1).
 
-        Each point is described by weights of the corners and the centroid of the polygon. The shape is
-        (n_sector + 1, n_corner + 1). The points follow anticlockwise from the middle of the edge before the
-        first corner.
+        Each point is described by the weights of the corners and of the centroid of the core polygon. The points are
+        ordered anticlockwise. The first point is the middle of the edge before the first corner.
         """
-        corners = np.eye(self.n_corner + 1)[:-1]  # the weights of a corner are zero except for its own
-        middles = 0.5 * (corners + np.roll(corners, -1, axis=0))  # of the edges after the corners
-        stops = [middles[-1]]  # middle, corner, middle, corner, ..., middle
+        # Weights of the corners, and of the middle of the edge after each corner. The weights of a corner are 1 for the
+        # corner itself, and 0 for all other corners and for the centroid.
+        corners = np.eye(self.n_corner + 1)[:-1]
+        middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
+
+        # The stops are the middles and the corners of the meshed part in anticlockwise order.
+        stops = [middles[-1]]
         for corner, middle in zip(corners[: self.n_meshed], middles[: self.n_meshed], strict=True):
             stops += [corner, middle]
 
-        # Divide the line between two stops into equal parts.
-        fraction = np.arange(self.split)[:, None] / self.split
+        # Divide the line between two successive stops into equal parts.
+        fraction = np.arange(self.n_half_edge)[:, None] / self.n_half_edge
         points = [start + fraction * (end - start) for start, end in pairwise(stops)]
         points.append(stops[-1][None])
         return np.concatenate(points)
 
     @cached_property
-    def straight(self) -> Array:
-        """Corners (a, b, c, d) of the elements inside the innermost circle, shape (n_inner, 4, n_corner + 1).
+    def inner_corner_weights(self) -> Array:
+        """Corners of the elements inside the innermost circle, shape (n_inner, 4, n_corner + 1).
 
-        Each corner is described by weights of the corners of the core polygon and its centroid. The points of an
-        element with straight sides are (1 - v) (a + t (b - a)) + v (c + t (d - c)) with v and t from 0 to 1. The
-        weights of a corner on a curved side are zero, and `Placement` adds the curved side.
+        The four corners of an element are the first and the last corner of its inner side, and the first and the last
+        corner of its outer side. Each corner is described by the weights of the corners and of the centroid of the core
+        polygon. The weights of a corner on a curved side are zero, because `Placement` adds the curved sides.
         """
         core_elements = [
-            self._quad(corner, v_index, t_index)
+            self._core_element(corner, radial_index, angular_index)
             for corner in range(self.n_meshed)
-            for v_index in range(self.split)
-            for t_index in range(self.split)
+            for radial_index in range(self.n_half_edge)
+            for angular_index in range(self.n_half_edge)
         ]
         zero = np.zeros(self.n_corner + 1)
 
-        # The first layer has a straight inner side on the core polygon. Its outer side may be curved. A second layer
-        # has two curved sides.
-        first_layer = [[first, second, zero, zero] for first, second in pairwise(self.boundary)]
-        n_second_layer = self.n_sector * (self.n_layer - 1)
+        # The first layer has a straight inner side on the core polygon, and an outer side that may be curved. Both
+        # sides of the second layer are curved.
+        first_layer = [[first, last, zero, zero] for first, last in pairwise(self.core_outline)]
+        n_second_layer = self.n_sector * (self.n_layer - 1)  # 0 if there is only one layer
         second_layer = [[zero, zero, zero, zero] for _ in range(n_second_layer)]
         return np.array(core_elements + first_layer + second_layer)
 
-    def _quad(self, corner: int, v_index: int, t_index: int) -> list[Array]:
-        """Return the corners (a, b, c, d) of one element of the core polygon, each of shape (n_corner + 1,).
+    def _core_element(self, corner: int, radial_index: int, angular_index: int) -> list[Array]:
+        """Return the corners of one element of the core polygon.
 
-        The quadrilateral of a corner lies between the centroid, the middles of both adjacent edges, and the corner.
-        Each quadrilateral consists of `split` times `split` elements.
+        The quadrilateral of a corner lies between this corner, the centroid of the core polygon, and the middles of
+        both adjacent edges. Each quadrilateral consists of n_half_edge * n_half_edge elements.
 
         Args:
             corner: Index of the corner of the core polygon whose quadrilateral contains the element.
-            v_index: Index of the element along the side from the centroid to the middle of the edge after the corner.
-            t_index: Index of the element along the side from the centroid to the middle of the edge before the corner.
-        """
-        # Corners of the quadrilateral. A step from a middle to a corner, or back, is `split` points of the boundary.
-        centroid = np.eye(self.n_corner + 1)[-1]
-        start = 2 * self.split * corner
-        middle_before = self.boundary[start]
-        corner_point = self.boundary[start + self.split]
-        middle_after = self.boundary[start + 2 * self.split]
+            radial_index: Index of the element along the side from the centroid to the middle of the edge before the
+                corner.
+            angular_index: Index of the element along the side from the centroid to the middle of the edge after the
+                corner.
 
-        # Corners of the element in the coordinates v and t of the quadrilateral, from 0 to 1
-        v_inner = v_index / self.split
-        v_outer = (v_index + 1) / self.split
-        t_first = t_index / self.split
-        t_last = (t_index + 1) / self.split
+        Returns:
+            First and last corner of the inner side, and first and last corner of the outer side, each as weights of
+            shape (n_corner + 1,).
+        """
+        # Corners of the quadrilateral. There are `n_half_edge` steps along the outline between a middle and a corner.
+        centroid = np.eye(self.n_corner + 1)[-1]
+        start = 2 * self.n_half_edge * corner
+        middle_before = self.core_outline[start]
+        corner_point = self.core_outline[start + self.n_half_edge]
+        middle_after = self.core_outline[start + 2 * self.n_half_edge]
+
+        # Corners of the element in the coordinates of the quadrilateral, which are numbers from 0 to 1
+        inner = radial_index / self.n_half_edge
+        outer = (radial_index + 1) / self.n_half_edge
+        first = angular_index / self.n_half_edge
+        last = (angular_index + 1) / self.n_half_edge
         return [
-            _bilinear(centroid, middle_after, middle_before, corner_point, v, t)
-            for v, t in ((v_inner, t_first), (v_inner, t_last), (v_outer, t_first), (v_outer, t_last))
+            _bilinear(centroid, middle_after, middle_before, corner_point, radial, angular)
+            for radial, angular in ((inner, first), (inner, last), (outer, first), (outer, last))
         ]
 
     def rotated(self, steps: int, steps_per_turn: int) -> Integers:
         """Return the indices of the elements after a rotation of the probe that maps the mesh onto itself.
 
-        The quadrilaterals are numbered corner by corner. The sectors are numbered layer by layer, and in each layer
-        anticlockwise.
+        The elements of the core polygon are numbered corner by corner. The sectors are numbered layer by layer, and
+        anticlockwise within each layer.
 
         Args:
             steps: Number of steps by which the probe is rotated.
@@ -225,39 +241,47 @@ class Blocks:
             Index of the element that takes the place of each element, shape (n_element,).
         """
         corner_shift = steps * self.n_corner // steps_per_turn
-        sector_shift = 2 * self.split * corner_shift
-        quads = np.arange(self.n_quad).reshape(self.n_meshed, -1)
-        sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)
-        # Element i is replaced by the element that follows it by the shift, anticlockwise.
-        rotated_quads = np.roll(quads, -corner_shift, axis=0)
+        sector_shift = 2 * self.n_half_edge * corner_shift
+        core_elements = np.arange(self.n_quad).reshape(self.n_meshed, -1)  # one row for each corner
+        sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)  # one row for each layer and ring
+
+        # Each element is replaced by the element that lies the shift farther in the anticlockwise direction.
+        rotated_core_elements = np.roll(core_elements, -corner_shift, axis=0)
         rotated_sectors = np.roll(sectors, -sector_shift, axis=1)
-        return np.concatenate([rotated_quads.ravel(), rotated_sectors.ravel()])
+        return np.concatenate([rotated_core_elements.ravel(), rotated_sectors.ravel()])
 
     def into_meshed_half(self, points: Complexes) -> tuple[Complexes, Booleans]:
-        """Reflect film points into the upper half if only this half is meshed.
+        """Reflect film points into the upper half of the film if only this half is meshed.
 
         Args:
             points: Film points x + iy, any shape.
 
         Returns:
-            The points in the meshed part, and whether each of them was reflected. Both have the shape of `points`.
+            Points in the meshed part of the film, and whether each point was reflected. Both arrays have the shape of
+            `points`.
         """
         is_reflected = (points.imag < 0.0) & self.half
         meshed_points = points.real + 1j * np.abs(points.imag) if self.half else points
         return meshed_points, is_reflected
 
 
-def _bilinear(a: Array, b: Array, c: Array, d: Array, v: float, t: float) -> Array:
-    """Return the point of a quadrilateral with the corners a, b, c, d that has the local coordinates (v, t).
+def _bilinear(
+    inner_first: Array, inner_last: Array, outer_first: Array, outer_last: Array, radial: float, angular: float
+) -> Array:
+    """Interpolate bilinearly between the four corners of a quadrilateral.
 
     Args:
-        a: Corner at v = 0 and t = 0, as weights of the corners of the core polygon, shape (n_corner + 1,).
-        b: Corner at v = 0 and t = 1.
-        c: Corner at v = 1 and t = 0.
-        d: Corner at v = 1 and t = 1.
-        v: First local coordinate, from 0 to 1.
-        t: Second local coordinate, from 0 to 1.
+        inner_first: First corner of the inner side, as weights of the corners and of the centroid of the core polygon,
+            shape (n_corner + 1,).
+        inner_last: Last corner of the inner side, same shape.
+        outer_first: First corner of the outer side, same shape.
+        outer_last: Last corner of the outer side, same shape.
+        radial: Coordinate from 0 on the inner side to 1 on the outer side.
+        angular: Coordinate from 0 at the first corners to 1 at the last corners.
+
+    Returns:
+        Weights of the point with these coordinates, shape (n_corner + 1,).
     """
-    inner_point = a + t * (b - a)
-    outer_point = c + t * (d - c)
-    return (1.0 - v) * inner_point + v * outer_point
+    inner_point = inner_first + angular * (inner_last - inner_first)
+    outer_point = outer_first + angular * (outer_last - outer_first)
+    return (1.0 - radial) * inner_point + radial * outer_point

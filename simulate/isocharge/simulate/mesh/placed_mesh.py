@@ -1,4 +1,4 @@
-"""The mesh of one press: a template, its position on the film, and the integration rules of its elements."""
+"""Mesh of a press, which consists of a template, its position on the film, and integration rules for the elements."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,17 +25,32 @@ from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 
 UNDEFORMED_RADIUS = 0.5
-"""Radius within which the mesh of an oval film equals that of a circular film, in film radii."""
+"""Radius within which the mesh of an oval film is the same as the mesh of a circular film, in film radii."""
 
 PRESSURE_POINTS = 32
 """Number of integration points in each direction of an element for a pressure that is not uniform."""
 
 Pressure = Callable[[Complexes], Array]
-"""Function that returns the pressure at film points."""
+"""Function that returns the pressure at film points x + iy, in the shape of the points."""
 
 INVERSE_STEPS = 8
-"""Number of Newton steps of `from_oval`. With these steps, the error is of the order of rounding errors up to
-e = 0.05."""
+"""Number of Newton steps of `from_oval`.
+
+After this number of steps, the error is of the order of rounding errors for oval parameters up to e = 0.05.
+"""
+
+
+class CoatStiffness(NamedTuple):
+    """Stiffness that a coat adds to some elements of a mesh.
+
+    Attributes:
+        elements: Indices of the coated elements, shape (n,).
+        moduli: Contribution of the coat to the elasticity matrix C / E at the quadrature points of the coated elements,
+            shape (n, n_point, 3, 3).
+    """
+
+    elements: Integers
+    moduli: Array
 
 
 @dataclass(frozen=True)
@@ -43,16 +58,16 @@ class Geometry:
     """Integration rules for the elements of a mesh on the film.
 
     Attributes:
-        nodes: Node numbers, shape (n_element, n_local).
-        gradient: Derivatives of the basis with respect to (X1, X2) at the quadrature points, shape
+        nodes: Number of each node of each element, shape (n_element, n_local).
+        gradient: Derivatives of the basis functions with respect to (X1, X2) at the quadrature points, shape
             (n_element, n_point, 2, n_local).
-        weights: Integration weights, shape (n_element, n_point). Their sum is the meshed area.
-        load: Share of the load on the deflection W of each node, shape (n_node,). The sum is one over the number of
-            copies of the mesh.
-        mass: Lumped area of the nodes of each element, shape (n_element, n_local).
+        weights: Integration weights of the quadrature points, shape (n_element, n_point). The sum of all weights is the
+            meshed area.
+        load: Share of the force of the probe that acts on each node, shape (n_node,). The sum of all shares is one over
+            the number of copies of the mesh that cover the film.
+        mass: Integration weights of the nodes of each element, shape (n_element, n_local).
         constraint: Matrix for hanging nodes; see `Template.constraint`.
-        coat: Indices of the coated elements, shape (n,). Contribution of the coat to the elasticity matrix C / E at the
-            quadrature points of these elements, shape (n, n_point, 3, 3). None if there is no coat.
+        coat: Stiffness of the coat; None if there is no coat.
     """
 
     nodes: Integers
@@ -61,38 +76,41 @@ class Geometry:
     load: Array
     mass: Array
     constraint: csr_array | None = None
-    coat: tuple[Integers, Array] | None = None
+    coat: CoatStiffness | None = None
 
     @classmethod
     def build(cls, template: Template, points: Complexes, pressure: Pressure | None = None) -> "Geometry":
-        """Compute the integration rules of a mesh, and the forces of a unit load at its nodes.
+        """Compute the integration rules of a mesh, and the share of the force of the probe that acts on each node.
 
         Args:
             template: Template of the mesh.
-            points: Film points of the nodes of every element, shape (n_element, n_local), in film radii.
+            points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
             pressure: Function that returns the pressure at film points (in film radii), in any unit. None if the
                 pressure is uniform over the footprint.
 
         Returns:
             The integration rules.
         """
-        # Weights of the Gauss points and of the nodes: reference weights times the determinant of the Jacobian
+        # The weights of the quadrature points and of the nodes on the film are the weights on the reference element
+        # multiplied by the determinant of the Jacobian.
         rule = _quadrature(template.resolution.order)
         gradient, determinant = _film_gradient(rule.derivatives[:, None], points)
         weights = determinant * rule.weights
         node_jacobian = _jacobian(rule.node_derivatives[:, None], points)
         mass = node_jacobian.determinant * rule.node_weights
 
-        # Forces of the pressure at the nodes of the footprint, relative to the force on the whole film. The mesh covers
-        # only one of several equal copies of the film, so its forces sum to 1 / copies.
+        # Integrate the pressure times each basis function over the elements of the footprint.
         footprint = template.footprint
         if pressure is None:
             footprint_weights = weights[footprint]  # shape (n_footprint_element, n_point)
             element_load = footprint_weights @ rule.values  # shape (n_footprint_element, n_local)
             total_load = footprint_weights.sum()
         else:
-            element_load = _integrated_pressure(template.resolution.order, points[footprint], pressure)
+            element_load = _integrate_pressure(template.resolution.order, points[footprint], pressure)
             total_load = element_load.sum()
+
+        # Divide the forces by the force on the whole film. The mesh covers one of several equal copies, so the shares
+        # of its nodes add up to 1 / copies.
         node_load = np.bincount(template.nodes[footprint].ravel(), element_load.ravel(), template.n_node)
         load = node_load / (template.copies * total_load)
         if template.constraint is not None:
@@ -101,21 +119,24 @@ class Geometry:
 
     @property
     def stacked(self) -> Array:
-        """Gradient with a common axis for the points and both derivatives, shape (n_element, n_point * 2, n_local)."""
+        """Attribute `gradient` with a common axis for the points and both derivatives.
+
+        The shape is (n_element, n_point * 2, n_local).
+        """
         return self.gradient.reshape(len(self.gradient), -1, self.gradient.shape[-1])
 
-    def gather(self, local: Array) -> Array:
-        """Sum the contributions of the elements at the nodes.
+    def gather(self, contributions: Array) -> Array:
+        """Add the contributions of all elements at each node.
 
-        The contributions at a hanging node are distributed to the nodes that determine its value.
+        The contributions at a hanging node are distributed to the nodes that determine the value at the hanging node.
 
         Args:
-            local: Contributions, shape (n_element, n_local).
+            contributions: Contribution of each element at each of its nodes, shape (n_element, n_local).
 
         Returns:
-            Sums, shape (n_node,).
+            Sums at the nodes, shape (n_node,). The sums at hanging nodes are zero.
         """
-        sums = np.bincount(self.nodes.ravel(), local.ravel(), self.load.size).astype(np.float64)
+        sums = np.bincount(self.nodes.ravel(), contributions.ravel(), self.load.size).astype(np.float64)
         if self.constraint is None:
             return np.asarray(sums)
         return np.asarray(self.constraint.T @ sums)
@@ -123,12 +144,12 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class PlacedMesh:
-    """The mesh of one press, which is rotated onto the positive x axis.
+    """Mesh of a press. The press and the film are rotated such that the press lies on the positive x axis.
 
     Attributes:
         template: Template of the mesh.
         placement: Position of the template on a circular film.
-        layer: Width of the thin rings at the rim, in film radii.
+        layer: Total width of the thin rings at the rim, in film radii.
         oval: Shape of the clamp as the complex number e exp(2 i alpha). In the direction `angle`, the rim of the film
             lies at the distance 1 + e cos(2 (angle - alpha)) from the centre, in film radii. 0 for a circular clamp.
         coat: Coat on parts of the film, in film radii and rotated with the press; None if there is no coat.
@@ -147,13 +168,14 @@ class PlacedMesh:
 
     @cached_property
     def points(self) -> Complexes:
-        """Positions of the nodes of every element on the film, x + iy, shape (n_element, n_local), in film radii."""
-        return self.template.from_base(to_oval(self.placement.element_points(self.template), self.oval))
+        """Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii."""
+        circular_points = self.placement.element_points(self.template)
+        return self.template.from_base(to_oval(circular_points, self.oval))
 
     @property
     def node_points(self) -> Complexes:
-        """Positions of the nodes on the film, x + iy, shape (n_node,), in film radii."""
-        return np.asarray(self.points.ravel()[self.template.first_seen])
+        """Film points x + iy of the nodes, shape (n_node,), in film radii."""
+        return np.asarray(self.points.ravel()[self.template.first_occurrence])
 
     @cached_property
     def geometry(self) -> Geometry:
@@ -163,62 +185,70 @@ class PlacedMesh:
         if self.coat is None:
             return geometry
 
-        # Add the stiffness of the coat at the integration points of the elements that it may cover.
+        # Compute the stiffness of the coat at the quadrature points of all elements that the coat may cover.
         xi, eta, _ = gauss_reference_square(self.resolution.order + 1)
         basis_values = tensor_values(self.resolution.order, xi, eta)  # shape (n_point, n_local)
         quadrature_points = self.points @ basis_values.T  # shape (n_element, n_point)
         coated_elements = np.flatnonzero(self.coat.near(quadrature_points).any(axis=1))
-        added_stiffness = self.coat.moduli(quadrature_points[coated_elements])
-        return replace(geometry, coat=(coated_elements, added_stiffness))
+        added_moduli = self.coat.moduli(quadrature_points[coated_elements])
+        return replace(geometry, coat=CoatStiffness(coated_elements, added_moduli))
 
     def _pressure(self, points: Complexes) -> Array:
-        """Return the pressure of the probe at film points, shape (..., n), relative to the mean pressure.
+        """Compute the pressure of the probe at film points, divided by the mean pressure.
 
         Args:
-            points: Film points rotated with the press, in film radii.
+            points: Film points x + iy rotated with the press, shape (..., n), in film radii.
+
+        Returns:
+            Relative pressure, same shape, dimensionless.
         """
         centroid = self.placement.corners[-1]
-        points_of_probe = (from_oval(points, self.oval) - centroid) / self.placement.rotation_and_scale
-        return self.placement.probe.pressure(points_of_probe)
+        circular_points = from_oval(points, self.oval)
+        points_from_centroid_mm = (circular_points - centroid) / self.placement.rotation_and_scale
+        return self.placement.probe.pressure(points_from_centroid_mm)
 
     def locate(self, points: Complexes) -> tuple[Integers, Array, Array, Booleans]:
         """Find the elements that contain film points.
 
         Args:
-            points: Film points rotated with the press, shape (n,), in film radii.
+            points: Film points x + iy rotated with the press, shape (n,), in film radii.
 
         Returns:
-            Index of the element, xi, eta, and whether the point was reflected into the meshed half, each of shape (n,).
+            Index of the element, local coordinates xi and eta in the element, and whether the point was reflected into
+            the meshed half, each of shape (n,).
         """
         circular_points = from_oval(points, self.oval)
         meshed_points, is_reflected = self.template.into_meshed_half(circular_points)
+
         # `locate_points` expects one row of points for each placement. Here, there is a single placement.
         (base_element,), (base_xi,), (base_eta,) = locate_points(
             self.placement.batch(), self.template, meshed_points[None]
         )
-        element, xi, eta = self.template.within(base_element, base_xi, base_eta)  # after splits of elements
+        # The template may consist of parts of the original elements.
+        element, xi, eta = self.template.to_split_elements(base_element, base_xi, base_eta)
         return element, xi, eta, is_reflected
 
     def gradient(self, element: Integers, xi: Array, eta: Array) -> Array:
-        """Compute the derivatives of the basis with respect to (X1, X2) at points of elements.
+        """Compute the derivatives of the basis functions with respect to (X1, X2) at given points of elements.
 
         Args:
             element: Index of the element of each point, shape (n,).
-            xi: First local coordinate, shape (n,).
-            eta: Second local coordinate, shape (n,).
+            xi: First local coordinate of each point, shape (n,).
+            eta: Second local coordinate of each point, shape (n,).
 
         Returns:
             Derivatives, shape (n, 2, n_local).
         """
         _, derivatives = tensor_basis(self.resolution.order, xi, eta)
+        # The axis of length one is for the points of an element, of which there is one.
         gradient, _ = _film_gradient(derivatives[:, :, None, :], self.points[element])
         return gradient[:, 0]
 
     def node_derivatives(self, values: Array) -> Array:
-        """Compute the derivatives of nodal values with respect to (X1, X2) at the nodes of every element.
+        """Compute the derivatives of a field with respect to (X1, X2) at the nodes of every element.
 
         Args:
-            values: Values at the nodes, shape (n_element, n_local, k).
+            values: Values of the field at the nodes, shape (n_element, n_local, k).
 
         Returns:
             Derivatives, shape (n_element, n_local, 2, k).
@@ -231,7 +261,7 @@ class PlacedMesh:
 
     @cached_property
     def _node_gradient(self) -> Array:
-        """Derivatives of the basis with respect to (X1, X2) at the nodes, shape (n_element, n_local, 2, n_local)."""
+        """Derivatives of the basis functions by (X1, X2) at the nodes, shape (n_element, n_local, 2, n_local)."""
         _, derivatives = tensor_basis(self.resolution.order, self.template.xi, self.template.eta)
         gradient, _ = _film_gradient(derivatives[:, None], self.points)
         return gradient
@@ -240,24 +270,24 @@ class PlacedMesh:
 def place(
     film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float, *, whole: bool = False
 ) -> PlacedMesh:
-    """Place the template of a probe under a press.
+    """Create the mesh of a press by placing the template of the probe on the film.
 
     Args:
         film: The film.
         probe: The probe.
         at: Centroid (x, y) of the footprint, mm.
         resolution: Fineness of the mesh.
-        layer: Width of the thin rings at the rim, in film radii.
-        whole: Whether to mesh the whole film although film and footprint are symmetric, as a load that is not symmetric
-            requires.
+        layer: Total width of the thin rings at the rim, in film radii.
+        whole: Whether to mesh the whole film although film and footprint are symmetric. A load that is not symmetric
+            requires such a mesh.
 
     Returns:
-        The mesh, which is rotated so that the press lies on the positive x axis.
+        The mesh. It is rotated such that the press lies on the positive x axis.
     """
     needs_whole_mesh = whole or not film.is_axisymmetric
     template = template_for(probe, resolution, whole=needs_whole_mesh)
 
-    # Rotate the press, the probe and the axis of an oval film so that the press lies on the positive x axis.
+    # Rotate the press, the probe and the axis of an oval film such that the press lies on the positive x axis.
     x, y = at
     direction = float(np.arctan2(y, x))
     distance = np.array(np.hypot(x, y))
@@ -267,55 +297,59 @@ def place(
 
 
 def to_oval(points: Complexes, oval: complex) -> Complexes:
-    """Map points of a circular film to an oval film. Points within `UNDEFORMED_RADIUS` remain unchanged.
+    """Convert points of a circular film into points of an oval film.
 
-    Each point is displaced in the radial direction. At the rim, the relative displacement is e cos(2 (angle - alpha)).
+    Each point is displaced in the radial direction. Points within `UNDEFORMED_RADIUS` remain unchanged. At the rim, the
+    displacement divided by the radius is e cos(2 (angle - alpha)) in the direction `angle`.
 
     Args:
-        points: Points x + iy, any shape, in film radii.
-        oval: e exp(2 i alpha) of the clamp; see `PlacedMesh`.
+        points: Points x + iy of the circular film, any shape, in film radii.
+        oval: Shape e exp(2 i alpha) of the clamp; see `PlacedMesh`.
 
     Returns:
-        Points of the oval film, same shape, in film radii.
+        Points x + iy of the oval film, same shape, in film radii.
     """
     if oval == 0.0:
         return points
     radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
-    rim_displacement = (np.conj(oval) * (points / radius) ** 2).real
-    return np.asarray(points * (1.0 + _relative_displacement(radius) * rim_displacement))
+    rim_displacement = (np.conj(oval) * (points / radius) ** 2).real  # e cos(2 (angle - alpha))
+    return np.asarray(points * (1.0 + _displacement_ratio(radius) * rim_displacement))
 
 
 def from_oval(points: Complexes, oval: complex) -> Complexes:
-    """Map points of an oval film to a circular film. This is the inverse of `to_oval`.
+    """Convert points of an oval film into points of a circular film. This function is the inverse of `to_oval`.
 
-    The radius is found by Newton's method with an approximate slope.
+    The radius of each point on the circular film is computed by Newton's method with an approximate slope.
 
     Args:
-        points: Points x + iy, any shape, in film radii.
-        oval: e exp(2 i alpha) of the clamp; see `PlacedMesh`.
+        points: Points x + iy of the oval film, any shape, in film radii.
+        oval: Shape e exp(2 i alpha) of the clamp; see `PlacedMesh`.
 
     Returns:
-        Points of the circular film, same shape, in film radii.
+        Points x + iy of the circular film, same shape, in film radii.
     """
     if oval == 0.0:
         return points
     oval_radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
-    rim_displacement = (np.conj(oval) * (points / oval_radius) ** 2).real
+    rim_displacement = (np.conj(oval) * (points / oval_radius) ** 2).real  # e cos(2 (angle - alpha))
     radius = oval_radius
     for _ in range(INVERSE_STEPS):
-        relative_displacement = _relative_displacement(radius)
-        residual = radius * (1.0 + relative_displacement * rim_displacement) - oval_radius
-        # With the cubic relative displacement d(r), the derivative of r d(r) is d + r d' = 7 d at the rim. The same
-        # ratio is used for all radii, which is sufficient for the convergence.
-        slope = 1.0 + 7.0 * rim_displacement * relative_displacement
+        displacement_ratio = _displacement_ratio(radius)
+        residual = radius * (1.0 + displacement_ratio * rim_displacement) - oval_radius
+        # If d(r) is the displacement ratio at the radius r, the derivative of r d(r) is d + r d', which is 7 d at the
+        # rim. The factor 7 is used for all radii, because an approximate slope is sufficient for the convergence.
+        slope = 1.0 + 7.0 * rim_displacement * displacement_ratio
         radius = radius - residual / slope
     return np.asarray(points * (radius / oval_radius))
 
 
-def _relative_displacement(radius: Array) -> Array:
-    """Return the ratio of the displacement at a radius to the displacement of the rim.
+def _displacement_ratio(radius: Array) -> Array:
+    """Compute the ratio of the relative displacement at a radius to the relative displacement of the rim.
 
-    The ratio is 0 at `UNDEFORMED_RADIUS` and 1 at the rim.
+    The ratio increases with the third power of the distance from `UNDEFORMED_RADIUS`, and is 1 at the rim.
+
+    Args:
+        radius: Radii of at least `UNDEFORMED_RADIUS`, any shape, in film radii.
     """
     return np.asarray(((radius - UNDEFORMED_RADIUS) / (1.0 - UNDEFORMED_RADIUS)) ** 3)
 
@@ -324,11 +358,12 @@ class _Quadrature(NamedTuple):
     """Integration rules on the reference element.
 
     Attributes:
-        values: Basis at the Gauss points, shape (n_point, n_local).
-        derivatives: Derivatives of the basis with respect to (xi, eta) at the Gauss points, shape (2, n_point,
-            n_local).
+        values: Basis functions at the Gauss points, shape (n_point, n_local).
+        derivatives: Derivatives of the basis functions with respect to (xi, eta) at the Gauss points, shape
+            (2, n_point, n_local).
         weights: Weights of the Gauss points, shape (n_point,).
-        node_derivatives: Derivatives of the basis with respect to (xi, eta) at the nodes, shape (2, n_local, n_local).
+        node_derivatives: Derivatives of the basis functions with respect to (xi, eta) at the nodes, shape
+            (2, n_local, n_local).
         node_weights: Gauss-Lobatto weights of the nodes, shape (n_local,).
     """
 
@@ -339,27 +374,30 @@ class _Quadrature(NamedTuple):
     node_weights: Array
 
 
-def _integrated_pressure(order: int, points: Complexes, pressure: Pressure) -> Array:
-    """Integrate the pressure times each basis function over elements.
+def _integrate_pressure(order: int, points: Complexes, pressure: Pressure) -> Array:
+    """Integrate the product of the pressure and each basis function over each element.
 
     Args:
         order: Order of the elements.
-        points: Film points of the nodes of every element, shape (n_element, n_local), in film radii.
+        points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
         pressure: Function that returns the pressure at film points.
 
     Returns:
         Integrals, shape (n_element, n_local).
     """
-    xi, eta, weights = gauss_reference_square(PRESSURE_POINTS)
+    xi, eta, reference_weights = gauss_reference_square(PRESSURE_POINTS)
     values, derivatives = tensor_basis(order, xi, eta)
-    weights_on_film = _jacobian(derivatives[:, None], points).determinant * weights
-    film_points = points @ values.T  # the integration points, shape (n_element, n_point)
-    force_at_points = pressure(film_points) * weights_on_film
+    film_weights = _jacobian(derivatives[:, None], points).determinant * reference_weights
+    quadrature_points = points @ values.T  # film points, shape (n_element, n_point)
+    force_at_points = pressure(quadrature_points) * film_weights
     return np.asarray(force_at_points @ values)
 
 
 class _Jacobian(NamedTuple):
-    """Derivatives of the film coordinates (x, y) with respect to (xi, eta), each of shape (n_element, n_point)."""
+    """Derivatives of the film coordinates (x, y) with respect to the local coordinates (xi, eta) of elements.
+
+    Each array has the shape (n_element, n_point). The field `determinant` is the determinant of the four derivatives.
+    """
 
     x_xi: Array
     x_eta: Array
@@ -370,11 +408,20 @@ class _Jacobian(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _quadrature(order: int) -> _Quadrature:
-    """Return the integration rules for elements of an order: at Gauss points, and at the nodes (Lobatto)."""
+    """Return the integration rules of elements of a given order.
+
+    The first rule uses the Gauss points of an element, and the second rule uses its nodes (Gauss-Lobatto rule).
+
+    Args:
+        order: Order of the elements.
+    """
+    # Gauss rule
     xi, eta, weights = gauss_reference_square(order + 1)
     values, derivatives = tensor_basis(order, xi, eta)
-    nodes = lobatto_nodes(order)
-    node_xi, node_eta = np.meshgrid(nodes, nodes)
+
+    # Gauss-Lobatto rule
+    line_nodes = lobatto_nodes(order)
+    node_xi, node_eta = np.meshgrid(line_nodes, line_nodes)
     _, node_derivatives = tensor_basis(order, node_xi.ravel(), node_eta.ravel())
     line_weights = lobatto_quadrature(order)
     node_weights = np.outer(line_weights, line_weights).ravel()
@@ -382,22 +429,26 @@ def _quadrature(order: int) -> _Quadrature:
 
 
 def _film_gradient(derivatives: Array, points: np.ndarray) -> tuple[Array, Array]:
-    """Compute the derivatives of the basis with respect to the film coordinates.
+    """Compute the derivatives of the basis functions with respect to the film coordinates.
 
     Args:
-        derivatives: Derivatives of the basis with respect to (xi, eta), shape (2, n_element or 1, n_point, n_local).
-        points: Film points of the nodes of every element, shape (n_element, n_local), in film radii.
+        derivatives: Derivatives of the basis functions with respect to (xi, eta), shape
+            (2, n_element, n_point, n_local). The second axis may have the length 1 if the derivatives are the same for
+            all elements.
+        points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
 
     Returns:
         Derivatives with respect to (X1, X2), shape (n_element, n_point, 2, n_local). Determinant of the Jacobian, shape
         (n_element, n_point).
     """
-    # Inverse of the 2 x 2 Jacobian: row X1 is (y_eta, -y_xi), and row X2 is (-x_eta, x_xi), over the determinant.
+    # The inverse of the Jacobian has the rows (y_eta, -y_xi) and (-x_eta, x_xi), divided by the determinant. The first
+    # row belongs to X1, and the second row to X2.
     jacobian = _jacobian(derivatives, points)
     determinant = jacobian.determinant
     adjugate = np.stack([jacobian.y_eta, -jacobian.y_xi, -jacobian.x_eta, jacobian.x_xi], axis=-1)
     inverse = (adjugate / determinant[..., None]).reshape(*determinant.shape, 2, 2)
-    # Sum over the local derivative b, for each element e, point p, film derivative a and node n.
+
+    # Sum over the local coordinate b, for each element e, point p, film coordinate a and node n.
     gradient = np.einsum("epab,bepn->epan", inverse, derivatives)
     return gradient, determinant
 
@@ -406,16 +457,15 @@ def _jacobian(derivatives: Array, points: np.ndarray) -> _Jacobian:
     """Compute the Jacobian of the map from the reference element to the film.
 
     Args:
-        derivatives: Derivatives of the basis with respect to (xi, eta); see `_film_gradient`.
+        derivatives: Derivatives of the basis functions with respect to (xi, eta), shape
+            (2, n_element, n_point, n_local). The second axis may have the length 1 if the derivatives are the same for
+            all elements.
         points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
-
-    Returns:
-        Derivatives of x and y with respect to xi and eta, and their determinant.
     """
-    # Sum over the nodes n, for each local derivative k (xi or eta), element e and point p. The result is complex, like
-    # the points.
-    tangent = np.einsum("kepn,en->kep", derivatives, points)
-    x_xi, x_eta = tangent.real
-    y_xi, y_eta = tangent.imag
+    # Sum over the nodes n, for each local coordinate k (xi or eta), element e and point p. The real part of the result
+    # contains the derivatives of x, and the imaginary part contains the derivatives of y.
+    point_derivatives = np.einsum("kepn,en->kep", derivatives, points)
+    x_xi, x_eta = point_derivatives.real
+    y_xi, y_eta = point_derivatives.imag
     determinant = x_xi * y_eta - x_eta * y_xi
     return _Jacobian(x_xi, x_eta, y_xi, y_eta, determinant)

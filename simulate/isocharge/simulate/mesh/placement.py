@@ -1,18 +1,22 @@
-"""Positions of the elements on the film: a conformal map for the rings, and blended blocks in and around the footprint.
+"""Positions of the elements of a mesh on the film for a given position of the probe.
 
-The disk automorphism
+The positions of the rings follow from a conformal map of the unit disk onto itself,
 
-    Z = (z + c) / (1 + c z),   0 <= c < 1,
+    Z = (z + c) / (1 + c z),   0 <= c < 1.
 
-is a conformal map of the unit disk onto itself. The map converts points z of the template plane into film points Z, in
-film radii, with the probe on the positive x axis. The images of circles are circles. With
+The map converts points z of the template plane into film points Z in film radii. The probe lies on the positive x axis
+of the film. The map converts circles into circles. With the parameters
 
-    al = (atanh(p + R) + atanh(p - R)) / 2,   be = (atanh(p + R) - atanh(p - R)) / 2,   c = tanh al,   rho = tanh be
+    al = (atanh(p + R) + atanh(p - R)) / 2,   be = (atanh(p + R) - atanh(p - R)) / 2,   c = tanh al,   rho = tanh be,
 
-the circle |z| = rho is mapped exactly onto the circle of radius R about p. Inside this circle, the blocks are linear
-blends between the edges of the core polygon, the boundary of the footprint and the circle. The edges of a polygonal
-footprint remain straight, so the load is integrated over exactly the footprint. The values of fields at the nodes are
-smooth functions of the position of the probe. The module `point_location` finds the element that contains a film point.
+the map converts the circle |z| = rho into the circle with the radius R and the centre p, which is the innermost circle
+of the mesh.
+
+Inside the innermost circle, the points of an element are interpolated linearly between its inner and its outer side.
+The sides of the elements lie on the core polygon, on the boundary of the footprint and on the innermost circle. The
+edges of a polygonal footprint remain straight, so the load is integrated exactly over the footprint. The values of
+fields at the nodes are smooth functions of the position of the probe. The module `point_location` finds the element
+that contains a film point.
 """
 
 from collections.abc import Callable
@@ -39,19 +43,20 @@ CHECKED_ORIENTATIONS = 12
 
 @dataclass(frozen=True)
 class Placement:
-    """Position of a template on the film. The arrays may have leading axes, for one placement per press.
+    """Position of a template on the film. The arrays may have additional leading axes for several placements.
 
     Attributes:
         c: Parameter of the conformal map, shape (...).
         rho: Radius of the innermost circle in the template plane, shape (...).
-        corners: Corners of the core polygon and, last, its centroid, on the film, in film radii, shape
+        corners: Corners of the core polygon, followed by its centroid, as film points x + iy, in film radii, shape
             (..., n_corner + 1).
-        circle_angles: Angles of the sides of the sectors on the innermost circle, shape (..., n_sector + 1), rad.
-        rim_angles: Angles of the sides of the sectors on the rim, shape (..., n_sector + 1), rad.
-        ring_depths: Depths of the edges of the rings, 0 on the innermost circle and 1 on the rim, shape
+        circle_angles: Angles of the sides of the sectors on the innermost circle in the template plane, shape
+            (..., n_sector + 1), rad.
+        rim_angles: Angles of the sides of the sectors on the rim in the template plane, shape (..., n_sector + 1), rad.
+        ring_depths: Depths of the edges of the rings, from 0 on the innermost circle to 1 on the rim, shape
             (..., n_ring + 1).
-        rotation_and_scale: Complex factor that rotates points of the footprint by the further rotation and converts
-            them from mm to film radii, shape (...). The points are relative to the centroid.
+        rotation_and_scale: Complex factor for points of the footprint relative to its centroid, shape (...). The factor
+            rotates the points by the additional rotation of the footprint, and converts them from mm to film radii.
         probe: The probe.
     """
 
@@ -76,16 +81,16 @@ class Placement:
     ) -> Self:
         """Place a template under a press on the positive x axis.
 
-        The method determines the innermost circle, the conformal map that belongs to it, and the angles and depths of
-        the elements between this circle and the rim.
+        The method determines the innermost circle of the mesh, the conformal map for this circle, and the angles and
+        depths of the elements between the circle and the rim.
 
         Args:
-            blocks: The elements, whose topology must be the topology of the probe.
+            blocks: The elements. Their topology must be the topology of the probe.
             probe: The probe in the frame in which the press lies on the positive x axis.
             distance: Distance of the centroid of the footprint from the centre of the film, any shape, mm.
             film_radius: Radius of the film, mm.
-            layer: Width of the thin rings at the rim, in film radii.
-            rotation: Further rotation of the footprint, a number or of the shape of `distance`, rad.
+            layer: Total width of the thin rings at the rim, in film radii.
+            rotation: Additional rotation of the footprint, a number or of the shape of `distance`, rad.
         """
         # Corners of the core polygon on the film, followed by the centroid of the footprint. The centroid is a real
         # number, because the press lies on the x axis.
@@ -93,13 +98,14 @@ class Placement:
         if probe.is_axisymmetric:
             rotation = 0.0
         rotation_factor: Complexes = np.exp(1j * np.broadcast_to(rotation, centroid.shape))
-        core = centroid[..., None] + probe.core(film_radius) * rotation_factor[..., None]
-        corners = np.concatenate([core, centroid[..., None]], axis=-1)
+        core_corners = centroid[..., None] + probe.core(film_radius) * rotation_factor[..., None]
+        corners = np.concatenate([core_corners, centroid[..., None]], axis=-1)
 
-        # The innermost circle is the footprint itself, or encloses it. `reach` is the largest distance of the blocks
-        # inside the circle from its centre. `stops` are the corners of the footprint and the points half-way between
-        # them, at which the sectors around the footprint begin.
-        stops: Complexes = np.asarray(corners @ blocks.boundary[:: blocks.split].T)
+        # The innermost circle is the boundary of a circular footprint, or encloses the footprint with a gap. The last
+        # layer of blocks ends at this circle. `reach` is the largest distance of the inner side of the last layer from
+        # the centre of the circle. `stops` are the points of this side that belong to the corners of the core polygon
+        # and to the points half-way between the corners. Sides of sectors begin at the stops.
+        stops: Complexes = np.asarray(corners @ blocks.core_outline[:: blocks.n_half_edge].T)
         if probe.topology.fills_circle:
             centre = centroid
             radius = np.full(centroid.shape, probe.reach / film_radius)
@@ -109,7 +115,7 @@ class Placement:
             centre, radius = enclosing_circle(outline, centroid)
             reach = np.abs(outline - centre[..., None]).max(axis=-1)
             if probe.topology.is_curved:
-                boundary = probe.boundary(blocks.boundary_parameter[:: blocks.split])
+                boundary = probe.boundary(blocks.boundary_parameter[:: blocks.n_half_edge])
                 stops = np.asarray(centroid[..., None] + boundary / film_radius * rotation_factor[..., None])
 
         # Compute the conformal map of the innermost circle, and the angles and depths of the elements around it.
@@ -128,41 +134,65 @@ class Placement:
         )
 
     def __getitem__(self, indices: Integers) -> "Placement":
-        """Return the placements with the given indices along the first axis."""
+        """Select placements by their indices along the first axis of the arrays."""
         return self._with_arrays(lambda values: values[indices])
 
     def batch(self) -> "Placement":
-        """Return a single placement with an additional axis of length one, as for several presses."""
+        """Return the placement with an additional first axis of length one in all arrays."""
         return self._with_arrays(lambda values: np.asarray(values)[None])
 
-    def _with_arrays(self, function: Callable[[Any], Any]) -> "Placement":
-        """Return a copy in which a function is applied to every array."""
+    def _with_arrays(self, convert: Callable[[Any], Any]) -> "Placement":
+        """Return a copy of the placement in which each array is replaced by the result of a function.
+
+        Args:
+            convert: Function that converts each array.
+        """
         arrays: dict[str, Any] = {
-            field.name: function(getattr(self, field.name)) for field in fields(self) if field.name != "probe"
+            field.name: convert(getattr(self, field.name)) for field in fields(self) if field.name != "probe"
         }
         return replace(self, **arrays)
 
     def to_film(self, z: Complexes) -> Complexes:
-        """Map points of the template plane, shape (..., n), to film points in film radii."""
+        """Convert points of the template plane into film points by the conformal map.
+
+        Args:
+            z: Points x + iy of the template plane, shape (..., n).
+
+        Returns:
+            Film points, shape (..., n), in film radii.
+        """
         c = self.c[..., None]
         return np.asarray((z + c) / (1.0 + c * z))
 
     def to_template(self, points: Complexes) -> Complexes:
-        """Map film points in film radii, shape (..., n), to points of the template plane."""
+        """Convert film points into points of the template plane by the inverse of the conformal map.
+
+        Args:
+            points: Film points x + iy, shape (..., n), in film radii.
+
+        Returns:
+            Points of the template plane, shape (..., n).
+        """
         c = self.c[..., None]
         return np.asarray((points - c) / (1.0 - c * points))
 
     def boundary(self, parameter: Array) -> Complexes:
-        """Return points of the boundary of the footprint on the film, in film radii.
+        """Compute points of the boundary of a curved footprint on the film.
 
         Args:
-            parameter: Boundary parameters, from 0 to 2 pi, shape (..., n).
+            parameter: Boundary parameters of the points, from 0 to 2 pi, shape (..., n).
+
+        Returns:
+            Film points x + iy, shape (..., n), in film radii.
         """
         centroid = self.corners[..., -1:]
         return np.asarray(centroid + self.rotation_and_scale[..., None] * self.probe.boundary(parameter))
 
     def element_points(self, blocks: Blocks) -> Complexes:
-        """Compute the film points of the nodes of every element for a single placement.
+        """Compute the film points of the nodes of all elements for a single placement.
+
+        Args:
+            blocks: The elements.
 
         Returns:
             Film points x + iy, shape (n_element, (order + 1)^2), in film radii.
@@ -174,22 +204,30 @@ class Placement:
     def _inner_element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes of the elements inside the innermost circle.
 
-        A point is a linear blend between the inner and the outer side of its element. `Blocks.straight` describes the
-        straight sides. This method adds the curved sides.
+        The points of an element are interpolated linearly between its inner side and its outer side. The weights
+        `Blocks.inner_corner_weights` describe the corners on straight sides, and are zero for corners on curved sides.
+        Therefore the contributions of the curved sides are added separately.
+
+        Args:
+            blocks: The elements.
 
         Returns:
             Film points x + iy, shape (n_inner, (order + 1)^2), in film radii.
         """
-        radial, angular = _unit_coordinates(blocks)  # of the nodes of an element, from 0 to 1, shape (n_local,)
-        corners = blocks.straight @ self.corners  # shape (n_inner, 4)
-        a, b, c, d = corners.T[:, :, None]  # each of shape (n_inner, 1)
-        inner_side = a + angular * (b - a)
-        outer_side = c + angular * (d - c)
+        # Contributions of the straight sides. The coordinates of the nodes have the shape (n_local,).
+        radial, angular = _unit_coordinates(blocks)
+        corners = blocks.inner_corner_weights @ self.corners  # shape (n_inner, 4)
+        inner_first, inner_last, outer_first, outer_last = corners.T[:, :, None]  # each of shape (n_inner, 1)
+        inner_side = inner_first + angular * (inner_last - inner_first)
+        outer_side = outer_first + angular * (outer_last - outer_first)
         points = (1.0 - radial) * inner_side + radial * outer_side
 
-        innermost_circle = self.to_film(self.rho * np.exp(1j * self._node_circle_angles(blocks)))
-        points[blocks.last_layer] += radial * innermost_circle
-        if blocks.n_layer == 2:  # the boundary of the footprint separates the two layers
+        # Contribution of the innermost circle, which is the outer side of the last layer
+        circle = self.to_film(self.rho * np.exp(1j * self._node_circle_angles(blocks)))  # shape (n_sector, n_local)
+        points[blocks.last_layer] += radial * circle
+
+        # Contribution of the boundary of the footprint, which separates the layers if there are two
+        if blocks.n_layer == 2:
             sector = np.arange(blocks.n_sector)[:, None]
             first_parameter = blocks.boundary_parameter[sector]
             last_parameter = blocks.boundary_parameter[sector + 1]
@@ -201,16 +239,20 @@ class Placement:
     def _ring_element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes of the elements between the innermost circle and the rim.
 
+        Args:
+            blocks: The elements.
+
         Returns:
             Film points x + iy, shape (n_ring * n_sector, (order + 1)^2), in film radii.
         """
-        # Depth of the nodes: 0 on the innermost circle, 1 on the rim
+        # Depths of the nodes, from 0 on the innermost circle to 1 on the rim
         radial, angular = _unit_coordinates(blocks)
         inner_depth = self.ring_depths[:-1, None]
         node_depth = inner_depth + radial * np.diff(self.ring_depths)[:, None]  # shape (n_ring, n_local)
         depth = node_depth[:, None]  # shape (n_ring, 1, n_local)
 
-        # The angle is interpolated over the depth between the innermost circle and the rim.
+        # The angle of a node and the logarithm of its radius are interpolated linearly with respect to the depth,
+        # between the innermost circle and the rim. On the rim, the logarithm of the radius is 0.
         circle_angle = self._node_circle_angles(blocks)  # shape (n_sector, n_local)
         rim_angle = self.rim_angles[:-1, None] + angular * np.diff(self.rim_angles)[:, None]
         angle = (1.0 - depth) * circle_angle + depth * rim_angle  # shape (n_ring, n_sector, n_local)
@@ -219,7 +261,14 @@ class Placement:
         return self.to_film(template_points).reshape(-1, radial.size)
 
     def _node_circle_angles(self, blocks: Blocks) -> Array:
-        """Return the angles (rad) on the innermost circle for the nodes of each sector, shape (n_sector, n_local)."""
+        """Compute the angles of the nodes of each sector on the innermost circle in the template plane.
+
+        Args:
+            blocks: The elements.
+
+        Returns:
+            Angles, shape (n_sector, n_local), rad.
+        """
         _, angular = _unit_coordinates(blocks)
         first_side = self.circle_angles[:-1, None]
         last_side = self.circle_angles[1:, None]
@@ -227,25 +276,36 @@ class Placement:
 
 
 def _unit_coordinates(blocks: Blocks) -> tuple[Array, Array]:
-    """Return the radial and angular coordinates (0 to 1) of the nodes of an element, each of shape (n_local,)."""
+    """Return the radial and angular coordinates of the nodes of an element.
+
+    Args:
+        blocks: The elements.
+
+    Returns:
+        Radial coordinate and angular coordinate, both from 0 to 1, each of shape (n_local,).
+    """
     return 0.5 * (blocks.xi + 1.0), 0.5 * (blocks.eta + 1.0)
 
 
 def widest_smooth_layer(mesh: Blocks, probe: Probe, distance: float, film_radius: float) -> float:
-    """Return the largest width of the thin rings for which the mesh is a smooth function of the position of the press.
+    """Compute the largest width of the thin rings for which the mesh is a smooth function of the position of the press.
 
-    `ring_edges` limits the depth of wider thin rings if the press is near the rim. The positions of the nodes would
-    then have a kink as functions of the distance. Polynomials in the distance would interpolate the fields badly.
+    If the press is near the rim, the function `ring_edges` limits the depth of wider thin rings. The positions of the
+    nodes, as functions of the distance of the press from the centre, would then have a kink. A polynomial in the
+    distance would therefore interpolate the fields inaccurately.
 
     Args:
         mesh: Template of the mesh.
         probe: The probe.
-        distance: Largest distance of a press from the centre, mm.
+        distance: Largest distance of a press from the centre of the film, mm.
         film_radius: Radius of the film, mm.
 
     Returns:
-        Width of all thin rings together, in film radii.
+        Total width of the thin rings, in film radii.
     """
+    # The layer is 0, because the parameters of the conformal map do not depend on the width of the thin rings.
+    no_layer = 0.0
     rotation = 2.0 * np.pi * np.arange(CHECKED_ORIENTATIONS) / CHECKED_ORIENTATIONS
-    placement = Placement.of(mesh, probe, np.full(CHECKED_ORIENTATIONS, distance), film_radius, 0.0, rotation)
+    distances = np.full(CHECKED_ORIENTATIONS, distance)
+    placement = Placement.of(mesh, probe, distances, film_radius, no_layer, rotation)
     return float(widest_layer(mesh.resolution, placement.c, placement.rho).min())

@@ -1,8 +1,11 @@
-"""Search for the elements that contain film points.
+"""Search for the elements that contain given film points.
 
-Points outside the innermost circle are located by closed formulas, and points inside by Newton's method. The module
-`placement` describes the positions of the elements. Each element has two local coordinates from 0 to 1. The radial
-coordinate increases from the inner to the outer side. The angular coordinate increases anticlockwise along the sector.
+The elements of points outside the innermost circle are computed by closed formulas. The local coordinates of points
+inside the innermost circle are computed by Newton's method. The docstring of the module `placement` describes the
+positions of the elements on the film.
+
+In this module, each element has two local coordinates from 0 to 1. The radial coordinate increases from the inner side
+to the outer side of the element. The angular coordinate increases anticlockwise.
 """
 
 from typing import NamedTuple
@@ -14,25 +17,30 @@ from isocharge.simulate.mesh.blocks import Blocks
 from isocharge.simulate.mesh.placement import Placement
 
 NEWTON_STEPS = 20
-"""Number of Newton steps to locate a point inside the innermost circle. Six suffice in well-shaped blocks."""
+"""Number of Newton steps with which a point inside the innermost circle is located.
+
+In well-shaped blocks, six steps are sufficient.
+"""
 
 OVERSHOOT = 0.1
-"""Largest amount by which the local coordinates of a point may leave the range from 0 to 1 in Newton's method."""
+"""Largest distance of the local coordinates of a point from the range from 0 to 1 in Newton's method."""
 
 SECTOR_TOLERANCE = 1e-9
-"""Amount by which a local coordinate must leave the range from 0 to 1 before a neighbouring sector is tried."""
+"""Distance of a local coordinate from the range from 0 to 1 above which neighbouring sectors are tried."""
 
 PARAMETER_STEP = 1e-5
 """Step of the boundary parameter for the derivative of a curved boundary by central differences."""
 
 
 class _Sides(NamedTuple):
-    """Points of the inner and outer sides of elements, and their derivatives with respect to the angular coordinate.
+    """Points of the inner and outer sides of elements, and the derivatives of these points.
+
+    The derivatives are taken with respect to the angular coordinate.
 
     Attributes:
-        inner: Points of the inner sides, shape (n,), in film radii.
+        inner: Points x + iy of the inner sides, shape (n,), in film radii.
         inner_derivative: Derivatives of `inner`, shape (n,).
-        outer: Points of the outer sides, shape (n,), in film radii.
+        outer: Points x + iy of the outer sides, shape (n,), in film radii.
         outer_derivative: Derivatives of `outer`, shape (n,).
     """
 
@@ -45,79 +53,87 @@ class _Sides(NamedTuple):
 class QuadCorners(NamedTuple):
     """Corners of quadrilateral elements as film points x + iy, in film radii.
 
+    The two corners of a side are in anticlockwise order.
+
     Attributes:
-        a: First corner of the inner side.
-        b: Second corner of the inner side, anticlockwise from a.
-        c: First corner of the outer side.
-        d: Second corner of the outer side, anticlockwise from c.
+        inner_first: First corner of the inner side.
+        inner_last: Last corner of the inner side.
+        outer_first: First corner of the outer side.
+        outer_last: Last corner of the outer side.
     """
 
-    a: Complexes
-    b: Complexes
-    c: Complexes
-    d: Complexes
+    inner_first: Complexes
+    inner_last: Complexes
+    outer_first: Complexes
+    outer_last: Complexes
 
     def of_elements(self, element: Integers) -> "QuadCorners":
         """Select the corners of one element for each point.
 
-        Each field of this object has the shape (n_point, n_element), with one row of elements for each point.
+        The arrays of this object must have the shape (n_point, n_element), with one row of elements for each point.
 
         Args:
             element: Index of the element of each point, shape (n_point,).
 
         Returns:
-            Corners of these elements, each of shape (n_point,).
+            Corners of the selected elements, each of shape (n_point,).
         """
         row_of_point = np.arange(element.size)
         return QuadCorners(
-            a=self.a[row_of_point, element],
-            b=self.b[row_of_point, element],
-            c=self.c[row_of_point, element],
-            d=self.d[row_of_point, element],
+            inner_first=self.inner_first[row_of_point, element],
+            inner_last=self.inner_last[row_of_point, element],
+            outer_first=self.outer_first[row_of_point, element],
+            outer_last=self.outer_last[row_of_point, element],
         )
 
 
 def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
-    """Find the elements that contain film points. There are n points for each of k placements.
+    """Find the elements that contain film points, and the local coordinates of the points in their elements.
 
     Args:
-        placement: One placement for each row of points.
+        placement: k placements, one for each row of points.
         blocks: The elements.
-        points: Film points, shape (k, n), in film radii. They lie in the upper half if only that half is meshed.
+        points: Film points x + iy, shape (k, n), in film radii. If only the upper half of the film is meshed, all
+            points must lie in the upper half.
 
     Returns:
-        Index of the element, xi and eta, each of shape (k, n).
+        Index of the element and local coordinates xi and eta from -1 to 1, each of shape (k, n).
     """
-    # All points are first located as if they were in the rings. The points inside the circle are then located again.
+    # First locate all points as if they were in the rings. Then locate the points inside the innermost circle again.
     template_points = placement.to_template(points)
     element, radial, angular = _locate_in_rings(placement, blocks, template_points)
     is_inside = np.abs(template_points) <= placement.rho[:, None]
     if np.any(is_inside):
         placement_index, _ = np.nonzero(is_inside)
-        placement_of_point = placement[placement_index]  # the placement of each inner point
+        placement_of_point = placement[placement_index]  # one placement for each point inside the circle
         element[is_inside], radial[is_inside], angular[is_inside] = _locate_inside(
             placement_of_point, blocks, points[is_inside]
         )
-    return element, 2.0 * radial - 1.0, 2.0 * angular - 1.0
+
+    # Convert the coordinates from the range from 0 to 1 to the range from -1 to 1.
+    xi = 2.0 * radial - 1.0
+    eta = 2.0 * angular - 1.0
+    return element, xi, eta
 
 
 def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Complexes) -> tuple[Integers, Array, Array]:
-    """Locate points between the innermost circle and the rim.
+    """Find the elements that contain points between the innermost circle and the rim.
 
     Args:
-        placement: One placement for each row of points.
+        placement: k placements, one for each row of points.
         blocks: The elements.
-        template_points: Points of the template plane, shape (k, n).
+        template_points: Points x + iy of the template plane, shape (k, n).
 
     Returns:
-        Index of the element and its radial and angular coordinate from 0 to 1, each of shape (k, n).
+        Index of the element, and radial and angular coordinate in the element from 0 to 1, each of shape (k, n).
     """
-    # Depth of each point: 0 on the innermost circle, 1 on the rim
-    with np.errstate(divide="ignore"):  # the logarithm of the centre is infinite
+    # Depth of each point, from 0 on the innermost circle to 1 on the rim. At the origin, the logarithm is infinite, and
+    # the depth is clipped to 0.
+    with np.errstate(divide="ignore"):
         log_ratio = np.log(np.abs(template_points)) / np.log(placement.rho)[:, None]
     depth = np.clip(1.0 - log_ratio, 0.0, 1.0)
 
-    # Ring of each point, from the number of ring edges that the point has passed
+    # The index of the ring is the number of edges between rings that lie inside of the point.
     edges_between_rings = placement.ring_depths[:, None, 1:-1]  # shape (k, 1, n_ring - 1)
     ring = np.sum(edges_between_rings <= depth[..., None], axis=-1)
     inner_edge = np.take_along_axis(placement.ring_depths, ring, axis=1)
@@ -130,43 +146,45 @@ def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Comp
 
 
 def _locate_in_sectors(placement: Placement, blocks: Blocks, angle: Array, depth: Array) -> tuple[Integers, Array]:
-    """Find the sectors of points between the innermost circle and the rim.
+    """Find the sectors that contain points between the innermost circle and the rim.
 
     Args:
-        placement: One placement for each row of points.
+        placement: k placements, one for each row of points.
         blocks: The elements.
         angle: Angles of the points in the template plane, shape (k, n), rad.
         depth: Depths of the points, from 0 on the innermost circle to 1 on the rim, shape (k, n).
 
     Returns:
-        Index of the sector, and the angular coordinate in the sector from 0 to 1, each of shape (k, n).
+        Index of the sector, and angular coordinate in the sector from 0 to 1, each of shape (k, n).
     """
-    if not blocks.half:  # count the angle from the first side, up to a full turn
+    # If the whole film is meshed, add full turns such that each angle lies within one turn after the first side.
+    if not blocks.half:
         first_side = np.zeros(depth.shape, dtype=np.intp)
         angle_of_first_side = _side_angles(placement, first_side, depth)
         angle = angle_of_first_side + np.mod(angle - angle_of_first_side, 2.0 * np.pi)
 
-    # The index of the sector is the number of sides between sectors that the angle of the point has passed.
+    # The index of the sector is the number of sides between sectors whose angles do not exceed the angle of the point.
     circle_angles = placement.circle_angles[:, None, 1:-1]  # shape (k, 1, n_sector - 1)
     rim_angles = placement.rim_angles[:, None, 1:-1]
     side_angles = circle_angles + depth[..., None] * (rim_angles - circle_angles)
     sector: Integers = np.sum(side_angles <= angle[..., None], axis=-1)
-    side_before = _side_angles(placement, sector, depth)
-    side_after = _side_angles(placement, sector + 1, depth)
-    angular = (angle - side_before) / (side_after - side_before)
+
+    angle_of_side_before = _side_angles(placement, sector, depth)
+    angle_of_side_after = _side_angles(placement, sector + 1, depth)
+    angular = (angle - angle_of_side_before) / (angle_of_side_after - angle_of_side_before)
     return sector, angular
 
 
 def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
-    """Return the angles (rad) of sides of the sectors at given depths between the innermost circle and the rim.
+    """Compute the angles of sides of the sectors at given depths between the innermost circle and the rim.
 
     Args:
-        placement: One placement for each row of points.
+        placement: k placements, one for each row of points.
         side: Index of the side for each point, shape (k, n).
-        depth: Depth of each point, 0 on the innermost circle and 1 on the rim, shape (k, n).
+        depth: Depth of each point, from 0 on the innermost circle to 1 on the rim, shape (k, n).
 
     Returns:
-        Angles, shape (k, n).
+        Angles in the template plane, shape (k, n), rad.
     """
     circle_angle = np.take_along_axis(placement.circle_angles, side, axis=1)
     rim_angle = np.take_along_axis(placement.rim_angles, side, axis=1)
@@ -174,38 +192,39 @@ def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
 
 
 def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
-    """Locate points inside the innermost circle. There is one point for each placement.
+    """Find the elements that contain points inside the innermost circle.
 
-    The signed distance of a point from a side of an element is positive if both the point and the element lie on the
-    same side of the straight line through this side. Each point is assigned to the element for which the smallest of
-    its distances from the four sides is largest. Curved sides have an infinite distance, so that they are ignored.
-    Elements that cannot contain the point get a negative infinite distance.
+    The signed distance of a point from a side of an element is positive if the point and the element lie on the same
+    side of the straight line through this side. Therefore the smallest of the four distances is positive for points
+    inside an element with straight sides. Each point is assigned to the element for which the smallest distance is
+    largest.
 
     Args:
-        placement: One placement for each point.
+        placement: n placements, one for each point.
         blocks: The elements.
-        points: Film points, shape (n,), in film radii.
+        points: Film points x + iy, shape (n,), in film radii.
 
     Returns:
-        Index of the element and its radial and angular coordinate from 0 to 1, each of shape (n,).
+        Index of the element, and radial and angular coordinate in the element from 0 to 1, each of shape (n,).
     """
-    # Distance of each point from the four sides of each element, shape (n, n_inner). The corners a and b are on the
-    # inner side of an element, c and d on its outer side.
+    # Signed distance of each point from the four sides of each element, shape (n, n_inner). The sides are directed such
+    # that the element lies on the left.
     corners = _inner_corners(placement, blocks)
     point_column = points[:, None]
-    distance_from_first_side = _distance_to_left(corners.a, corners.c, point_column)
-    distance_from_last_side = _distance_to_left(corners.d, corners.b, point_column)
-    distance_from_inner_side = _distance_to_left(corners.b, corners.a, point_column)
-    distance_from_outer_side = _distance_to_left(corners.c, corners.d, point_column)
+    distance_from_first_side = _distance_to_left(corners.inner_first, corners.outer_first, point_column)
+    distance_from_last_side = _distance_to_left(corners.outer_last, corners.inner_last, point_column)
+    distance_from_inner_side = _distance_to_left(corners.inner_last, corners.inner_first, point_column)
+    distance_from_outer_side = _distance_to_left(corners.outer_first, corners.outer_last, point_column)
 
-    # Ignore curved sides. With two layers, the boundary of the footprint decides between footprint and last layer.
+    # The distances from curved sides are set to infinity, so that they are never the smallest. If there are two layers,
+    # elements inside the footprint are excluded for points outside, and vice versa, by a distance of minus infinity.
     distance_from_outer_side[:, blocks.n_quad :] = np.inf
     if blocks.n_layer == 2:
         centroid = placement.corners[:, -1]
-        in_footprint = placement.probe.contains((points - centroid) / placement.rotation_and_scale)
+        is_in_footprint = placement.probe.contains((points - centroid) / placement.rotation_and_scale)
         distance_from_inner_side[:, blocks.last_layer] = np.inf
-        distance_from_outer_side[~in_footprint, blocks.footprint] = -np.inf
-        distance_from_outer_side[in_footprint, blocks.last_layer] = -np.inf
+        distance_from_outer_side[~is_in_footprint, blocks.footprint] = -np.inf
+        distance_from_outer_side[is_in_footprint, blocks.last_layer] = -np.inf
 
     distances = [
         distance_from_first_side,
@@ -215,7 +234,7 @@ def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> t
     ]
     smallest_distance = np.min(distances, axis=0)  # shape (n, n_inner)
     element = np.argmax(smallest_distance, axis=1)
-    radial, angular = _invert_blend(placement, blocks, points, element, corners.of_elements(element))
+    radial, angular = _local_coordinates(placement, blocks, points, element, corners.of_elements(element))
     if blocks.n_layer == 2:
         _correct_sectors(placement, blocks, points, corners, element, radial, angular)
     return element, radial, angular
@@ -230,39 +249,42 @@ def _correct_sectors(
     radial: Array,
     angular: Array,
 ) -> None:
-    """Assign points that lie outside of the found element to another sector of the same layer.
+    """Assign points that lie outside their element to another sector of the same layer.
 
-    The straight sides of two sectors may cross outside of the elements. A point may then lie between the extended sides
-    of a sector that does not contain the point. This occurs for elongated probes near the rim. The neighbouring sectors
-    on both sides are tried, then the next neighbours, and so on.
+    The straight lines through the sides of two sectors may cross outside the elements. A point may then lie between the
+    lines of a sector that does not contain the point. For elongated probes near the rim, some points are assigned to a
+    wrong sector for this reason. The function tries the neighbouring sectors on both sides, then the next neighbours,
+    and so on.
 
     Args:
-        placement: One placement for each point.
+        placement: n placements, one for each point.
         blocks: The elements.
-        points: Film points, shape (n,), in film radii.
+        points: Film points x + iy, shape (n,), in film radii.
         corners: Corners of all elements inside the innermost circle, each of shape (n, n_inner).
-        element: Index of the element that was found for each point, shape (n,); changed in place.
-        radial: Coordinates from the inner to the outer side, shape (n,); changed in place.
-        angular: Coordinates along the sector, shape (n,); changed in place.
+        element: Index of the element to which each point is assigned, shape (n,); changed in place.
+        radial: Radial coordinate in the element, shape (n,); changed in place.
+        angular: Angular coordinate in the element, shape (n,); changed in place.
     """
-    first_element = element.copy()  # because `element` changes in the loop
+    first_element = element.copy()  # the first assignment, because `element` changes in the loop
     for shift in range(1, blocks.n_sector // 2 + 1):
+        # Select the points that lie outside their element. Only points in the layers are selected, because the elements
+        # of the core polygon are not sectors.
         is_outside = _overshoot(radial, angular) > SECTOR_TOLERANCE
         rows = np.flatnonzero(is_outside & (first_element >= blocks.n_quad))
         if rows.size == 0:
             return
-
-        # Sector in its layer for each point that is outside of its element. Quadrilaterals have no sectors.
         row_corners = QuadCorners(*(corner[rows] for corner in corners))
         in_last_layer = first_element[rows] >= blocks.last_layer.start
         layer_start = np.where(in_last_layer, blocks.last_layer.start, blocks.n_quad)
-        sector = first_element[rows] - layer_start
+        sector = first_element[rows] - layer_start  # index of the sector within its layer
 
-        # Try the sectors on both sides, and keep a sector in which the local coordinates overshoot less.
+        # Try the sectors on both sides. Assign a point to a sector in which its local coordinates overshoot less.
         for signed_shift in (shift, -shift):
             candidate = layer_start + (sector + signed_shift) % blocks.n_sector
             candidate_corners = row_corners.of_elements(candidate)
-            new_radial, new_angular = _invert_blend(placement[rows], blocks, points[rows], candidate, candidate_corners)
+            new_radial, new_angular = _local_coordinates(
+                placement[rows], blocks, points[rows], candidate, candidate_corners
+            )
             is_better = _overshoot(new_radial, new_angular) < _overshoot(radial[rows], angular[rows])
             better_rows = rows[is_better]
             element[better_rows] = candidate[is_better]
@@ -271,52 +293,55 @@ def _correct_sectors(
 
 
 def _inner_corners(placement: Placement, blocks: Blocks) -> QuadCorners:
-    """Return the corners of all elements inside the innermost circle.
+    """Compute the corners of all elements inside the innermost circle.
 
-    Corners on straight sides are weighted sums of the corners of the core polygon. The other corners lie on the
-    innermost circle or on the boundary of the footprint.
+    Corners on straight sides are weighted sums of the corners and the centroid of the core polygon. The other corners
+    lie on the innermost circle or on the boundary of the footprint.
 
     Args:
         placement: One or several placements.
         blocks: The elements.
 
     Returns:
-        The four corners x + iy of each element, each of shape (n_placement, n_inner), in film radii.
+        The four corners of each element, each of shape (n_placement, n_inner).
     """
     # Sum over the corners n of the core polygon, for each element e, its corner k and each placement p.
-    weighted_sums = np.einsum("ekn,pn->pek", blocks.straight, placement.corners)
-    a, b, c, d = np.moveaxis(weighted_sums, -1, 0)
+    weighted_sums = np.einsum("ekn,pn->pek", blocks.inner_corner_weights, placement.corners)
+    inner_first, inner_last, outer_first, outer_last = np.moveaxis(weighted_sums, -1, 0)
 
-    # Replace the corners on curved lines: c and d are on the outer side of an element, a and b on its inner side.
+    # Replace the corners of the last layer on the innermost circle.
     circle = placement.to_film(placement.rho[:, None] * np.exp(1j * placement.circle_angles))
-    c[:, blocks.last_layer] = circle[:, :-1]
-    d[:, blocks.last_layer] = circle[:, 1:]
+    outer_first[:, blocks.last_layer] = circle[:, :-1]
+    outer_last[:, blocks.last_layer] = circle[:, 1:]
+
+    # Replace the corners on the boundary of the footprint, which separates the layers if there are two.
     if blocks.n_layer == 2:
         boundary = placement.boundary(blocks.boundary_parameter)
-        c[:, blocks.first_layer] = boundary[:, :-1]
-        d[:, blocks.first_layer] = boundary[:, 1:]
-        a[:, blocks.last_layer] = boundary[:, :-1]
-        b[:, blocks.last_layer] = boundary[:, 1:]
-    return QuadCorners(a, b, c, d)
+        outer_first[:, blocks.first_layer] = boundary[:, :-1]
+        outer_last[:, blocks.first_layer] = boundary[:, 1:]
+        inner_first[:, blocks.last_layer] = boundary[:, :-1]
+        inner_last[:, blocks.last_layer] = boundary[:, 1:]
+    return QuadCorners(inner_first, inner_last, outer_first, outer_last)
 
 
-def _invert_blend(
+def _local_coordinates(
     placement: Placement, blocks: Blocks, points: Complexes, element: Integers, corners: QuadCorners
 ) -> tuple[Array, Array]:
-    """Compute the local coordinates of points in given elements inside the innermost circle, by Newton's method.
+    """Compute the local coordinates of points in given elements inside the innermost circle by Newton's method.
 
-    The film point with the coordinates (radial, angular) is (1 - radial) * inner(angular) + radial * outer(angular),
-    where inner and outer are the two sides of the element.
+    The film point with the coordinates (radial, angular) is (1 - radial) * inner(angular) + radial * outer(angular). In
+    this formula, inner and outer are the two sides of the element as functions of the angular coordinate.
 
     Args:
-        placement: One placement for each point.
+        placement: n placements, one for each point.
         blocks: The elements.
-        points: Film points, shape (n,), in film radii.
+        points: Film points x + iy, shape (n,), in film radii.
         element: Index of the element that contains each point, shape (n,).
         corners: Corners of these elements, each of shape (n,).
 
     Returns:
-        Radial and angular coordinate from 0 to 1, each of shape (n,).
+        Radial coordinate and angular coordinate, each of shape (n,). They are between 0 and 1 for points inside the
+        element.
     """
     radial = np.full(points.shape, 0.5)
     angular = np.full(points.shape, 0.5)
@@ -326,7 +351,8 @@ def _invert_blend(
         angular_derivative = (1.0 - radial) * sides.inner_derivative + radial * sides.outer_derivative
         residual = sides.inner + radial * radial_derivative - points
 
-        # Newton step for two unknowns by Cramer's rule, with 2 x 2 determinants as products of complex numbers
+        # Newton step for two unknowns by Cramer's rule. The determinant of two plane vectors is the imaginary part of
+        # the product of the conjugate of the first vector and the second vector.
         determinant = (np.conj(radial_derivative) * angular_derivative).imag
         radial_step = -(np.conj(residual) * angular_derivative).imag / determinant
         angular_step = -(np.conj(radial_derivative) * residual).imag / determinant
@@ -339,36 +365,35 @@ def _sides(placement: Placement, blocks: Blocks, element: Integers, corners: Qua
     """Compute the points of the inner and the outer side of elements at given angular coordinates.
 
     Args:
-        placement: One placement for each point.
+        placement: n placements, one for each point.
         blocks: The elements.
         element: Index of the element of each point, shape (n,).
         corners: Corners of these elements, each of shape (n,).
         angular: Angular coordinate of each point from 0 to 1, shape (n,).
-
-    Returns:
-        Points of both sides and their derivatives with respect to the angular coordinate, each of shape (n,).
     """
-    # The elements are ordered from the inside out: quadrilaterals of the core polygon, then the layers of sectors.
+    # The elements of the core polygon have the lowest indices, followed by the sectors of each layer. The sector of an
+    # element of the core polygon is not used, and is set to 0.
     in_sector = element >= blocks.n_quad
     in_last_layer = element >= blocks.last_layer.start
     sector = np.where(in_sector, (element - blocks.n_quad) % blocks.n_sector, 0)
 
-    # Begin with straight sides, and replace those on the innermost circle.
-    straight_inner_derivative = corners.b - corners.a
-    straight_outer_derivative = corners.d - corners.c
-    inner = corners.a + angular * straight_inner_derivative
-    outer = corners.c + angular * straight_outer_derivative
+    # Compute straight sides for all elements, and replace the outer sides that lie on the innermost circle.
+    straight_inner_derivative = corners.inner_last - corners.inner_first
+    straight_outer_derivative = corners.outer_last - corners.outer_first
+    straight_inner = corners.inner_first + angular * straight_inner_derivative
+    straight_outer = corners.outer_first + angular * straight_outer_derivative
     circle, circle_derivative = _circle_in_sector(placement, sector, angular)
-    outer = np.where(in_last_layer, circle, outer)
+    outer = np.where(in_last_layer, circle, straight_outer)
     outer_derivative = np.where(in_last_layer, circle_derivative, straight_outer_derivative)
     if blocks.n_layer == 1:
-        return _Sides(inner, straight_inner_derivative, outer, outer_derivative)
+        return _Sides(straight_inner, straight_inner_derivative, outer, outer_derivative)
 
-    # With two layers, the boundary of the footprint is the outer side of the first and the inner side of the last.
+    # If there are two layers, the boundary of the footprint is the outer side of the first layer and the inner side of
+    # the last layer.
     boundary, boundary_derivative = _boundary_in_sector(placement, blocks, sector, angular)
     in_first_layer = in_sector & ~in_last_layer
     return _Sides(
-        inner=np.where(in_last_layer, boundary, inner),
+        inner=np.where(in_last_layer, boundary, straight_inner),
         inner_derivative=np.where(in_last_layer, boundary_derivative, straight_inner_derivative),
         outer=np.where(in_first_layer, boundary, outer),
         outer_derivative=np.where(in_first_layer, boundary_derivative, outer_derivative),
@@ -376,69 +401,80 @@ def _sides(placement: Placement, blocks: Blocks, element: Integers, corners: Qua
 
 
 def _circle_in_sector(placement: Placement, sector: Integers, angular: Array) -> tuple[Complexes, Complexes]:
-    """Return points of the innermost circle and their derivatives with respect to the angular coordinate.
+    """Compute points of the innermost circle and their derivatives with respect to the angular coordinate.
 
     Args:
-        placement: One placement for each point.
+        placement: n placements, one for each point.
         sector: Index of the sector of each point, shape (n,).
-        angular: Position in the sector, from 0 to 1, shape (n,).
+        angular: Angular coordinate of each point in its sector, from 0 to 1, shape (n,).
 
     Returns:
-        Points and derivatives, each of shape (n,), in film radii.
+        Points x + iy and derivatives, each of shape (n,), in film radii.
     """
     # Angles of the first and the last side of the sector of each point
     first_angle = np.take_along_axis(placement.circle_angles, sector[:, None], axis=1)[:, 0]
     last_angle = np.take_along_axis(placement.circle_angles, (sector + 1)[:, None], axis=1)[:, 0]
     angle_range = last_angle - first_angle
-    # z is a point of the template plane. The conformal map (z + c) / (1 + c z) converts it into a film point.
-    z = placement.rho * np.exp(1j * (first_angle + angular * angle_range))
-    points = (z + placement.c) / (1.0 + placement.c * z)
-    derivative = 1j * angle_range * z * (1.0 - placement.c**2) / (1.0 + placement.c * z) ** 2
+
+    # The conformal map converts a point z of the template plane into the film point (z + c) / (1 + c z).
+    template_points = placement.rho * np.exp(1j * (first_angle + angular * angle_range))
+    denominator = 1.0 + placement.c * template_points
+    points = (template_points + placement.c) / denominator
+    derivative = 1j * angle_range * template_points * (1.0 - placement.c**2) / denominator**2
     return np.asarray(points), np.asarray(derivative)
 
 
 def _boundary_in_sector(
     placement: Placement, blocks: Blocks, sector: Integers, angular: Array
 ) -> tuple[Complexes, Complexes]:
-    """Return boundary points of a curved footprint and their derivatives with respect to the angular coordinate.
+    """Compute boundary points of a curved footprint and their derivatives with respect to the angular coordinate.
 
     Args:
-        placement: One placement for each point.
+        placement: n placements, one for each point.
         blocks: The elements.
         sector: Index of the sector of each point, shape (n,).
-        angular: Position in the sector, from 0 to 1, shape (n,).
+        angular: Angular coordinate of each point in its sector, from 0 to 1, shape (n,).
 
     Returns:
-        Points and derivatives, each of shape (n,), in film radii.
+        Points x + iy and derivatives, each of shape (n,), in film radii.
     """
+    # The boundary parameter is a linear function of the angular coordinate.
     first_parameter = blocks.boundary_parameter[sector]
     parameter_range = blocks.boundary_parameter[sector + 1] - first_parameter
-    parameter = (first_parameter + angular * parameter_range)[:, None]
-    point = placement.boundary(parameter)[:, 0]
-    next_point = placement.boundary(parameter + PARAMETER_STEP)[:, 0]
-    previous_point = placement.boundary(parameter - PARAMETER_STEP)[:, 0]
-    parameter_derivative = (next_point - previous_point) / (2.0 * PARAMETER_STEP)
+    parameter = (first_parameter + angular * parameter_range)[:, None]  # shape (n, 1), one point for each placement
+    points = placement.boundary(parameter)[:, 0]
+
+    # The derivative with respect to the boundary parameter is a central difference.
+    next_points = placement.boundary(parameter + PARAMETER_STEP)[:, 0]
+    previous_points = placement.boundary(parameter - PARAMETER_STEP)[:, 0]
+    parameter_derivative = (next_points - previous_points) / (2.0 * PARAMETER_STEP)
     angular_derivative = parameter_derivative * parameter_range
-    return point, angular_derivative
+    return points, angular_derivative
 
 
 def _overshoot(radial: Array, angular: Array) -> Array:
-    """Return the signed distance of local coordinates from the range from 0 to 1, shape (n,).
+    """Compute by how much local coordinates exceed the range from 0 to 1.
 
-    The distance is negative within the range.
+    Args:
+        radial: Radial coordinates, shape (n,).
+        angular: Angular coordinates, shape (n,).
+
+    Returns:
+        Larger excess of the two coordinates, shape (n,). It is negative if both coordinates lie within the range.
     """
     distance_from_middle = np.maximum(np.abs(radial - 0.5), np.abs(angular - 0.5))
     return np.asarray(distance_from_middle - 0.5)
 
 
 def _distance_to_left(start: Complexes, end: Complexes, points: Complexes) -> Array:
-    """Return the signed distances of points from directed lines, positive to the left of a line.
+    """Compute the signed distances of points from directed lines. The distance is positive to the left of a line.
 
     Args:
         start: Points x + iy at which the lines start, any shape.
         end: Points x + iy at which the lines end, same shape.
-        points: Points x + iy, of a shape that broadcasts with that of the lines.
+        points: Points x + iy, of a shape that can be broadcast with the shape of the lines.
     """
     direction = end - start
-    length = np.maximum(np.abs(direction), 1e-300)
-    return np.asarray(((points - start) * np.conj(direction)).imag / length)
+    length = np.maximum(np.abs(direction), 1e-300)  # the limit avoids a division by zero
+    cross_product = ((points - start) * np.conj(direction)).imag
+    return np.asarray(cross_product / length)

@@ -1,4 +1,4 @@
-"""Mesh templates: elements with numbered nodes, which are the same for all positions of a probe."""
+"""Mesh templates, which contain the elements and the numbers of their nodes for all positions of a probe."""
 
 from functools import lru_cache
 from typing import Self
@@ -13,7 +13,10 @@ from isocharge.simulate.sensor.probe import Circle, Polygon, Probe
 from isocharge.simulate.sensor.probe_shapes.base import CurvedProbe, FootprintTopology
 
 SAMPLE_REACH = 0.1
-"""Reach of the footprint of the sample press, from which coinciding nodes are found, in film radii."""
+"""Reach of the footprint of the sample press, in film radii.
+
+Nodes of different elements that coincide under the sample press are the same node.
+"""
 
 SAMPLE_DISTANCE = 0.1
 """Distance of the sample press from the centre of the film, in film radii."""
@@ -26,13 +29,13 @@ class Template(Blocks):
     """Elements with numbered nodes. Adjacent elements share the nodes on their common side.
 
     Attributes:
-        nodes: Node number of each node of each element, shape (n_element, (order + 1)^2).
+        nodes: Number of each node of each element, shape (n_element, (order + 1)^2).
         n_node: Number of nodes.
-        first_seen: Index of the first occurrence of each node among the nodes of all elements, shape (n_node,).
-        on_rim: Whether a node lies on the rim, shape (n_node,).
-        on_axis: Whether a node lies on the line of symmetry of a half template, shape (n_node,).
-        splits: Index of the original element and position in this element, with one row for each element. Empty if no
-            element is split.
+        first_occurrence: Index of the first occurrence of each node among the nodes of all elements, shape (n_node,).
+        on_rim: Whether each node lies on the rim, shape (n_node,).
+        on_axis: Whether each node lies on the line of symmetry of a half mesh, shape (n_node,).
+        splits: Index of the original element of each element and position in the original element, with one row for
+            each element. Empty if no element is split.
         constraint: Matrix that computes the values at all nodes from the values at the nodes that are not hanging
             nodes, shape (n_node, n_node). None if there are no hanging nodes.
     """
@@ -43,7 +46,7 @@ class Template(Blocks):
     def __init__(self, resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> None:
         """Count the elements and number their nodes.
 
-        If nodes of different elements have the same position under a sample press, they are the same node.
+        Nodes of different elements that have the same position under a sample press are the same node.
 
         Args:
             resolution: Fineness of the mesh.
@@ -53,47 +56,47 @@ class Template(Blocks):
         super().__init__(resolution, topology, whole)
         element_points = sample_points(self)  # x + iy in film radii, shape (n_element, n_local)
         all_points = element_points.ravel()
-        rounded_points = np.round(all_points, 9)  # equal points may differ by rounding errors
-        _, self.first_seen, node_number = np.unique(rounded_points, return_index=True, return_inverse=True)
+        rounded_points = np.round(all_points, 9)  # positions of the same node may differ by rounding errors
+        _, self.first_occurrence, node_number = np.unique(rounded_points, return_index=True, return_inverse=True)
         self.nodes: Integers = node_number.reshape(element_points.shape)
-        self.n_node = self.first_seen.size
+        self.n_node = self.first_occurrence.size
 
-        # Nodes on the rim, and on the line of symmetry of a half mesh
-        node_points = all_points[self.first_seen]
+        # Find the nodes on the rim, and the nodes on the line of symmetry of a half mesh.
+        node_points = all_points[self.first_occurrence]
         self.on_rim = np.abs(node_points) > 1.0 - 1e-9
         self.on_axis = (np.abs(node_points.imag) < 1e-9) & self.half
 
     def from_base(self, values: np.ndarray) -> np.ndarray:
-        """Convert values at the nodes of the original (unsplit) elements into values at the nodes of the elements.
+        """Return the given values, because no element of this class is split.
 
-        In this class no element is split, so the values do not change. `RefinedTemplate` interpolates.
+        The subclass `RefinedTemplate` interpolates the values from the original elements to the split elements.
 
         Args:
-            values: Shape (n_original_element, n_local, ...).
+            values: Values at the nodes of the original elements, shape (n_original_element, n_local, ...).
 
         Returns:
-            Values, shape (n_element, n_local, ...).
+            Values at the nodes of the elements, shape (n_element, n_local, ...).
         """
         return values
 
-    def within(self, element: Integers, xi: Array, eta: Array) -> tuple[Integers, Array, Array]:
-        """Convert positions in the original (unsplit) elements into positions in the elements.
+    def to_split_elements(self, element: Integers, xi: Array, eta: Array) -> tuple[Integers, Array, Array]:
+        """Return the given positions, because no element of this class is split.
 
-        In this class no element is split, so the positions do not change. `RefinedTemplate` finds the split elements.
+        The subclass `RefinedTemplate` converts positions in the original elements into positions in the split elements.
 
         Args:
-            element: Index of the original element, shape (n,).
-            xi: First local coordinate, shape (n,).
-            eta: Second local coordinate, shape (n,).
+            element: Index of the original element of each point, shape (n,).
+            xi: First local coordinate of each point, shape (n,).
+            eta: Second local coordinate of each point, shape (n,).
 
         Returns:
-            Index of the element, xi and eta, each of shape (n,).
+            Index of the element, xi and eta of each point, each of shape (n,).
         """
         return element, xi, eta
 
 
 class SampleCurve(CurvedProbe):
-    """Circular footprint with the topology of another curved footprint. It is used to number the nodes."""
+    """Circular footprint that represents another curved footprint in the sample press, and has the same topology."""
 
     angle = 0.0
     notation = "sample"
@@ -106,27 +109,39 @@ class SampleCurve(CurvedProbe):
 
     @property
     def topology(self) -> FootprintTopology:
-        """The topology of the other footprint."""
+        """Topology of the other footprint."""
         return self._topology
 
     def boundary(self, parameter: Array) -> Complexes:
-        """Return points of the circle."""
+        """Return the points of the circle at given angles.
+
+        Args:
+            parameter: Angles, any shape, rad.
+
+        Returns:
+            Points x + iy, same shape, mm.
+        """
         return np.asarray(SAMPLE_REACH * np.exp(1j * parameter))
 
     def contains(self, points: Complexes) -> Booleans:
-        """Return whether points lie in the circle."""
+        """Return whether points lie in the circle.
+
+        Args:
+            points: Points x + iy, any shape, mm.
+        """
         return np.asarray(np.abs(points) <= SAMPLE_REACH)
 
     def rotated(self, angle: float) -> Self:
-        """Return the same footprint."""
+        """Return the footprint itself, because a rotation does not change a circle."""
         del angle
         return self
 
 
 def sample_points(blocks: Blocks) -> Complexes:
-    """Return the film points of the nodes of every element under a sample press.
+    """Return the film points of the nodes of all elements under a sample press.
 
-    No element is folded under the sample press, so nodes have the same position only if they are the same node.
+    No element is folded under the sample press. Therefore two nodes have the same position only if they are the same
+    node.
 
     Args:
         blocks: The elements.
@@ -140,7 +155,11 @@ def sample_points(blocks: Blocks) -> Complexes:
 
 
 def _sample_probe(topology: FootprintTopology) -> Probe:
-    """Return the probe of the sample press, which has the given topology, on a film with a radius of 1 mm."""
+    """Create a probe whose footprint has a given topology. The sample press uses this probe on a film of radius 1 mm.
+
+    Args:
+        topology: Number and kind of the blocks in and around the footprint.
+    """
     if topology.fills_circle:
         return Circle(SAMPLE_REACH)
     if topology.is_curved:
@@ -151,7 +170,7 @@ def _sample_probe(topology: FootprintTopology) -> Probe:
 
 @lru_cache(maxsize=16)
 def template(resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> Template:
-    """Return the template for a resolution and a topology. Templates are cached.
+    """Return the template for a given resolution and topology. Templates are cached.
 
     Args:
         resolution: Fineness of the mesh.
@@ -162,6 +181,15 @@ def template(resolution: Resolution, topology: FootprintTopology, whole: bool = 
 
 
 def template_for(probe: Probe, resolution: Resolution, whole: bool = False) -> Template:
-    """Return the template for the footprint of a probe; the arguments are those of `template`."""
+    """Return the template for the footprint of a probe.
+
+    Args:
+        probe: The probe.
+        resolution: Fineness of the mesh.
+        whole: Whether to mesh the whole film although the footprint is symmetric.
+    """
     topology = probe.topology
-    return template(resolution, topology, whole and topology.fills_circle)
+    # Only the mesh of a circular footprint may be a half mesh. All other meshes are whole in any case. The arguments
+    # are the same for all of them, so that the cache contains their template only once.
+    is_whole_circular_mesh = whole and topology.fills_circle
+    return template(resolution, topology, is_whole_circular_mesh)

@@ -1,1 +1,1 @@
-"""Numerical methods without physics: interpolation, points on a disk, polygons, least squares, Gauss rules."""
+"""Numerical methods that do not depend on the physics of the film, such as interpolation and least squares."""

@@ -1,6 +1,7 @@
-"""Lagrange interpolation on Gauss-Lobatto and Chebyshev nodes, cubic interpolation on uniform grids, and Gauss rules.
+"""Polynomial interpolation on Gauss-Lobatto nodes, Chebyshev nodes and uniform grids, and Gauss quadrature rules.
 
-The Lagrange polynomials are evaluated in barycentric form, which is stable at any order (Berrut and Trefethen 2004).
+The Lagrange polynomials are evaluated in the barycentric form, which is numerically stable at every order (Berrut and
+Trefethen 2004).
 """
 
 from functools import lru_cache
@@ -16,10 +17,13 @@ MIN_DIFFERENCE = 1e-200
 
 @lru_cache(maxsize=32)
 def lobatto_nodes(order: int) -> Array:
-    """Return the Gauss-Lobatto-Legendre nodes: the extrema of the Legendre polynomial P_order, and -1 and 1.
+    """Return the Gauss-Lobatto-Legendre nodes on the interval [-1, 1].
+
+    The nodes are the two ends of the interval, and the points between the ends at which the Legendre polynomial of the
+    given order has an extremum.
 
     Args:
-        order: Order of the polynomials that the nodes determine.
+        order: Order of the Legendre polynomial. Polynomials of this order are determined by their values at the nodes.
 
     Returns:
         Nodes in ascending order, shape (order + 1,).
@@ -30,11 +34,11 @@ def lobatto_nodes(order: int) -> Array:
 
 @lru_cache(maxsize=32)
 def lobatto_weights(order: int) -> Array:
-    """Return the barycentric weights of `lobatto_nodes`, shape (order + 1,).
+    """Return the barycentric weights of the nodes that `lobatto_nodes` returns, shape (order + 1,).
 
-    The weight of the node x_j is proportional to 1 / P_order(x_j) with the Legendre polynomial P_order. The magnitudes
-    of the weights are proportional to the square roots of the quadrature weights, and their signs alternate (Wang,
-    Huybrechs and Vandewalle 2014).
+    The weight of the node x_j is proportional to 1 / P(x_j), where P is the Legendre polynomial of the given order.
+    According to Wang, Huybrechs and Vandewalle (2014), the magnitudes of the barycentric weights are proportional to
+    the square roots of the quadrature weights. The signs of neighbouring weights are opposite.
     """
     weights: Array = 1.0 / eval_legendre(order, lobatto_nodes(order))
     return _read_only(weights / np.abs(weights).max())
@@ -42,21 +46,24 @@ def lobatto_weights(order: int) -> Array:
 
 @lru_cache(maxsize=32)
 def lobatto_quadrature(order: int) -> Array:
-    """Return the weights of the Gauss-Lobatto rule on `lobatto_nodes`, shape (order + 1,).
+    """Return the quadrature weights of the nodes that `lobatto_nodes` returns, shape (order + 1,).
 
-    The rule integrates polynomials up to the degree 2 order - 1 exactly.
+    The Gauss-Lobatto rule with n + 1 nodes integrates every polynomial of degree 2 n - 1 or less exactly.
     """
     return _read_only(np.asarray(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2)))
 
 
 @lru_cache(maxsize=32)
 def modal_matrix(order: int) -> Array:
-    """Return the matrix that maps values on `lobatto_nodes` to Legendre coefficients, shape (order + 1, order + 1)."""
+    """Return the matrix that converts the values of a polynomial at the Gauss-Lobatto nodes into Legendre coefficients.
+
+    The function `lobatto_nodes` returns the nodes. The matrix has the shape (order + 1, order + 1).
+    """
     return _read_only(np.linalg.inv(np.polynomial.legendre.legvander(lobatto_nodes(order), order)).astype(np.float64))
 
 
 def _read_only(values: Array) -> Array:
-    """Mark an array as read-only, because it is cached and returned to several callers."""
+    """Mark an array as read-only and return it, because several callers share the cached array."""
     values.flags.writeable = False
     return values
 
@@ -64,41 +71,49 @@ def _read_only(values: Array) -> Array:
 def chebyshev_nodes(count: int, low: float, high: float) -> Array:
     """Return the Chebyshev nodes of the first kind on the interval [low, high].
 
+    The nodes are the cosines of the angles (2 k - 1) pi / (2 count) for k = 1, ..., count, scaled from the interval
+    [-1, 1] to the interval [low, high].
+
     Args:
         count: Number of nodes.
         low: Lower end of the interval.
         high: Upper end of the interval.
 
     Returns:
-        Nodes, ascending, shape (count,). The ends of the interval are not among the nodes.
+        Nodes in ascending order, shape (count,). The nodes do not include the ends of the interval.
     """
-    descending = np.arange(count, 0, -1)  # the cosine decreases with the angle, so the nodes are ascending
-    angle = (2.0 * descending - 1.0) * np.pi / (2.0 * count)
+    descending_numbers = np.arange(count, 0, -1)  # the cosine decreases with the angle, so the nodes are ascending
+    angles = (2.0 * descending_numbers - 1.0) * np.pi / (2.0 * count)
     middle = 0.5 * (low + high)
     half_width = 0.5 * (high - low)
-    return np.asarray(middle + half_width * np.cos(angle))
+    return np.asarray(middle + half_width * np.cos(angles))
 
 
 def barycentric_weights(nodes: Array) -> Array:
-    """Compute the barycentric weights of distinct nodes.
+    """Compute the barycentric weights of distinct interpolation nodes.
 
-    The weight of a node is the reciprocal of the product of its differences from all other nodes. The differences are
-    scaled to an interval of the length 4, on which the products neither overflow nor underflow for many nodes.
+    The weight of a node is the reciprocal of the product of its differences from all other nodes. The nodes are first
+    scaled to an interval of length 4. Because of this scaling, the products neither overflow nor underflow, even for
+    many nodes.
 
     Args:
         nodes: Interpolation nodes, shape (n,).
 
     Returns:
-        Weights, shape (n,). A common factor of all weights has no effect on the interpolation.
+        Weights, shape (n,). The scaling multiplies all weights by a common factor, which does not affect the
+        interpolation.
     """
     scale = 4.0 / np.ptp(nodes) if nodes.size > 1 else 1.0
     difference = (nodes[:, None] - nodes[None, :]) * scale
-    np.fill_diagonal(difference, 1.0)  # the difference of a node from itself does not count
+    np.fill_diagonal(difference, 1.0)  # excludes the difference of a node from itself from the product
     return np.asarray(1.0 / difference.prod(axis=1))
 
 
 def lagrange_values(nodes: Array, weights: Array, points: Array) -> Array:
     """Evaluate the Lagrange polynomials of given nodes by the barycentric formula (Berrut and Trefethen 2004).
+
+    At the point x, the polynomial of node j has the value w_j / (x - x_j), divided by the sum of w_k / (x - x_k) over
+    all nodes k. The numbers w_j are the barycentric weights.
 
     Args:
         nodes: Interpolation nodes, shape (n,).
@@ -109,40 +124,46 @@ def lagrange_values(nodes: Array, weights: Array, points: Array) -> Array:
         Value of each polynomial at each point, shape (m, n). Each row adds up to one.
     """
     difference = points[:, None] - nodes[None, :]  # shape (m, n)
-    point_on_node, node_index = np.nonzero(np.abs(difference) < MIN_DIFFERENCE)
-    difference[point_on_node, node_index] = 1.0  # avoids a division by zero; these rows are replaced below
+    # Points that coincide with a node would cause a division by zero. Their rows are replaced at the end.
+    coinciding_point, coinciding_node = np.nonzero(np.abs(difference) < MIN_DIFFERENCE)
+    difference[coinciding_point, coinciding_node] = 1.0
 
-    weighted_inverse = weights / difference
-    row_sum = weighted_inverse @ np.ones(nodes.size)
-    values: Array = weighted_inverse / row_sum[:, None]
-    values[point_on_node] = nodes == nodes[node_index, None]  # 1 for the node itself, 0 for all others
+    numerator = weights / difference
+    denominator = numerator @ np.ones(nodes.size)  # sum over the nodes
+    values: Array = numerator / denominator[:, None]
+
+    # At a node, the polynomial of this node is 1 and all other polynomials are 0.
+    values[coinciding_point] = nodes == nodes[coinciding_node, None]
     return values
 
 
 @lru_cache(maxsize=32)
 def derivative_matrix(order: int) -> Array:
-    """Return the matrix that converts the values of a polynomial at the nodes into its derivatives at the nodes.
+    """Return the matrix that converts the values of a polynomial at the nodes into the derivatives at the same nodes.
+
+    The symbols x_i and w_i denote the nodes that `lobatto_nodes` returns, and their barycentric weights. The matrix
+    element in row i and column j is (w_j / w_i) / (x_i - x_j) if i and j are different (Berrut and Trefethen 2004).
 
     Args:
         order: Order of the polynomials.
 
     Returns:
-        Matrix for `lobatto_nodes`, shape (order + 1, order + 1).
+        Matrix, shape (order + 1, order + 1).
     """
     nodes = lobatto_nodes(order)
     weights = lobatto_weights(order)
     difference = nodes[:, None] - nodes[None, :]
-    np.fill_diagonal(difference, 1.0)  # avoids a division by zero; the diagonal is replaced below
-
-    # The derivative of a constant is zero, so each row adds up to zero (Berrut and Trefethen 2004).
+    np.fill_diagonal(difference, 1.0)  # avoids a division by zero on the diagonal, which is replaced below
     matrix = weights[None, :] / weights[:, None] / difference
+
+    # The derivative of a constant is zero. Therefore each row adds up to zero, which determines the diagonal.
     np.fill_diagonal(matrix, 0.0)
     np.fill_diagonal(matrix, -matrix.sum(axis=1))
     return _read_only(matrix)
 
 
 def basis(order: int, points: Array) -> tuple[Array, Array]:
-    """Evaluate the Lagrange basis on `lobatto_nodes`, and its derivatives.
+    """Evaluate the Lagrange polynomials of the Gauss-Lobatto nodes and the derivatives of these polynomials.
 
     Args:
         order: Order of the polynomials.
@@ -156,7 +177,7 @@ def basis(order: int, points: Array) -> tuple[Array, Array]:
 
 
 def tensor_values(order: int, xi: Array, eta: Array) -> Array:
-    """Evaluate the tensor-product basis on the square [-1, 1]^2.
+    """Evaluate the tensor products of Lagrange polynomials at points of the square [-1, 1]^2.
 
     Args:
         order: Order of the polynomials in each direction.
@@ -164,7 +185,7 @@ def tensor_values(order: int, xi: Array, eta: Array) -> Array:
         eta: Second coordinate of the points, shape (n,).
 
     Returns:
-        Values, shape (n, (order + 1)^2). The nodes are numbered in tensor order, in which xi varies fastest.
+        Values of the products, shape (n, (order + 1)^2). The polynomial in xi changes fastest from column to column.
     """
     nodes = lobatto_nodes(order)
     weights = lobatto_weights(order)
@@ -172,15 +193,16 @@ def tensor_values(order: int, xi: Array, eta: Array) -> Array:
 
 
 def tensor_basis(order: int, xi: Array, eta: Array) -> tuple[Array, Array]:
-    """Evaluate the tensor-product basis and its derivatives at points of the reference element.
+    """Evaluate the tensor products of Lagrange polynomials and their derivatives at points of the square [-1, 1]^2.
 
     Args:
-        order: Order of the elements.
-        xi: First local coordinate of the points, shape (n,).
-        eta: Second local coordinate of the points, shape (n,).
+        order: Order of the polynomials in each direction.
+        xi: First coordinate of the points, shape (n,).
+        eta: Second coordinate of the points, shape (n,).
 
     Returns:
-        Values, shape (n, (order + 1)^2). Derivatives with respect to xi and eta, shape (2, n, (order + 1)^2).
+        Values of the products, shape (n, (order + 1)^2). The polynomial in xi changes fastest from column to column.
+        Derivatives of the products with respect to xi and eta, shape (2, n, (order + 1)^2).
     """
     xi_values, xi_slopes = basis(order, xi)
     eta_values, eta_slopes = basis(order, eta)
@@ -191,48 +213,50 @@ def tensor_basis(order: int, xi: Array, eta: Array) -> tuple[Array, Array]:
 
 
 def _tensor_product(xi_values: Array, eta_values: Array) -> Array:
-    """Multiply every basis value in xi by every basis value in eta.
+    """Multiply the value of each basis function in xi by the value of each basis function in eta.
 
     Args:
         xi_values: Values of the basis functions in xi at n points, shape (n, p).
         eta_values: Values of the basis functions in eta at the same points, shape (n, q).
 
     Returns:
-        Products, shape (n, q * p). The function in xi changes fastest.
+        Products, shape (n, q * p). The function in xi changes fastest from column to column.
     """
-    products = eta_values[:, :, None] * xi_values[:, None, :]
+    products = eta_values[:, :, None] * xi_values[:, None, :]  # shape (n, q, p)
     return products.reshape(len(xi_values), eta_values.shape[1] * xi_values.shape[1])
 
 
 def cubic_weights(points: Array, count: int, periodic: bool = False) -> tuple[Integers, Array]:
-    """Compute the weights of cubic interpolation between the four nearest nodes of a uniform grid.
+    """Compute the weights of cubic interpolation between four neighbouring nodes of a uniform grid.
 
-    The weights are the Lagrange polynomials of four neighbouring nodes.
+    The weight of a node is the value of its cubic Lagrange polynomial, which is 1 at this node and 0 at the other three
+    nodes.
 
     Args:
-        points: Points of evaluation in units of the spacing, any shape. The nodes are 0, 1, ..., count - 1, and points
-            beyond the last node are extrapolated.
+        points: Points of evaluation in units of the grid spacing, any shape. The nodes have the coordinates 0, 1, ...,
+            count - 1. If the grid is not periodic, values at points beyond its ends are extrapolated.
         count: Number of nodes, at least four.
-        periodic: Whether the grid is periodic, so that node `count` is the same as node 0.
+        periodic: Whether the grid is periodic. In a periodic grid, node `count` is the same as node 0.
 
     Returns:
-        Indices of the four nodes, and their weights, each of shape (..., 4).
+        Indices of the four nodes of each point, and the weights of these nodes, each of shape (..., 4).
     """
-    # The point lies between the second and the third of the four nodes, except near the ends of the grid.
+    # A point lies between the second and the third of its four nodes, except near the ends of a grid that is not
+    # periodic.
     first_node = np.floor(points).astype(np.intp) - 1
     if not periodic:
         first_node = np.clip(first_node, 0, count - 4)
 
-    # Signed distances of the point from the four nodes. The weight of a node is the product of the distances from the
-    # other three nodes, divided by its value at the node itself.
-    from_0 = (points - first_node)[..., None]
-    from_1 = from_0 - 1.0
-    from_2 = from_0 - 2.0
-    from_3 = from_0 - 3.0
-    weight_0 = -from_1 * from_2 * from_3 / 6.0
-    weight_1 = from_0 * from_2 * from_3 / 2.0
-    weight_2 = -from_0 * from_1 * from_3 / 2.0
-    weight_3 = from_0 * from_1 * from_2 / 6.0
+    # The weight of a node is the product of the signed distances of the point from the other three nodes, divided by
+    # the value of this product at the node itself.
+    distance_0 = (points - first_node)[..., None]  # from the first of the four nodes, shape (..., 1)
+    distance_1 = distance_0 - 1.0
+    distance_2 = distance_0 - 2.0
+    distance_3 = distance_0 - 3.0
+    weight_0 = -distance_1 * distance_2 * distance_3 / 6.0
+    weight_1 = distance_0 * distance_2 * distance_3 / 2.0
+    weight_2 = -distance_0 * distance_1 * distance_3 / 2.0
+    weight_3 = distance_0 * distance_1 * distance_2 / 6.0
     weights = np.concatenate([weight_0, weight_1, weight_2, weight_3], axis=-1)
 
     nodes = first_node[..., None] + np.arange(4)
@@ -242,21 +266,21 @@ def cubic_weights(points: Array, count: int, periodic: bool = False) -> tuple[In
 
 
 def gauss_line(count: int) -> tuple[Array, Array]:
-    """Return the Gauss rule on [0, 1].
+    """Return the points and weights of the Gauss-Legendre rule on the interval [0, 1].
 
     Args:
         count: Number of points.
 
     Returns:
-        Points, and weights, which add up to one, each of shape (count,).
+        Points and weights, each of shape (count,). The weights add up to one.
     """
-    points, weights = np.polynomial.legendre.leggauss(count)
+    points, weights = np.polynomial.legendre.leggauss(count)  # on the interval [-1, 1]
     return 0.5 * (points + 1.0), 0.5 * weights
 
 
 @lru_cache(maxsize=32)
 def gauss_reference_square(count: int) -> tuple[Array, Array, Array]:
-    """Return the Gauss rule on the square [-1, 1]^2.
+    """Return the points and weights of the Gauss-Legendre rule on the square [-1, 1]^2.
 
     Args:
         count: Number of points in each direction.
@@ -265,20 +289,21 @@ def gauss_reference_square(count: int) -> tuple[Array, Array, Array]:
         Coordinates xi and eta of the points, and the weights of the points, each of shape (count^2,). The coordinate xi
         varies fastest. The weights add up to 4.
     """
-    line, weight = np.polynomial.legendre.leggauss(count)
-    xi, eta = np.meshgrid(line, line)
-    return _read_only(xi.ravel()), _read_only(eta.ravel()), _read_only(np.outer(weight, weight).ravel())
+    line_points, line_weights = np.polynomial.legendre.leggauss(count)
+    xi, eta = np.meshgrid(line_points, line_points)
+    weights = np.outer(line_weights, line_weights)
+    return _read_only(xi.ravel()), _read_only(eta.ravel()), _read_only(weights.ravel())
 
 
 @lru_cache(maxsize=32)
 def gauss_square(count: int) -> tuple[Array, Array]:
-    """Return the Gauss rule on the square [0, 1]^2.
+    """Return the points and weights of the Gauss-Legendre rule on the square [0, 1]^2.
 
     Args:
         count: Number of points in each direction.
 
     Returns:
-        Points, shape (count^2, 2), and weights, shape (count^2,), which add up to one.
+        Points, shape (count^2, 2), and weights, shape (count^2,). The weights add up to one.
     """
     xi, eta, weights = gauss_reference_square(count)
     points = 0.5 * (np.stack([xi, eta], axis=1) + 1.0)

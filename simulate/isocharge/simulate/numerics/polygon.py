@@ -1,7 +1,7 @@
-"""Polygons and disks in the plane: areas, centroid, convexity, overlap, and Gauss rules.
+"""Areas, centroids and overlaps of polygons in the plane, and Gauss quadrature rules for polygons.
 
-The library shapely (GEOS) computes centroids, overlaps and intersections of polygons. The area of a polygon within a
-disk is computed here, because shapely would replace the disk by a polygon.
+The library shapely (GEOS) computes centroids, overlaps and intersections of polygons. The function `area_in_disk` does
+not use shapely, because shapely would replace the disk by a polygon.
 """
 
 from itertools import pairwise
@@ -33,33 +33,34 @@ def centroid_of(corners: Array) -> Array:
 
 
 def is_convex(corners: Array) -> bool:
-    """Return whether a polygon is convex and anticlockwise, with a left turn at every corner.
+    """Return whether a polygon is strictly convex and has its corners in anticlockwise order.
 
-    A star polygon, which turns left at every corner but crosses itself, is not convex.
+    A star polygon turns left at every corner, but it crosses itself and is therefore not convex.
 
     Args:
         corners: Corners (x, y), shape (n, 2).
     """
-    edge = np.roll(corners, -1, axis=0) - corners
-    next_edge = np.roll(edge, -1, axis=0)
-    turns_left = np.all(_cross(edge, next_edge) > 0.0)
+    edges = np.roll(corners, -1, axis=0) - corners
+    next_edges = np.roll(edges, -1, axis=0)
+    turns_left = np.all(_cross(edges, next_edges) > 0.0)
 
-    # All corners of a convex polygon lie on the left of each edge or on the edge.
-    offset = corners[None, :] - corners[:, None]  # from the start of each edge to each corner
-    side = _cross(edge[:, None], offset)  # positive for corners on the left of the edge
-    is_on_left = side.min() >= -1e-9 * side.max()  # the tolerance is for rounding errors
-    return bool(turns_left and is_on_left)
+    # All corners of a convex polygon lie on each edge or on the left of the edge.
+    offsets = corners[None, :] - corners[:, None]  # from the start of each edge to each corner, shape (n, n, 2)
+    cross_products = _cross(edges[:, None], offsets)  # positive for corners on the left of the edge, shape (n, n)
+    rounding_tolerance = 1e-9 * cross_products.max()
+    all_on_left = cross_products.min() >= -rounding_tolerance
+    return bool(turns_left and all_on_left)
 
 
 def _cross(first: Array, second: Array) -> Array:
-    """Return the cross products x1 y2 - y1 x2 of plane vectors.
+    """Compute the cross product x1 y2 - y1 x2 of each pair of plane vectors (x1, y1) and (x2, y2).
 
     Args:
         first: Vectors (x1, y1), shape (..., 2).
         second: Vectors (x2, y2), shape (..., 2).
 
     Returns:
-        Cross products, shape (...). They are positive if the second vector points to the left of the first.
+        Cross products, shape (...). A cross product is positive if the second vector points to the left of the first.
     """
     x1 = first[..., 0]
     y1 = first[..., 1]
@@ -74,13 +75,15 @@ def overlap(first: Array, second: Array, within: float = 0.0) -> bool:
     Args:
         first: Corners (x, y), shape (n, 2).
         second: Corners (x, y), shape (m, 2).
-        within: The distance, in the unit of the corners. If it is 0, polygons that only touch do not overlap.
+        within: Distance in the unit of the corners. With the distance 0, polygons that only touch do not overlap.
     """
     first_polygon = shapely.Polygon(first)
     second_polygon = shapely.Polygon(second)
     if within > 0.0:
         return bool(shapely.distance(first_polygon, second_polygon) < within)
-    interiors_intersect = "T********"  # pattern of the dimensionally extended nine-intersection model
+
+    # Pattern of the dimensionally extended nine-intersection model: only the interiors are required to intersect.
+    interiors_intersect = "T********"
     return bool(shapely.relate_pattern(first_polygon, second_polygon, interiors_intersect))
 
 
@@ -95,12 +98,12 @@ def to_corners(z: Complexes) -> Array:
 
 
 def min_edge_cross_product(corners: Complexes, points: Complexes) -> Array:
-    """Compute the smallest cross product over all edges of a convex polygon.
+    """Compute the smallest cross product of each point with the edges of a convex polygon.
 
-    The factors of each cross product are an edge and the vector from its start to the point. The cross product is the
-    length of the edge times the signed distance of the point from the line through the edge. The cross product is
-    positive if the point lies on the left of the edge. The smallest cross product is therefore positive for points
-    within the polygon.
+    The cross product of an edge vector and the vector from the start of the edge to the point is computed for each
+    edge. The cross product equals the length of the edge times the signed distance of the point from the line through
+    the edge. The cross product is positive if the point lies on the left of the edge. The smallest cross product is
+    therefore positive for points inside the polygon, and negative for points outside.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n,).
@@ -116,7 +119,7 @@ def min_edge_cross_product(corners: Complexes, points: Complexes) -> Array:
 
 
 def shared_area(first: Complexes, second: Complexes) -> float:
-    """Compute the area that two polygons have in common.
+    """Compute the area of the intersection of two polygons.
 
     Args:
         first: Corners x + iy, shape (n,).
@@ -129,9 +132,10 @@ def shared_area(first: Complexes, second: Complexes) -> float:
 def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float) -> Array:
     """Compute the area of the intersection of a polygon with each of several disks.
 
-    Each edge of the polygon forms a triangle with the centre of the disk. The result is the sum of the signed areas
-    that these triangles have in common with the disk. The part of an edge inside the circle contributes a triangle, and
-    the parts outside contribute sectors.
+    Each edge of the polygon forms a triangle with the centre of the disk. The area of the intersection is the sum over
+    all edges of the signed area that the triangle and the disk have in common. The part of an edge inside the circle
+    contributes the area of a triangle. Each part of an edge outside the circle contributes the area of a circular
+    sector.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n,).
@@ -141,45 +145,50 @@ def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float)
     Returns:
         Common area for each disk, in the shape of `centre`.
     """
-    # Ends of each edge relative to the centre, and their coordinates along and across the edge, shape (..., n)
+    # Start and end point of each edge relative to the centre, and their coordinates along the edge and across it. The
+    # coordinate across the edge is the same for both points. All arrays have the shape (..., n).
     start = corners - np.asarray(centre)[..., None]
     end = np.roll(start, -1, axis=-1)
-    direction = (end - start) / np.abs(end - start)
+    direction = (end - start) / np.abs(end - start)  # unit vector x + iy
     start_along = (start * np.conj(direction)).real
     end_along = (end * np.conj(direction)).real
     across = (start * np.conj(direction)).imag  # negative if the centre lies on the left of the edge
 
-    # Ends of the part of the edge within the circle. They coincide if the edge does not meet the circle.
+    # The chord is the part of the edge within the circle. If the edge does not meet the circle, the length of the chord
+    # is zero.
     half_chord = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
     chord_start_along = np.clip(start_along, -half_chord, half_chord)
     chord_end_along = np.clip(end_along, -half_chord, half_chord)
     chord_start = (chord_start_along + 1j * across) * direction
     chord_end = (chord_end_along + 1j * across) * direction
 
-    # Signed areas of the triangle inside the circle and of the sectors before and after it
-    triangle = -0.5 * across * (chord_end_along - chord_start_along)
+    # Signed areas of the triangle between the centre and the chord, and of the sectors before and after the chord
+    triangle_area = -0.5 * across * (chord_end_along - chord_start_along)
     angle_before_chord = np.angle(chord_start * np.conj(start))
     angle_after_chord = np.angle(end * np.conj(chord_end))
-    sectors = 0.5 * radius**2 * (angle_before_chord + angle_after_chord)
-    return np.asarray((triangle + sectors).sum(axis=-1))
+    sector_area = 0.5 * radius**2 * (angle_before_chord + angle_after_chord)
+    return np.asarray((triangle_area + sector_area).sum(axis=-1))
 
 
 def gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:
-    """Compute a Gauss rule for a convex polygon.
+    """Compute the points and weights of a Gauss rule for a convex polygon.
 
-    The polygon is divided into triangles that share its first corner. The rule of a triangle is the rule of a square
-    after one side of the square is contracted to a point (Duffy 1982).
+    The polygon is divided into triangles that share the first corner of the polygon. The rule of each triangle is
+    obtained from the rule of a square by contracting one side of the square to a point (Duffy 1982).
 
     Args:
         corners: Corners (x, y), anticlockwise, shape (n, 2).
         count: Number of points in each direction of a square.
 
     Returns:
-        Points (x, y), shape (m, 2), and weights, shape (m,), which add up to one.
+        Points (x, y), shape (m, 2), and weights, shape (m,). The weights add up to one.
     """
-    unit_points, unit_weights = gauss_square(count)
-    radial = unit_points[:, :1]  # 0 at the first corner of a triangle, 1 on the opposite side; shape (count^2, 1)
-    angular = unit_points[:, 1:]  # 0 on the first side, 1 on the second side
+    # Coordinates of the square, each of shape (count^2, 1). The radial coordinate is 0 at the first corner of a
+    # triangle, and 1 on the opposite side. The angular coordinate is 0 on the first side, and 1 on the second side.
+    square_points, square_weights = gauss_square(count)
+    radial = square_points[:, :1]
+    angular = square_points[:, 1:]
+
     first_corner = corners[0]
     points = []
     weights = []
@@ -191,69 +200,80 @@ def gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:
 
         # The determinant of the Jacobian is the radial coordinate times twice the area of the triangle.
         double_area = float(_cross(first_side, second_side))
-        weights.append(unit_weights * radial[:, 0] * double_area)
+        weights.append(square_weights * radial[:, 0] * double_area)
     all_weights = np.concatenate(weights)
     return np.concatenate(points), all_weights / all_weights.sum()
 
 
 def bilinear(corners: Complexes, s: Array, t: Array) -> Complexes:
-    """Map points (s, t) of the unit square bilinearly into a quadrilateral, or into a triangle.
+    """Map points (s, t) of the unit square into a quadrilateral or a triangle by a bilinear function.
 
     Args:
-        corners: Corners x + iy, shape (4,): the images of (0, 0), (1, 0), (1, 1) and (0, 1). A triangle has the shape
-            (3,), and its last corner is the image of both (1, 1) and (0, 1).
+        corners: Corners x + iy of a quadrilateral, shape (4,), or of a triangle, shape (3,). The corners of a
+            quadrilateral are the images of (0, 0), (1, 0), (1, 1) and (0, 1). The last corner of a triangle is the
+            image of both (1, 1) and (0, 1).
         s: First coordinate in the unit square.
-        t: Second coordinate in the unit square, of a shape that can be broadcast with that of `s`.
+        t: Second coordinate in the unit square. The shapes of `s` and `t` can be broadcast.
 
     Returns:
         Points x + iy, in the common shape of `s` and `t`.
     """
-    a, b, c, d = _four_corners(corners)
-    return np.asarray(a + (b - a) * s + (d - a) * t + (a - b + c - d) * s * t)
+    z00, z10, z11, z01 = _four_corners(corners)  # the digits are the coordinates s and t of each corner
+    return np.asarray(z00 + (z10 - z00) * s + (z01 - z00) * t + (z00 - z10 + z11 - z01) * s * t)
 
 
-def gauss_quadrilateral(corners: Array, count: int, length: float) -> tuple[Array, Array]:
-    """Compute a Gauss rule for a quadrilateral or a triangle by mapping a square bilinearly.
+def gauss_quadrilateral(corners: Array, max_count: int, reference_length: float) -> tuple[Array, Array]:
+    """Compute the points and weights of a Gauss rule for a quadrilateral or a triangle.
+
+    A bilinear function maps the rule of the unit square into the polygon.
 
     Args:
         corners: Corners (x, y), anticlockwise, shape (4, 2) or (3, 2).
-        count: Number of points along a side of the length `length` or more. Shorter sides have proportionally fewer
-            points, but at least two.
-        length: Length of a side from which on it has `count` points, in the unit of the corners.
+        max_count: Number of points along a side of the reference length or longer. Shorter sides have proportionally
+            fewer points, but at least two.
+        reference_length: Length of the shortest side that has `max_count` points, in the unit of the corners.
 
     Returns:
-        Points (x, y), shape (n, 2), and weights, shape (n,), which add up to the area of the polygon.
+        Points (x, y), shape (n, 2), and weights, shape (n,). The weights add up to the area of the polygon.
     """
-    # The corners (a, b, c, d) are the images of (0, 0), (1, 0), (1, 1) and (0, 1) in the coordinates (s, t).
+    # The polygon is the image of the unit square with the coordinates s and t. The digits in the name of a corner are
+    # the values of s and t at this corner.
     complex_corners = to_complex(corners)
-    a, b, c, d = _four_corners(complex_corners)
-    s_side = max(abs(b - a), abs(c - d))  # the longer one of the two sides along s
-    t_side = max(abs(d - a), abs(c - b))
-    s_line, s_weights = _gauss_line_for(s_side, count, length)
-    t, t_weights = _gauss_line_for(t_side, count, length)
-    s = s_line[:, None]
+    z00, z10, z11, z01 = _four_corners(complex_corners)
+    s_side = max(abs(z10 - z00), abs(z11 - z01))  # length of the longer side in the direction of s
+    t_side = max(abs(z01 - z00), abs(z11 - z10))
+    s_points, s_weights = _gauss_line_for(s_side, max_count, reference_length)
+    t, t_weights = _gauss_line_for(t_side, max_count, reference_length)
+    s = s_points[:, None]  # shape (n_s, 1), to be combined with each t
 
     points = bilinear(complex_corners, s, t)  # shape (n_s, n_t)
     # The determinant of the Jacobian is the cross product of the derivatives of the points.
-    s_derivative = (b - a) * (1.0 - t) + (c - d) * t
-    t_derivative = (d - a) * (1.0 - s) + (c - b) * s
+    s_derivative = (z10 - z00) * (1.0 - t) + (z11 - z01) * t
+    t_derivative = (z01 - z00) * (1.0 - s) + (z11 - z10) * s
     determinant = (np.conj(s_derivative) * t_derivative).imag
     weights = np.outer(s_weights, t_weights) * determinant
     return to_corners(points.ravel()), weights.ravel()
 
 
 def _four_corners(corners: Complexes) -> Complexes:
-    """Return the four corners of a quadrilateral, or the three corners of a triangle with the last corner repeated."""
+    """Return four corners for a quadrilateral or a triangle. The last corner of a triangle is returned twice.
+
+    Args:
+        corners: Corners x + iy, shape (4,) or (3,).
+    """
     return corners if corners.size == 4 else np.append(corners, corners[-1:])
 
 
-def _gauss_line_for(side: float, count: int, length: float) -> tuple[Array, Array]:
-    """Return the Gauss rule on [0, 1] with a number of points that suits the length of a side.
+def _gauss_line_for(side: float, max_count: int, reference_length: float) -> tuple[Array, Array]:
+    """Return a Gauss rule on the interval [0, 1] whose number of points is proportional to the length of a side.
 
     Args:
         side: Length of the side.
-        count: Largest number of points.
-        length: Length of a side from which on it has `count` points, in the unit of `side`.
+        max_count: Largest number of points. The smallest number is two.
+        reference_length: Length of the shortest side that has `max_count` points, in the unit of `side`.
+
+    Returns:
+        Points and weights, each of shape (n,).
     """
-    proportional_count = max(2, int(np.ceil(count * side / length)))
-    return gauss_line(min(count, proportional_count))
+    proportional_count = max(2, int(np.ceil(max_count * side / reference_length)))
+    return gauss_line(min(max_count, proportional_count))

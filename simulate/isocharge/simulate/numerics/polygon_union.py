@@ -1,8 +1,11 @@
-"""Unions of polygons, divided into trapezoids for integration. Polygons are arrays of corners x + iy, anticlockwise.
+"""Division of unions of polygons into trapezoids for numerical integration, and computation of outlines of traces.
 
-The library shapely (GEOS) computes unions and intersections. The library has no equivalent for two functions of this
-module: the division into trapezoids, and the outline of a trace. The function `buffer` of shapely silently cuts off
-sharp bends, and converts a trace that crosses itself into a ring. With `trace_outline`, both errors can be detected.
+A polygon is an array of its corners x + iy in anticlockwise order. The library shapely (GEOS) computes unions and
+intersections of polygons, but cannot divide a union into trapezoids.
+
+The outline of a trace is not computed by shapely. The function `shapely.buffer` silently cuts off sharp bends, and
+converts a trace that crosses itself into a ring. The result of the function `trace_outline` allows callers to detect
+sharp bends and crossings.
 """
 
 from collections.abc import Sequence
@@ -15,21 +18,21 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.simulate.numerics.polygon import area_of, bilinear, to_complex, to_corners
 
 MERGE_DISTANCE = 1e-9
-"""Distance below which two corners, or the y coordinates of two corners, are merged, mm."""
+"""Distance below which two corners or two y coordinates of corners are treated as equal, mm."""
 
 MIN_BEND = 0.1
-"""Smallest allowed value of 1 + cos(angle) for the angle by which a trace bends, dimensionless.
+"""Smallest allowed value of 1 + cos(angle), where `angle` is the angle by which a trace bends, dimensionless.
 
 The length of a mitre is proportional to 1 / (1 + cos(angle)). The largest allowed bend is 154 degrees.
 """
 
 
 def is_simple(corners: Complexes) -> bool:
-    """Return whether a polygon is anticlockwise and does not cross itself.
+    """Return whether the corners of a polygon are in anticlockwise order and the polygon does not cross itself.
 
-    The signed area of a polygon is compared with the area that the polygon covers. The two areas are different if the
-    polygon covers some points twice, or some points clockwise. A polygon that touches itself at a point or along an
-    edge counts as simple.
+    The function compares the signed area of the polygon with the area that the polygon covers. The two areas differ if
+    the polygon covers a region twice or encloses a region clockwise. A polygon that touches itself at a point or along
+    an edge counts as simple.
 
     Args:
         corners: Corners x + iy, shape (n,), mm.
@@ -43,16 +46,17 @@ def is_simple(corners: Complexes) -> bool:
 def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> list[Complexes]:
     """Divide the union of simple polygons into trapezoids that do not overlap.
 
-    The plane is cut into horizontal strips at every corner and at every crossing of two edges. The part of the union
-    within a strip consists of trapezoids. A triangle is represented as a trapezoid with two equal corners.
+    Horizontal lines through every corner and through every crossing of two edges divide the plane into strips. Within
+    each strip, the union consists of trapezoids. A triangle is represented as a trapezoid with two equal corners.
 
     Args:
         front: Simple polygons, each of shape (n,), mm.
-        back: Further simple polygons. If there are any, the intersection of both unions is divided.
+        back: Further simple polygons, each of shape (n,), mm. If there are any, the function divides the intersection
+            of the union of `front` and the union of `back`.
 
     Returns:
-        Trapezoids, each of shape (4,), mm: lower left, lower right, upper right and upper left corner. They are ordered
-        from bottom to top, and from left to right within a strip.
+        Trapezoids, each of shape (4,), mm. The corners of each trapezoid are in the order lower left, lower right,
+        upper right, upper left. The trapezoids are ordered from bottom to top, and from left to right within a strip.
     """
     region = _region(front)
     if back:
@@ -63,11 +67,14 @@ def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> l
     start, end = _edges(region)
     trapezoids = []
     for bottom, top in pairwise(_strip_ends([*front, *back])):
-        # Edges that cross the strip, in the order from left to right
+        # Find the edges that cross the strip. The start and the end of such an edge are on different sides of the
+        # middle of the strip, because no edge ends within a strip.
         middle = 0.5 * (bottom + top)
         crosses_strip = (start.imag < middle) != (end.imag < middle)
         edge_start = start[crosses_strip]
         edge_end = end[crosses_strip]
+
+        # Sort the edges from left to right. Edges do not cross each other within a strip.
         order = np.argsort(_x_at_height(edge_start, edge_end, middle))
         x_bottom = _x_at_height(edge_start, edge_end, bottom)[order]
         x_top = _x_at_height(edge_start, edge_end, top)[order]
@@ -84,64 +91,78 @@ def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> l
 
 
 def _x_at_height(start: Complexes, end: Complexes, y: float) -> Array:
-    """Return the x coordinates at which lines have the height y, shape (n,).
+    """Compute the x coordinate at which each straight line reaches the height y, shape (n,).
 
     Args:
         start: Points x + iy at which the lines start, shape (n,).
         end: Points x + iy at which the lines end, shape (n,).
-        y: The height.
+        y: Height, which must be the same for all lines.
     """
     slope = (end - start).real / (end - start).imag
     return np.asarray(start.real + slope * (y - start.imag))
 
 
 def _region(polygons: Sequence[Complexes]) -> shapely.Geometry:
-    """Return the union of polygons. Polygons that touch or cross themselves are made valid first."""
+    """Compute the union of polygons.
+
+    A polygon that touches or crosses itself is first converted into a valid region.
+    """
     valid = shapely.make_valid([shapely.Polygon(to_corners(corners)) for corners in polygons])
     return shapely.union_all(valid)
 
 
 def _strip_ends(polygons: Sequence[Complexes]) -> Array:
-    """Return the y coordinates (mm) of all corners and of all crossings of edges, sorted and without repetition."""
+    """Return the y coordinates of all corners and of all crossings of edges in ascending order, shape (n,), mm.
+
+    Coordinates that differ by less than `MERGE_DISTANCE` are returned only once.
+    """
     outlines = [shapely.LinearRing(to_corners(corners)) for corners in polygons]
-    lines = shapely.union_all(outlines)  # has a point at each crossing
+    lines = shapely.union_all(outlines)  # includes a point at each crossing of two edges
     y = np.unique(shapely.get_coordinates(lines)[:, 1])
-    return np.asarray(y[np.diff(y, prepend=-np.inf) > MERGE_DISTANCE])
+    is_distinct = np.diff(y, prepend=-np.inf) > MERGE_DISTANCE  # from the previous coordinate; true for the first
+    return np.asarray(y[is_distinct])
 
 
 def _edges(region: shapely.Geometry) -> tuple[Complexes, Complexes]:
-    """Return the start and end points x + iy of all edges of a region, including the edges of its holes."""
+    """Return the start points and the end points of all edges of a region, including the edges of its holes.
+
+    Returns:
+        Start points and end points x + iy, each of shape (n,).
+    """
     parts = shapely.get_parts(region)
-    polygons = parts[shapely.get_dimensions(parts) == 2]  # without points and lines where polygons only touch
-    rings = [to_complex(shapely.get_coordinates(ring)) for ring in shapely.get_rings(polygons)]  # closed
+    polygons = parts[shapely.get_dimensions(parts) == 2]  # removes points and lines at which polygons only touch
+    rings = [to_complex(shapely.get_coordinates(ring)) for ring in shapely.get_rings(polygons)]
+    # Each ring is closed, because its last point is the same as its first point.
     start = np.concatenate([ring[:-1] for ring in rings])
     end = np.concatenate([ring[1:] for ring in rings])
     return start, end
 
 
-def subdivide(part: Complexes, max_side: float) -> list[Complexes]:
-    """Cut a quadrilateral into smaller quadrilaterals. If two corners of a part coincide, the part is a triangle.
+def subdivide(quadrilateral: Complexes, max_side: float) -> list[Complexes]:
+    """Cut a quadrilateral into quadrilaterals and triangles whose sides do not exceed a given length.
 
     Args:
-        part: Corners of the quadrilateral, shape (4,), mm.
+        quadrilateral: Corners of the quadrilateral, shape (4,), mm. Two of the corners may be equal.
         max_side: Largest length of a side of the returned polygons, mm.
 
     Returns:
-        Polygons of shape (4,) or (3,), mm.
+        Corners of each polygon, shape (4,) for a quadrilateral or (3,) for a triangle, mm.
     """
     # The quadrilateral is the bilinear image of the unit square (s, t), which is divided into a grid of cells.
-    first_s_side, first_t_side, second_s_side, second_t_side = np.abs(np.roll(part, -1) - part)
+    side_lengths = np.abs(np.roll(quadrilateral, -1) - quadrilateral)
+    first_s_side, first_t_side, second_s_side, second_t_side = side_lengths
     n_s = int(np.ceil(max(first_s_side, second_s_side) / max_side))
     n_t = int(np.ceil(max(first_t_side, second_t_side) / max_side))
     s = np.linspace(0.0, 1.0, n_s + 1)
     t = np.linspace(0.0, 1.0, n_t + 1)
-    grid = bilinear(part, s[:, None], t)  # shape (n_s + 1, n_t + 1)
+    grid = bilinear(quadrilateral, s[:, None], t)  # shape (n_s + 1, n_t + 1)
     cells = []
     for i in range(n_s):
         for j in range(n_t):
             corners = np.array([grid[i, j], grid[i + 1, j], grid[i + 1, j + 1], grid[i, j + 1]])
 
-            # Omit corners that coincide with the previous corner, and cells without an area.
+            # Omit corners that coincide with the previous corner. Omit cells with fewer than three distinct corners,
+            # because their area is zero.
             previous_corners = np.roll(corners, 1)
             is_distinct = np.abs(corners - previous_corners) > MERGE_DISTANCE
             has_area = np.count_nonzero(is_distinct) > 2
@@ -151,24 +172,28 @@ def subdivide(part: Complexes, max_side: float) -> list[Complexes]:
 
 
 def trace_outline(path: Complexes, width: float) -> Complexes:
-    """Compute the outline of a trace of constant width along a path, with straight ends and mitred bends.
+    """Compute the outline of a trace that follows a path with a constant width.
+
+    The outline has straight ends and mitred bends. At each point of the path, the outline has one corner on the left
+    side and one corner on the right side. The displacement from the point to the left corner is called the mitre.
+    Between two sections with the unit normals n and m, the mitre is (width / 2) (n + m) / (1 + dot(n, m)). The product
+    dot(n, m) is the cosine of the angle by which the path bends.
 
     Args:
-        path: Points of the path, shape (n,), mm.
+        path: Points of the path x + iy, shape (n,), mm.
         width: Width of the trace, mm.
 
     Returns:
-        Corners, anticlockwise, shape (2 n,), mm. Corners of a bend sharper than `MIN_BEND` allows are NaN.
+        Corners in anticlockwise order, shape (2 n,), mm. If two successive points are equal, or if a bend is sharper
+        than `MIN_BEND` allows, the corners at these points are NaN.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):  # repeated points and sharp bends result in NaN
+    # Repeated points and sharp bends result in NaN, for which NumPy would issue warnings.
+    with np.errstate(divide="ignore", invalid="ignore"):
         sections = np.diff(path)
-        normal = 1j * sections / np.abs(sections)  # to the left of each section
-        normal_before = np.append(normal[:1], normal)  # at each point; the ends have a single section
-        normal_after = np.append(normal, normal[-1:])
-
-        # The mitre is the displacement of a corner from the path, along the bisector of the unit normals n and m before
-        # and after the point. Its components along n and m are half of the width, so it is proportional to n + m with
-        # the factor (width / 2) / (1 + cos(bend)), where the product n . m is the cosine of the bend.
+        normals = 1j * sections / np.abs(sections)  # to the left of each section, shape (n - 1,)
+        # Normals of the sections before and after each point. At an end of the path, both are the same section.
+        normal_before = np.append(normals[:1], normals)
+        normal_after = np.append(normals, normals[-1:])
         one_plus_cosine = 1.0 + (normal_before * np.conj(normal_after)).real
         one_plus_cosine = np.where(one_plus_cosine < MIN_BEND, np.nan, one_plus_cosine)
         mitre = 0.5 * width * (normal_before + normal_after) / one_plus_cosine

@@ -1,4 +1,4 @@
-"""Least-squares fit of a cubic spline of two variables, with a penalty for regions that few points affect."""
+"""Least-squares fit of a cubic spline of two variables, with a penalty that makes the spline smooth."""
 
 import numpy as np
 import scipy  # scipy.interpolate is imported when it is used
@@ -8,14 +8,25 @@ from scipy.sparse.linalg import splu
 from isocharge.common.arrays import Array
 
 SMOOTHING = 5e-3
-"""Weight of the third differences of the coefficients in the fit, dimensionless.
+"""Weight of the third differences of the spline coefficients in the fit, dimensionless.
 
-It determines the coefficients in regions without points.
+The third differences determine the coefficients in regions without points.
 """
 
 
 def spline_knots(low: float, high: float, cells: int) -> Array:
-    """Return the knots of a cubic spline on an interval with equal cells, shape (cells + 7,)."""
+    """Return the knots of a cubic spline that divide an interval into equal cells.
+
+    Each end of the interval occurs four times among the knots, so that the spline is defined on the whole interval.
+
+    Args:
+        low: Lower end of the interval.
+        high: Upper end of the interval.
+        cells: Number of cells.
+
+    Returns:
+        Knots in ascending order, shape (cells + 7,).
+    """
     return np.concatenate([[low] * 3, np.linspace(low, high, cells + 1), [high] * 3])
 
 
@@ -26,25 +37,25 @@ def fit_spline(position: Array, values: Array, knots: tuple[Array, Array], fixed
         position: Positions (x, y), shape (n, 2), mm.
         values: Values at the positions, shape (n, ...).
         knots: Knots along x and along y.
-        fixed: Number of coefficients at each end of each axis that are zero. With two such coefficients, the spline
-            and its slopes are zero on the edges.
+        fixed: Number of coefficients at each end of each axis that are fixed at zero. With two fixed coefficients, the
+            spline and its slopes are zero on the edges.
 
     Returns:
-        The spline, whose values have the shape of `values` without the first axis.
+        The spline. Its values have the shape of `values` without the first axis.
     """
-    # A cubic spline has 4 coefficients less than knots along each axis.
+    # A cubic spline has 4 coefficients fewer than knots along each axis.
     x_knots, y_knots = knots
     x_count = x_knots.size - 4
     y_count = y_knots.size - 4
 
-    # Only the coefficients that are not fixed are unknown.
+    # The free coefficients are the unknowns of the fit. The fixed coefficients are zero.
     is_free = np.zeros((x_count, y_count), dtype=bool)
     is_free[fixed : x_count - fixed, fixed : y_count - fixed] = True
     free = np.flatnonzero(is_free)
     free_design = _design_matrix(position, knots)[:, free]
     free_penalty = _penalty_matrix(x_count, y_count).tocsc()[:, free]
 
-    # Solve the normal equations, whose matrix is positive definite and needs no pivoting.
+    # Solve the normal equations. Their matrix is positive definite, so the factorisation needs no pivoting.
     normal_matrix = (free_design.T @ free_design + free_penalty.T @ free_penalty).tocsc()
     right_side = np.ascontiguousarray(free_design.T @ values.reshape(len(position), -1))
     factors = splu(normal_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
@@ -57,24 +68,27 @@ def fit_spline(position: Array, values: Array, knots: tuple[Array, Array], fixed
 
 
 def _design_matrix(position: Array, knots: tuple[Array, Array]) -> csr_array:
-    """Return the matrix that computes the values of a cubic spline at positions from its coefficients.
+    """Return the matrix that converts the coefficients of a cubic spline into its values at given positions.
 
     Args:
         position: Positions (x, y), shape (n, 2), mm.
         knots: Knots along x and along y.
 
     Returns:
-        Matrix, shape (n, x_count * y_count), with the numbers of coefficients along x and y.
+        Matrix, shape (n, x_count * y_count), where x_count and y_count are the numbers of coefficients along x and y.
     """
+    # A cubic spline has 4 coefficients fewer than knots along each axis.
     x_knots, y_knots = knots
     n_coefficient = (x_knots.size - 4) * (y_knots.size - 4)
-    entries = scipy.interpolate.NdBSpline.design_matrix(position, knots, 3)
-    # SciPy omits the last columns if they are zero, so the shape is given here.
+    cubic_degree = 3
+    entries = scipy.interpolate.NdBSpline.design_matrix(position, knots, cubic_degree)
+    # The matrix of SciPy has no columns for the last coefficients if they do not affect any position. The matrix is
+    # therefore created again with its full shape.
     return csr_array((entries.data, entries.indices, entries.indptr), shape=(len(position), n_coefficient))
 
 
 def _penalty_matrix(x_count: int, y_count: int) -> sparray:
-    """Return the matrix that computes the weighted third differences of coefficients along x and along y.
+    """Return the matrix that converts spline coefficients into their weighted third differences along x and along y.
 
     Args:
         x_count: Number of coefficients along x, which is the first axis of the coefficients.
@@ -86,5 +100,5 @@ def _penalty_matrix(x_count: int, y_count: int) -> sparray:
 
 
 def _third_differences(count: int) -> dia_array:
-    """Return the matrix of the third differences of neighbouring coefficients, shape (count - 3, count)."""
+    """Return the matrix that computes the third differences of neighbouring coefficients, shape (count - 3, count)."""
     return diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))

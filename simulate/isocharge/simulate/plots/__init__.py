@@ -1,1 +1,4 @@
-"""Pictures of films, charges and errors. No other package of isocharge.simulate imports matplotlib."""
+"""Pictures of films, charges and errors, which are drawn with matplotlib.
+
+No other package of isocharge.simulate imports matplotlib.
+"""

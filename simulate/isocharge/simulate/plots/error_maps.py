@@ -1,4 +1,4 @@
-"""Pictures that show the lower limit of the position error over the film for an identification or a design."""
+"""Pictures that show the lower limit of the position error over the film, for an identification or a design."""
 
 from typing import Any
 
@@ -15,38 +15,41 @@ from isocharge.simulate.plots.film import draw_circle, draw_electrodes, draw_wor
 from isocharge.simulate.sensor.sensor import Sensor
 
 MIN_ERROR_mm = 0.02
-"""Position error at the lower end of the colours, mm. Smaller errors have the same colour."""
+"""Position error at the lower end of the colour scale, mm. Smaller errors have the colour of this error."""
 
 MAX_ERROR_mm = 5.0
-"""Position error at the upper end of the colours, mm. Larger errors have the same colour."""
+"""Position error at the upper end of the colour scale, mm. Larger errors have the colour of this error."""
 
 TICKS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Position errors that are labelled on the colour bar, mm."""
 
 MAX_ERROR_RATIO = 10.0
-"""Ratio of the errors at both ends of the colours in the maps of a design, dimensionless."""
+"""Ratio of the largest to the smallest error of the colour scale in the maps of a design, dimensionless."""
 
 MARGIN = 1.0
-"""Margin around the electrodes, mm."""
+"""Margin around the electrodes in the maps of a design, mm."""
 
 FORCE_COLOURS = ("#8fb8de", "#3a7ca5", INK)
-"""Colours of the curves for ascending forces. The last colour is that of the largest force."""
+"""Colours of the curves for ascending forces. The last colour belongs to the largest force."""
 
 
 def identification_picture(identification: Identification) -> Figure:
-    """Draw maps of the position error for the smallest and the largest force, and the error against the distance.
+    """Draw the position errors of an identification.
+
+    Two maps show the errors over the film for the smallest and the largest force. A diagram shows the errors as a
+    function of the distance from the centre.
 
     Args:
-        identification: The identification.
+        identification: Result of `identify`.
 
     Returns:
-        Figure with two maps and the errors against the distance.
+        Figure with the two maps and the diagram.
     """
     figure = new_figure(16.0, 5.2)
     smallest_force_axes, largest_force_axes, distance_axes = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
     draw_limit_map(smallest_force_axes, identification, identification.maps[0])
     coloured_areas = draw_limit_map(largest_force_axes, identification, identification.maps[-1])
-    figure.colorbar(  # both maps have the same colours
+    figure.colorbar(  # both maps have the same colour scale
         coloured_areas,
         ax=[smallest_force_axes, largest_force_axes],
         label="lower limit of the position error (rms), mm",
@@ -61,18 +64,18 @@ def identification_picture(identification: Identification) -> Figure:
 
 
 def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMap) -> Any:
-    """Draw the position errors for one force as colours. Folds, working area and electrodes are drawn to scale.
+    """Draw a map of the position errors for one force, with the folds, the working area and the electrodes.
 
     Args:
         axes: Axes of matplotlib.
-        identification: Result of the identification, which contains the sensor and the working area.
+        identification: Result of `identify`, with the sensor and the working area.
         limit_map: Lower limits of the position error for one force.
 
     Returns:
-        The coloured areas, for which a colour bar can be drawn.
+        The coloured areas of the map, for which a colour bar can be drawn.
     """
+    # Draw the errors as colours. Errors outside the colour scale get the first or the last colour.
     x, y = limit_map.rings.position.reshape(-1, 2).T  # mm
-    # Draw the errors as colours. Errors outside the range of the colours get the first or the last colour.
     levels = np.geomspace(MIN_ERROR_mm, MAX_ERROR_mm, 25)
     errors = np.clip(limit_map.position.ravel(), MIN_ERROR_mm, MAX_ERROR_mm)
     shades = axes.tricontourf(x, y, errors, levels, norm=LogNorm(), cmap="viridis")
@@ -83,7 +86,7 @@ def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMa
     axes.plot(fold_x, fold_y, ".", color=FELT, ms=3)
     draw_circle(axes, identification.area.radius, ls="--", lw=1.8, color="white")
     draw_electrodes(axes, identification.sensor)
-    axis_limits = (-identification.area.searched, identification.area.searched)
+    axis_limits = (-identification.area.search_radius, identification.area.search_radius)
     title = f"{limit_map.force:g} N; dashed: working area, {identification.area.radius:g} mm"
     if len(folds):
         title += "; red: folds"
@@ -92,11 +95,11 @@ def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMa
 
 
 def _draw_distance(axes: Any, identification: Identification) -> None:
-    """Draw the median and the largest error of every ring against its distance from the centre.
+    """Draw the median and the largest position error on each ring as functions of the distance from the centre.
 
     Args:
         axes: Axes of matplotlib.
-        identification: The identification, which contains a map for each force.
+        identification: Result of `identify`, which contains a map of the errors for each force.
     """
     area = identification.area
 
@@ -118,7 +121,7 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
     axes.set(
         xlabel="distance from the centre, mm",
         ylabel="lower limit of the position error (rms), mm",
-        xlim=(0.0, area.searched),
+        xlim=(0.0, area.search_radius),
         ylim=(0.005, 20.0),
     )
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -129,22 +132,22 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
 
 
 def error_maps_picture(design: Design) -> Figure:
-    """Draw the position errors of the initial and the new layout as colours.
+    """Draw maps of the position errors of the initial layout and of the new layout.
 
-    The errors include the nuisances of the case.
+    The errors include the effect of the nuisance parameters of the design case.
 
     Args:
-        design: Result of the design.
+        design: Result of the design of a layout.
 
     Returns:
-        Figure with one map for each layout.
+        Figure with one map for each layout. If the errors of the initial layout are unknown, the figure has one map.
     """
     case = design.case
-    layouts = [(design.sensor, design.after)]
-    if design.before:  # the initial layout is the first one; a design without one has a single map
-        layouts.insert(0, (case.sensor, design.before))
+    layouts = [(design.sensor, design.errors_after)]
+    if design.errors_before:
+        layouts.insert(0, (case.sensor, design.errors_before))  # the map of the initial layout is on the left
 
-    # All maps have the same range of colours, and the same axes that show all electrodes.
+    # Both maps have the same colour scale. Their axes have the same limits and show all electrodes.
     smallest = min(float(errors.with_nuisances.min()) for _, errors in layouts)
     norm = LogNorm(smallest, MAX_ERROR_RATIO * smallest)
     electrodes = [electrode for sensor, _ in layouts for electrode in sensor.electrodes]
@@ -174,10 +177,10 @@ def _draw_errors(axes: Any, sensor: Sensor, errors: ErrorMap, norm: LogNorm) -> 
         axes: Axes of matplotlib.
         sensor: Sensor with the electrodes of the layout.
         errors: Position errors of the layout.
-        norm: Range of the colours.
+        norm: Range of the colour scale.
 
     Returns:
-        The coloured area, for which a colour bar can be drawn.
+        The coloured area of the map, for which a colour bar can be drawn.
     """
     draw_electrodes(axes, sensor)
     position_error = errors.with_nuisances  # shape (n_press,), mm

@@ -1,6 +1,6 @@
-"""Creation, colours and output files of matplotlib figures. All pictures of isocharge use this module.
+"""Functions that create matplotlib figures and write them to files. All pictures of isocharge use this module.
 
-The figures have no window. The module needs matplotlib, so it is imported only where a picture is drawn.
+The figures are not shown in a window. This module imports matplotlib, so only modules that draw pictures import it.
 """
 
 from io import BytesIO
@@ -17,32 +17,36 @@ from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing, write_whole
 
 INK = "#1b2a41"
+"""Colour of outlines."""
+
 PRESSED = "#9aa5b1"
+"""Colour of true presses."""
+
 FELT = "#d1495b"
-"""Colours of outlines, of true presses and of estimated presses."""
+"""Colour of estimated presses, and of objects that are emphasised."""
 
 COLOURS = ("#d1495b", "#2e6f9e", "#3a8f5c", "#c98a1b")
 """Colours of the electrodes in the order of the charges."""
 
 FORMATS = ("png", "svg", "pdf")
-"""Formats of a picture, which are also the allowed suffixes of its file name."""
+"""Formats of pictures, which are also the allowed suffixes of their file names."""
 
 DPI = 130
 """Resolution of PNG files, dots per inch."""
 
 LAST_SHADE = 0.92
-"""End of the part of the viridis colour map that `shades` uses, from 0 to 1.
+"""Fraction of the colour map `viridis` that `shades` uses, from its dark end.
 
-The remaining part is hardly visible on white.
+The remaining colours are hardly visible on white.
 """
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return a new figure without a window.
+    """Create a figure that is not shown in a window.
 
     Args:
-        width: Width, inches.
-        height: Height, inches.
+        width: Width of the figure, inches.
+        height: Height of the figure, inches.
     """
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
@@ -50,13 +54,16 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def new_axes(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
-    """Return a new figure and its axes, as `subplots` of matplotlib does.
+    """Create a figure with axes, like the function `subplots` of matplotlib.
 
     Args:
-        width: Width, inches.
-        height: Height, inches.
+        width: Width of the figure, inches.
+        height: Height of the figure, inches.
         rows: Number of rows of axes.
         columns: Number of columns of axes.
+
+    Returns:
+        The figure, and its axes or an array of its axes.
     """
     figure = new_figure(width, height)
     return figure, figure.subplots(rows, columns)
@@ -70,7 +77,7 @@ def finish_axes(axes: Any, x: str, y: str, title: str = "", **legend: Any) -> No
         x: Label of the x axis.
         y: Label of the y axis.
         title: Title of the axes.
-        **legend: Arguments of `Axes.legend`.
+        **legend: Arguments that are passed to `Axes.legend`.
     """
     axes.set(xlabel=x, ylabel=y, title=title)
     axes.grid(alpha=0.3, which="both")
@@ -78,12 +85,22 @@ def finish_axes(axes: Any, x: str, y: str, title: str = "", **legend: Any) -> No
 
 
 def shades(count: int) -> Array:
-    """Return RGBA colours from dark to light for an ordered set of lines, shape (count, 4)."""
+    """Return colours from dark to light for an ordered set of lines.
+
+    Args:
+        count: Number of colours.
+
+    Returns:
+        Red, green, blue and opacity of each colour, from 0 to 1, shape (count, 4).
+    """
     return np.asarray(colormaps["viridis"](np.linspace(0.0, LAST_SHADE, count)))
 
 
 def check_picture(path: Path) -> None:
-    """Check the file name of a picture before the picture is computed.
+    """Raise an error if a picture cannot be written to a path, before the picture is computed.
+
+    Args:
+        path: Path of the picture.
 
     Raises:
         InputError: If the suffix is not one of `FORMATS`.
@@ -95,26 +112,31 @@ def check_picture(path: Path) -> None:
 
 
 def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
-    """Convert a figure into the bytes of an image file.
+    """Convert a figure into the content of an image file.
 
-    The file contains neither a date nor random identifiers, so equal figures have equal bytes.
+    The content includes neither a date nor random identifiers. Equal figures therefore result in equal bytes.
 
     Args:
-        figure: The figure.
+        figure: Figure to be converted.
         kind: Format of the file: "png", "svg" or "pdf".
-
-    Returns:
-        The bytes of the file.
     """
-    # Without these entries, matplotlib writes the present date. PNG files have no date.
+    # The value None removes the present date, which matplotlib would write into SVG and PDF files.
     date_metadata: dict[str, dict[str, None]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
     buffer = BytesIO()
-    # A fixed salt replaces the random identifiers of SVG elements. Text is stored as text, not as outlines.
+
+    # With a fixed salt, the identifiers of SVG elements are not random. Text is stored as text, not as outlines.
     with rc_context({"svg.hashsalt": "isocharge", "svg.fonttype": "none"}):
         figure.savefig(buffer, format=kind, dpi=DPI, metadata=date_metadata[kind])
     return buffer.getvalue()
 
 
 def save_picture(figure: Figure, path: Path) -> None:
-    """Write a figure to a file. The suffix of the path selects the format. A failed write leaves no partial file."""
+    """Write a figure to a file, in the format that the suffix of the path states.
+
+    If an error occurs, no file is written.
+
+    Args:
+        figure: Figure to be written.
+        path: Path of the file, whose suffix is one of `FORMATS`.
+    """
     write_whole(path, picture_bytes(figure, path.suffix.lstrip(".").lower()))

@@ -1,4 +1,4 @@
-"""Drawings of a film to scale: electrodes, probe, working area, charge map and deflection."""
+"""Functions that draw parts of a film to scale, such as electrodes, probes, charge maps and deflections."""
 
 from math import atan2, cos, hypot, sin
 from typing import Any
@@ -17,21 +17,21 @@ from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
 
 DRAWN_RADIUS = 0.999999
-"""Radius up to which the deflection is drawn, in units of the film radius.
+"""Radius up to which the deflection is drawn, in film radii, dimensionless.
 
-Because of rounding errors, points on the rim may lie outside the film.
+The radius is less than 1, because rounding could move points on the rim out of the film.
 """
 
 
 def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool = True, ink: str = INK) -> None:
     """Draw the outlines of the electrodes at their calibrated positions.
 
-    The outlines of the front are solid lines, and those of the back are dashed lines.
+    The outlines of metal on the front are solid lines. The outlines of metal on the back are dashed lines.
 
     Args:
-        axes: Matplotlib axes.
-        sensor: Sensor.
-        highlight: Name of an electrode that is drawn in another colour.
+        axes: Axes of matplotlib.
+        sensor: Sensor whose electrodes are drawn.
+        highlight: Name of an electrode that is drawn in another colour; empty for none.
         names: Whether to write the names of the electrodes.
         ink: Colour of the outlines.
     """
@@ -48,30 +48,42 @@ def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool 
 
 
 def draw_probe(axes: Any, probe: Probe, at: tuple[float, float], label: str = "") -> None:
-    """Draw the footprint of a press.
+    """Draw the footprint of a probe that presses on the film.
 
     Args:
         axes: Axes of matplotlib.
-        probe: The probe.
+        probe: Probe whose footprint is drawn.
         at: Position (x, y) of the centroid of the footprint, mm.
-        label: Label in the legend; none if it is empty.
+        label: Label of the footprint in the legend; empty for no label.
     """
     style: dict[str, Any] = {"fill": True, "fc": FELT, "ec": FELT, "alpha": 0.35, "zorder": 2, "label": label}
     axes.add_patch(Patch(to_corners(complex(*at) + probe.outline), **style))
 
 
 def draw_circle(axes: Any, radius: float, **style: Any) -> None:
-    """Draw a circle of `radius` (mm) about the centre."""
+    """Draw a circle around the centre of the film.
+
+    Args:
+        axes: Axes of matplotlib.
+        radius: Radius of the circle, mm.
+        **style: Arguments that are passed to the patch of matplotlib.
+    """
     axes.add_patch(Disk((0, 0), radius, fill=False, **style))
 
 
 def draw_working_area(axes: Any, radius: float, label: str = "") -> None:
-    """Draw a working area as a dotted circle of `radius` (mm) about the centre."""
+    """Draw the edge of a working area as a dotted circle around the centre of the film.
+
+    Args:
+        axes: Axes of matplotlib.
+        radius: Radius of the working area, mm.
+        label: Label of the circle in the legend; empty for no label.
+    """
     draw_circle(axes, radius, ls=":", color=INK, label=label)
 
 
 def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> None:
-    """Scale and label axes in mm so that they show all electrodes and a circle about the centre.
+    """Scale and label axes such that they show all electrodes and a circle around the centre of the film.
 
     Args:
         axes: Axes of matplotlib.
@@ -79,10 +91,10 @@ def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> Non
         radius: Radius of the circle, mm.
         title: Title of the axes.
     """
-    # The drawing contains the electrodes as polygons. `place` converts points of the drawing into points on the film.
+    # Find the distance of the outermost corner of an electrode from the centre of the film.
     polygons = [polygon for electrode in sensor.electrodes for polygon in electrode.front]
-    drawn_corners = np.concatenate(polygons)
-    corner_x, corner_y = sensor.calibration.place(drawn_corners).T
+    nominal_corners = np.concatenate(polygons)
+    corner_x, corner_y = sensor.calibration.place(nominal_corners).T  # calibrated positions
     outermost = float(np.hypot(corner_x, corner_y).max())
     margin_mm = 0.7
     half_width = max(radius, outermost) + margin_mm
@@ -91,14 +103,14 @@ def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> Non
 
 
 def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "", highlight: str = "") -> None:
-    """Draw the electrodes and the working area, and scale the axes.
+    """Draw the electrodes and the working area of a sensor, and scale the axes.
 
     Args:
         axes: Axes of matplotlib.
         sensor: Sensor whose electrodes are drawn.
         radius: Radius of the working area, mm.
         title: Title of the axes.
-        highlight: Electrode to highlight; see `draw_electrodes`.
+        highlight: Name of an electrode that is drawn in another colour; empty for none.
     """
     draw_electrodes(axes, sensor, highlight)
     draw_working_area(axes, radius)
@@ -106,16 +118,18 @@ def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "", highl
 
 
 def draw_charge_map(axes: Any, charge_map: ChargeMap, number: int, force: float = 1.0, count: int = 81) -> None:
-    """Draw the charge of one electrode as a function of the position of a press, as shades and labelled contours.
+    """Draw the charge of one electrode as a function of the position of a press.
+
+    The charge is shown by shades and by labelled contours.
 
     Args:
-        axes: Matplotlib axes.
-        charge_map: Charges as a function of the contact.
-        number: Number of the electrode in the order of the charges.
+        axes: Axes of matplotlib.
+        charge_map: Map that computes the charges of contacts.
+        number: Index of the electrode in the order of the charges.
         force: Force of the presses, N.
-        count: Number of angles of the grid.
+        count: Number of points on each ring of the polar grid on which the charge is computed.
     """
-    # The radius needs half as many points as the diameter.
+    # The grid has half as many rings as angles.
     x, y = _polar_grid(charge_map.domain.radius, rings=count // 2, angles=count)
     contact = np.stack([x.ravel(), y.ravel(), np.full(x.size, force)], axis=1)
     values = charge_map.charges(contact)[:, number].reshape(x.shape)
@@ -125,11 +139,11 @@ def draw_charge_map(axes: Any, charge_map: ChargeMap, number: int, force: float 
 
 
 def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
-    """Draw the deflection of the complete film as shades.
+    """Draw the deflection of the whole film as shades.
 
     Args:
         axes: Axes of matplotlib.
-        equilibrium: The solved press.
+        equilibrium: Equilibrium of the film under a press.
     """
     radius = equilibrium.film.radius
     x, y = _polar_grid(DRAWN_RADIUS * radius, rings=240, angles=361)
@@ -142,13 +156,15 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
 
 
 def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
-    """Draw the deflection on a section through the probe and the centre of the film. The vertical axis is stretched.
+    """Draw the deflection of the film along a straight line through the probe and the centre of the film.
+
+    The vertical axis is stretched.
 
     Args:
         axes: Axes of matplotlib.
-        equilibrium: The solved press.
+        equilibrium: Equilibrium of the film under a press.
     """
-    # Draw the deflection downwards, against the signed distance from the centre in the direction of the press.
+    # Draw the deflection downwards. The horizontal axis is the signed distance from the centre along the line.
     distance_along_section = np.linspace(-DRAWN_RADIUS, DRAWN_RADIUS, 801) * equilibrium.film.radius
     x, y = equilibrium.at
     distance = hypot(x, y)
@@ -171,7 +187,7 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
 
 
 def _polar_grid(radius: float, rings: int, angles: int) -> tuple[Array, Array]:
-    """Return the points of a polar grid on a disk, with equal areas between neighbouring rings.
+    """Return the points of a polar grid on a disk, whose rings have equal areas between them.
 
     Args:
         radius: Radius of the disk, mm.

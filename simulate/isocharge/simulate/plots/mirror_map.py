@@ -1,4 +1,4 @@
-"""Picture of the mirror region of a sensor on the whole film."""
+"""Picture that shows the mirror region of a sensor on the whole film."""
 
 from typing import Any
 
@@ -12,14 +12,17 @@ from isocharge.simulate.sensor.sensor import Sensor
 
 
 def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
-    """Draw the mirror region on the film, and its share as a function of the distance from the centre.
+    """Draw the mirror region of a sensor.
+
+    A map shows which share of the presses at each position cannot be noticed. A diagram shows this share as a function
+    of the distance from the centre.
 
     Args:
-        sensor: The sensor.
+        sensor: Sensor whose mirror region is drawn.
         mirror: Mirror region of the sensor.
 
     Returns:
-        A figure with two axes.
+        Figure with the map and the diagram.
     """
     figure = new_figure(13.0, 5.8)
     film_axes, distance_axes = figure.subplots(1, 2)
@@ -37,23 +40,25 @@ def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
 
 
 def _draw_region(axes: Any, sensor: Sensor, mirror: MirrorRegion) -> Any:
-    """Draw the shares as colours. The clamp, the working area and the electrodes are drawn to scale.
+    """Draw a map of the share of presses that cannot be noticed, with the clamp, the working area and the electrodes.
 
     Args:
         axes: Axes of matplotlib.
-        sensor: The sensor.
+        sensor: Sensor whose mirror region is drawn.
         mirror: Mirror region of the sensor.
 
     Returns:
-        The coloured cells, for which a colour bar can be drawn.
+        The coloured cells of the map, for which a colour bar can be drawn.
     """
-    # Corners of the cells, shape (n_ring + 1, n_sector + 1)
+    # Compute the corners of the cells, shape (n_ring + 1, n_sector + 1). A cell is the part of a ring in one sector.
     n_ring, n_sector = mirror.share.shape
     edge_radius = np.linspace(mirror.inner, mirror.outer, n_ring + 1)
     edge_angle = 2.0 * np.pi * np.arange(n_sector + 1) / n_sector
     corner_x = np.outer(edge_radius, np.cos(edge_angle))
     corner_y = np.outer(edge_radius, np.sin(edge_angle))
     shades = axes.pcolormesh(corner_x, corner_y, mirror.share, vmin=0.0, vmax=1.0, cmap="Reds")
+
+    # Draw the clamp, the working area and the electrodes.
     film_radius = sensor.film.radius
     draw_circle(axes, film_radius, color=INK, lw=2.0)
     draw_circle(axes, mirror.inner, color=INK, ls="--", lw=1.6)
@@ -65,7 +70,7 @@ def _draw_region(axes: Any, sensor: Sensor, mirror: MirrorRegion) -> Any:
 
 
 def _draw_distance(axes: Any, mirror: MirrorRegion) -> None:
-    """Draw the mean share of each ring against its distance from the centre.
+    """Draw the share of presses that cannot be noticed as a function of their distance from the centre.
 
     Args:
         axes: Axes of matplotlib.

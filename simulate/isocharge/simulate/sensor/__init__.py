@@ -1,1 +1,1 @@
-"""Description of a sensor and of probes: film, electrodes, probe shapes, and the reader of sensor files."""
+"""Description of sensors and probes, and the reader and writer of sensor files."""

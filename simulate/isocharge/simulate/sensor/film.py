@@ -8,55 +8,64 @@ from isocharge.common.errors import SensorError
 from isocharge.simulate.sensor.size_check import check_length, check_stress
 
 Surface = Literal["middle", "top", "bottom"]
-"""Surface in the thickness of the film at which the stress is read. The probe touches the top."""
+"""Surface at which the stress of the film is read. The top is the surface that the probe touches."""
 
 MIN_RADIUS = 1.0
-"""Smallest radius of a film, mm. Smaller values are probably in metres."""
+"""Smallest accepted radius of a film, mm. A smaller value was probably given in metres."""
 
 MIN_THICKNESS = 1e-4
-"""Smallest thickness of a film, mm. Smaller values are probably in metres."""
+"""Smallest accepted thickness of a film, mm. A smaller value was probably given in metres."""
 
 MAX_PIEZO = 1e5
-"""Largest piezoelectric or pyroelectric coefficient, pC/N or pC/(mm^2 K).
+"""Largest accepted piezoelectric or pyroelectric coefficient, pC/N or pC/(mm^2 K).
 
-It is thirty times the coefficient of the strongest crystals.
+This value is thirty times the coefficient of the strongest crystals.
 """
 
 MIN_PIEZO = 1e-3
-"""Smallest coefficient d31, d32, d33 or d12 other than zero, pC/N. Smaller values are probably in C/N."""
+"""Smallest accepted magnitude of a coefficient d31, d32, d33 or d12 that is not zero, pC/N.
+
+A smaller value was probably given in C/N.
+"""
 
 MIN_YOUNG = 1e-6
-"""Smallest Young's modulus of a film, MPa."""
+"""Smallest accepted Young's modulus of a film, MPa."""
 
 MAX_YOUNG = 1e7
-"""Largest Young's modulus of a film, MPa. Larger values are probably in Pa."""
+"""Largest accepted Young's modulus of a film, MPa. A larger value was probably given in Pa."""
 
 MAX_PRETENSION = 1e4
-"""Largest pretension of a film, MPa. Larger values are probably in Pa."""
+"""Largest accepted pretension of a film, MPa. A larger value was probably given in Pa."""
 
 MAX_SLACK = 10.0
-"""Largest magnitude of a negative pretension, MPa. A slack film wrinkles under small forces."""
+"""Largest accepted magnitude of a negative pretension, MPa. A slack film wrinkles under small forces."""
 
 MAX_YOUNG_RATIO = 10.0
-"""Largest ratio E1 / E2 for which the solver has been tested, dimensionless."""
+"""Largest ratio E1 / E2 of Young's moduli for which the solver has been tested, dimensionless."""
 
 MAX_OVAL = 0.1
 """Largest parameter e of an oval clamp for which the mesh has been tested, dimensionless."""
 
 MAX_EXPANSION = 1e-3
-"""Largest size of a thermal expansion coefficient, 1/K. Larger values are probably in ppm/K."""
+"""Largest accepted magnitude of a thermal expansion coefficient, 1/K. A larger value was probably given in ppm/K."""
 
 ALUMINIUM_EXPANSION = 23e-6
-"""Thermal expansion coefficient of aluminium, of which most rings are made, 1/K."""
+"""Thermal expansion coefficient of aluminium, 1/K. Most rings are made of aluminium."""
 
 MIN_BACK_VOLUME = 1.0
-"""Smallest volume behind a film, mm^3. Smaller values are probably in m^3."""
+"""Smallest accepted volume of the cavity behind a film, mm^3. A smaller value was probably given in m^3."""
 
 MAX_STATIC_PRESSURE = 0.01
-"""Largest size of a static pressure, MPa. A film of 25 um bulges by several millimetres under such a pressure."""
+"""Largest accepted magnitude of a static pressure, MPa.
+
+A film of 25 um bulges by several millimetres under such a pressure.
+"""
 
 MAX_COAT_STIFFNESS = 5.0
-"""Largest ratio of the stiffness of a coat to that of the film. The bending of a stiffer coat cannot be neglected."""
+"""Largest accepted ratio of the stiffness of a coat to the stiffness of the film, dimensionless.
+
+The bending stiffness of a stiffer coat could not be neglected.
+"""
 
 
 @dataclass(frozen=True)
@@ -66,9 +75,10 @@ class Coat:
     The coat is isotropic, has the same Poisson's ratio as the film, and has no pretension.
 
     Attributes:
-        stiffness: Young's modulus times thickness of one layer, N/mm.
-        layers: Areas with at least one layer and, if there are any, areas with two layers (one on each side). Each area
-            is a tuple of convex polygons that do not overlap, with anticlockwise corners (x, y) on the real film, mm.
+        stiffness: Young's modulus of the coat times the thickness of one layer, N/mm.
+        layers: The area that at least one layer covers, followed by the area that two layers cover (one on each side of
+            the film) if there is such an area. Each area is a tuple of convex polygons that do not overlap. A polygon
+            is a tuple of its corners (x, y) on the real film, anticlockwise, mm.
     """
 
     stiffness: float
@@ -77,31 +87,33 @@ class Coat:
     def __repr__(self) -> str:
         """Return a short text with the stiffness and the number of polygons.
 
-        The corners are omitted, because there are many.
+        The text does not list the corners, because there may be many corners.
         """
         return f"Coat({self.stiffness:.4g} N/mm, {len(self.layers[0])} parts)"
 
 
 @dataclass(frozen=True)
 class Film:
-    """A film that is clamped along its edge.
+    """Mechanical properties of a film that is clamped along its edge.
 
     Attributes:
         radius: Radius of the clamped edge, mm.
-        thickness: Thickness, mm.
-        young: Young's modulus, MPa; sqrt(E1 E2) of an orthotropic film.
-        poisson: Poisson's ratio, 0 <= poisson < 0.5; sqrt(nu12 nu21) of an orthotropic film.
-        pretension: Uniform second Piola-Kirchhoff stress without load, mean of T11 and T22, MPa, tension positive.
-        deviator: (T11 - T22) / 2 and T12 of a pretension that depends on the direction, MPa.
-        young_ratio: Ratio E1 / E2 of an orthotropic film, dimensionless.
+        thickness: Thickness of the film, mm.
+        young: Young's modulus, MPa. For an orthotropic film, this is sqrt(E1 E2).
+        poisson: Poisson's ratio, from 0 to less than 0.5, dimensionless. For an orthotropic film, this is
+            sqrt(nu12 nu21).
+        pretension: Stress of the unloaded film, MPa, tension positive. It is the second Piola-Kirchhoff stress, and the
+            mean of its components T11 and T22.
+        deviator: Half difference (T11 - T22) / 2 and shear T12 of a pretension that depends on the direction, MPa.
+        young_ratio: Ratio E1 / E2 of Young's moduli of an orthotropic film, dimensionless.
         shear: Shear modulus G12 of an orthotropic film, MPa; None for young / (2 (1 + poisson)).
-        axis: Angle of axis 1 of an orthotropic film from x, anticlockwise, rad.
+        axis: Angle of axis 1 of an orthotropic film from the x axis, anticlockwise, rad.
         oval: Parameter e of an oval clamp, whose semi-axes are radius * (1 + e) and radius * (1 - e), dimensionless.
-        oval_axis: Angle of the longer semi-axis from x, anticlockwise, rad.
+        oval_axis: Angle of the longer semi-axis of an oval clamp from the x axis, anticlockwise, rad.
         coat: Coat that stiffens parts of the film; None if there is no coat.
         back_volume: Volume of the closed cavity behind the film, mm^3; None if the back is vented.
-        static_pressure: Pressure on the film without contact, MPa, positive in the direction of the push. With a closed
-            cavity, this is the pressure on the flat film.
+        static_pressure: Constant pressure on the film, MPa, positive in the direction of the push. With a closed
+            cavity, this is the pressure on the film if it is flat.
         expansion: Thermal expansion coefficients of the film along its axes 1 and 2, 1/K; None if the temperature does
             not change the pretension.
         ring_expansion: Thermal expansion coefficient of the ring, 1/K.
@@ -134,7 +146,7 @@ class Film:
 
     @property
     def has_back_pressure(self) -> bool:
-        """Whether a pressure acts on the whole film, with or without contact."""
+        """Whether the film has a closed back or a static pressure, so that a pressure acts on the whole film."""
         return self.back_volume is not None or self.static_pressure != 0.0
 
     @property
@@ -144,20 +156,20 @@ class Film:
 
     @property
     def asymmetries(self) -> dict[str, object]:
-        """Names and values of the attributes because of which the film is not axisymmetric."""
+        """Names and values of the attributes that make the film differ from an axisymmetric film."""
         names = ("deviator", "young_ratio", "shear", "axis", "oval", "oval_axis", "coat")
         return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(Film, name)}
 
     @property
     def is_axisymmetric(self) -> bool:
-        """Whether a rotation of the film about its centre changes nothing."""
+        """Whether a rotation of the film about its centre does not change the properties of the film."""
         return not self.is_anisotropic and self.oval == 0.0 and self.coat is None
 
     def __post_init__(self) -> None:
         """Check the properties of the film.
 
         Raises:
-            SensorError: If a property is outside the range for which the solver was tested.
+            SensorError: If a property is outside its accepted range.
         """
         check_length("film radius", self.radius, MIN_RADIUS, SensorError)
         check_length("film thickness", self.thickness, MIN_THICKNESS, SensorError)
@@ -166,7 +178,7 @@ class Film:
         if not 0.0 <= self.poisson < 0.5:
             raise SensorError(f"film poisson: expected 0 <= poisson < 0.5, got {self.poisson}")
 
-        # Coat, and properties that depend on the direction
+        # Check the coat, and the properties that depend on the direction.
         max_stiffness = MAX_COAT_STIFFNESS * self.young * self.thickness
         if self.coat is not None and not 0.0 < self.coat.stiffness <= max_stiffness:
             raise SensorError(
@@ -185,7 +197,7 @@ class Film:
         if not abs(self.oval) <= MAX_OVAL:
             raise SensorError(f"film oval: expected a share up to {MAX_OVAL:g}, got {self.oval}")
 
-        # Temperature, pressure on the back, and shape
+        # Check the thermal expansion, the pressure on the back, and the shape.
         for expansion in (*(self.expansion or ()), self.ring_expansion):
             if not abs(expansion) <= MAX_EXPANSION:
                 raise SensorError(
@@ -215,18 +227,19 @@ class Film:
 class Piezo:
     """Piezoelectric strain coefficients and pyroelectric coefficient of a film.
 
-    With d31 > 0, a tension along x causes a positive charge. In PVDF, a decrease of the thickness increases the charge,
-    and an increase of the thickness decreases the charge. With d31 = 20 pC/N, PVDF therefore has d33 = -33 pC/N and
-    pyro = -30 pC/(mm^2 K), because warming increases the thickness (Kepler and Anderson 1978). Data sheets often omit
-    these signs. If the wires of a film are exchanged, all signs change.
+    If d31 is positive, a tension along x causes a positive charge. In PVDF, a decrease of the thickness increases the
+    charge, and an increase of the thickness decreases the charge. Tension along x makes the film thinner, and warming
+    makes the film thicker. PVDF with d31 = 20 pC/N therefore has the negative coefficients d33 = -33 pC/N and
+    pyro = -30 pC/(mm^2 K) (Kepler and Anderson 1978). Data sheets often omit the signs of the coefficients. If the two
+    wires of a film are exchanged, all coefficients change their signs.
 
     Attributes:
-        d31: Charge per force of tension along x, pC/N.
-        d32: Charge per force of tension along y, pC/N.
-        d33: Charge per force of tension through the thickness, pC/N.
-        d12: Coefficient of the shear stress, pC/N: the charge density is 2 d12 s12. If the piezoelectric axes are
+        d31: Charge density per tensile stress along x, pC/N.
+        d32: Charge density per tensile stress along y, pC/N.
+        d33: Charge density per tensile stress through the thickness, pC/N.
+        d12: Coefficient of the shear stress s12, pC/N. The charge density is 2 d12 s12. If the piezoelectric axes are
             rotated by an angle, d12 is (d31 - d32) / 2 times the sine of twice this angle.
-        pyro: Charge per area and temperature of a film that is free to expand, pC/(mm^2 K).
+        pyro: Charge density per change of the temperature of a film that is free to expand, pC/(mm^2 K).
     """
 
     d31: float
@@ -239,7 +252,7 @@ class Piezo:
         """Check the coefficients.
 
         Raises:
-            SensorError: If a coefficient is too large or too small for the unit pC/N, or if the film has no charge.
+            SensorError: If a coefficient is outside its accepted range, or if d31, d32 and d12 are all zero.
         """
         for name, coefficient in vars(self).items():
             if not abs(coefficient) <= MAX_PIEZO:

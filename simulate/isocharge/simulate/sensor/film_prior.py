@@ -1,13 +1,14 @@
-"""The unknown parameters of a real film, and their prior distribution.
+"""Unknown parameters of a real film, and the prior distribution of these parameters.
 
-The prior distribution is centred on the description in a sensor file. Before anything is measured, the properties of
-the film, its coefficients and the gains are uncertain by a few percent, and the positions of the electrodes by tenths
-of a millimetre. The pretension is almost unknown. Calibrations start from this prior distribution. Virtual films and
-the films with which networks for all films are trained are drawn from the same distribution.
+The prior distribution is centred on the film that a sensor file describes. Before any measurement, the properties of
+the film, the piezoelectric coefficients and the gains are known only to within some percent. The positions of the
+electrodes are known to within tenths of a millimetre, and the pretension is almost unknown. Calibrations start from
+this prior distribution. Virtual films are drawn from the same distribution, and so are the films with which networks
+for all films are trained.
 
-`PARAMETERS` declares each parameter that all films have. The parameter vector also contains one gain for each
-electrode. Each parameter is a deviation from the sensor file, so it is zero for the described film. Only the parameter
-of the pretension is the pretension itself.
+`PARAMETERS` declares the parameters that every film has. The parameter vector also contains one gain for each
+electrode. Each parameter except the pretension is a deviation from the sensor file, so it is zero for the described
+film. The parameter of the pretension is the pretension itself.
 """
 
 from collections.abc import Mapping
@@ -23,24 +24,26 @@ from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
 
 MAX_DEVIATION = 2.5
-"""Largest deviation of a parameter other than the pretension, in standard deviations."""
+"""Largest allowed deviation of a parameter from its mean, in standard deviations. The pretension has other bounds."""
 
 MAX_PRETENSION_FACTOR = 4.0 / 3.0
-"""Ratio of the largest pretension that a calibration may find to the largest pretension of the prior distribution."""
+"""Largest pretension that a calibration may find, divided by the largest pretension of the prior distribution."""
 
 MIN_PROBE_RADIUS_FACTOR = 0.5
-"""Ratio of the smallest probe radius that a calibration may find to the described radius."""
+"""Smallest probe radius that a calibration may find, divided by the described radius, dimensionless."""
 
 MAX_PROBE_RADIUS_FACTOR = 1.5
-"""Ratio of the largest probe radius that a calibration may find to the described radius."""
+"""Largest probe radius that a calibration may find, divided by the described radius, dimensionless."""
 
 MAX_SHOWN_CENTRES = 8
-"""Number of electrodes whose centres an error message shows."""
+"""Largest number of electrodes whose centres an error message lists."""
 
 
 @dataclass(frozen=True)
 class FilmSpread:
-    """Widths of the prior distribution: the largest pretension, and the standard deviations of all other parameters.
+    """Widths of the prior distribution of the parameters of a film.
+
+    The width of the pretension is its largest value. The widths of all other parameters are standard deviations.
 
     Attributes:
         pretension: Largest pretension, MPa. All values from zero to the largest pretension are equally likely.
@@ -72,7 +75,10 @@ class FilmSpread:
 
 
 Components = Mapping[str, Any]
-"""Objects that the parameters change, by name: `film`, `piezo` and `calibration` of a sensor, and `probe`."""
+"""Objects whose attributes the parameters change, by name.
+
+The objects are the `film`, the `piezo` and the `calibration` of a sensor, and the `probe`.
+"""
 
 
 @dataclass(frozen=True)
@@ -82,15 +88,15 @@ class FilmParameter:
     Attributes:
         name: Name of the parameter.
         unit: Unit of the parameter.
-        component: Name of the object in `Components` that the parameter changes.
-        attribute: Name of the attribute of this object.
-        form: "logarithm" for ln(value / described value), "difference" for value - described value, "value" for the
-            value itself.
-        spread: Name of the field of `FilmSpread` that contains the standard deviation.
-        derivative: Method for the derivative of the charges: "difference" of two films, or "scaling" with the
-            dimensionless groups.
-        item: Index or key of the value if the attribute is a tuple or a mapping.
-        file_factor: Factor that converts the unit of the parameter into the unit in files of calibrations (Pa or m).
+        component: Name of the object in `Components` whose attribute the parameter changes.
+        attribute: Name of the attribute that contains the physical value, such as `young`.
+        form: Relation between the parameter and the physical value: "logarithm" for ln(value / described value),
+            "difference" for value - described value, "value" for the value itself.
+        spread: Name of the field of `FilmSpread` that contains the width of the prior distribution.
+        derivative: Method by which the derivative of the charges is computed: "difference" between two films, or
+            "scaling" with the dimensionless groups.
+        item: Index or key of the physical value if the attribute is a tuple or a mapping; None if it is a number.
+        file_factor: Factor that converts the unit of the parameter into the unit in calibration files (Pa or m).
     """
 
     name: str
@@ -104,37 +110,41 @@ class FilmParameter:
     file_factor: float = 1.0
 
     def mean(self, prior: "FilmPrior") -> float:
-        """Return the mean of the prior distribution."""
+        """Return the mean of the prior distribution of the parameter, which is zero for the described film.
+
+        Args:
+            prior: Prior distribution. Only subclasses use it.
+        """
         del prior
         return 0.0
 
     def std(self, prior: "FilmPrior") -> float:
-        """Return the standard deviation of the prior distribution."""
+        """Return the standard deviation of the parameter in a prior distribution."""
         return float(getattr(prior.spread, self.spread))
 
     def bounds(self, prior: "FilmPrior") -> tuple[float, float]:
-        """Return the smallest and the largest value that a film or a calibration may have."""
+        """Return the smallest and the largest value that the parameter of a film or a calibration may have."""
         max_deviation = MAX_DEVIATION * self.std(prior)
         return self.mean(prior) - max_deviation, self.mean(prior) + max_deviation
 
-    def described(self, components: Components) -> float:
-        """Return the physical value of the parameter for a sensor and a probe. A missing gain is 1.
+    def physical_value(self, components: Components) -> float:
+        """Return the physical value of the parameter of a sensor or a probe, such as Young's modulus.
 
         Args:
             components: Objects of the sensor, and the probe.
         """
         value = getattr(components[self.component], self.attribute)
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping):  # the gains by electrode; a gain that is missing is 1
             return float(value.get(self.item, 1.0))
         return float(value if self.item is None else value[self.item])
 
-    def changed(self, described: float, parameter: float, factor: float) -> float:
-        """Convert a parameter into the physical value, according to the form of the parameter.
+    def to_physical_value(self, described: float, parameter: float, factor: float) -> float:
+        """Convert the value of the parameter into a physical value, according to `form`.
 
         Args:
             described: Physical value of the described film.
             parameter: Value of the parameter.
-            factor: Exponential of the parameter, which the caller computes for all parameters together.
+            factor: Exponential of `parameter`, which the caller computes for all parameters at once.
 
         Returns:
             The physical value, in the unit of `described`.
@@ -145,18 +155,21 @@ class FilmParameter:
             return described + parameter
         return parameter
 
-    def from_values(self, value: float, described: float) -> float:
-        """Convert a physical value into the parameter. This is the inverse of `changed`.
+    def from_physical_value(self, value: float, described: float) -> float:
+        """Convert a physical value into the value of the parameter, according to `form`.
+
+        This method is the inverse of `to_physical_value`.
 
         Args:
-            value: Physical value of the film.
+            value: Physical value of a film.
             described: Physical value of the described film, in the same unit.
 
         Returns:
-            The parameter: ln(value / described), the difference, or the value itself, according to `form`.
+            The logarithm of the ratio of both values, their difference, or `value` itself.
 
         Raises:
-            ValueError: If the parameter is a logarithm and the values have different signs.
+            ValueError: If the parameter is a logarithm, and the values have different signs or only one of them is
+                zero.
         """
         if self.form == "logarithm":
             ratio = _ratio(value, described)
@@ -169,35 +182,43 @@ class FilmParameter:
 
 
 class PretensionParameter(FilmParameter):
-    """The pretension, which is uniformly distributed between zero and the largest pretension."""
+    """Declaration of the pretension, which is uniformly distributed between zero and the largest pretension."""
 
     def mean(self, prior: "FilmPrior") -> float:
-        """Return half of the largest pretension."""
+        """Return the mean of the pretension, which is half of the largest pretension, MPa."""
         return 0.5 * prior.spread.pretension
 
     def std(self, prior: "FilmPrior") -> float:
-        """Return the standard deviation of the pretension: the width of its range divided by the root of 12."""
+        """Return the standard deviation of the pretension, MPa.
+
+        The standard deviation of a uniform distribution is the width of its range divided by the square root of 12.
+        """
         return prior.spread.pretension / float(np.sqrt(12.0))
 
     def bounds(self, prior: "FilmPrior") -> tuple[float, float]:
-        """Return zero, and a value slightly larger than the largest pretension of the prior distribution."""
+        """Return the bounds of the pretension, MPa.
+
+        The lower bound is zero. The upper bound is `MAX_PRETENSION_FACTOR` times the largest pretension of the prior
+        distribution.
+        """
         return 0.0, MAX_PRETENSION_FACTOR * prior.spread.pretension
 
 
 class ProbeRadiusParameter(FilmParameter):
-    """The radius of the probe, which is bounded relative to the described radius."""
+    """Declaration of the radius of the probe, whose bounds are proportional to the described radius."""
 
     def std(self, prior: "FilmPrior") -> float:
-        """Return the standard deviation of the radius, mm, which is reduced for small probes."""
+        """Return the standard deviation of the radius, mm, which is at most 0.3 times the described radius."""
         return min(prior.spread.probe_radius, 0.3 * prior.probe.radius)
 
     def bounds(self, prior: "FilmPrior") -> tuple[float, float]:
-        """Return the bounds of the difference from the described radius.
+        """Return the bounds of the difference between the radius and the described radius, mm.
 
-        The radius is between `MIN_PROBE_RADIUS_FACTOR` and `MAX_PROBE_RADIUS_FACTOR` times the described radius.
+        The radius is at least `MIN_PROBE_RADIUS_FACTOR` and at most `MAX_PROBE_RADIUS_FACTOR` times the described
+        radius.
 
         Args:
-            prior: Distribution of the films, which contains the described probe.
+            prior: Prior distribution with the described probe.
         """
         lower, upper = super().bounds(prior)
         radius = prior.probe.radius
@@ -217,14 +238,18 @@ PARAMETERS = (
     FilmParameter("rotation", "rad", "calibration", "rotation", "difference", "rotation"),
     ProbeRadiusParameter("probe_radius", "mm", "probe", "radius", "difference", "probe_radius", file_factor=1e-3),
 )
-"""Parameters that every film has. One gain for each electrode follows them."""
+"""Parameters that every film has. In the parameter vector, the gains of the electrodes follow these parameters."""
 
 SHARED = tuple(parameter.name for parameter in PARAMETERS)
-"""Names of the parameters that every film has."""
+"""Names of the parameters that every film has, in the order of the parameter vector."""
 
 
 def gain_parameter(electrode: str) -> FilmParameter:
-    """Return the declaration of the gain of the electrode with this name."""
+    """Return the declaration of the gain of an electrode.
+
+    Args:
+        electrode: Name of the electrode.
+    """
     return FilmParameter(
         f"gain {electrode}", "1", "calibration", "gain", "logarithm", "gain", "scaling", item=electrode
     )
@@ -232,11 +257,11 @@ def gain_parameter(electrode: str) -> FilmParameter:
 
 @dataclass(frozen=True)
 class FilmPrior:
-    """Prior distribution of the film of a described sensor, and of the radius of the probe.
+    """Prior distribution of the parameters of a real sensor, and of the radius of the probe.
 
     Attributes:
-        sensor: The sensor as described.
-        probe: The probe as described. It is circular, because its radius is one of the parameters.
+        sensor: Sensor as described by its file, on which the distribution is centred.
+        probe: Described probe. It is circular, because its radius is one of the parameters.
         spread: Widths of the prior distribution.
     """
 
@@ -245,13 +270,14 @@ class FilmPrior:
     spread: FilmSpread = FilmSpread()
 
     def __post_init__(self) -> None:
-        """Check that the electrodes of all films of the distribution lie on the film.
+        """Check that the electrodes lie within the rim for every film of the distribution.
 
         Raises:
-            SensorError: If an electrode may lie over the rim.
+            SensorError: If an electrode may lie over the rim of a film.
         """
+        # The largest shift is the largest deviation along x combined with the largest deviation along y.
         sensor = self.sensor
-        max_shift = float(np.hypot(MAX_DEVIATION, MAX_DEVIATION)) * self.spread.shift  # along x and y together
+        max_shift = float(np.hypot(MAX_DEVIATION, MAX_DEVIATION)) * self.spread.shift
         for electrode in sensor.electrodes:
             corners = sensor.calibration.place(np.concatenate(electrode.parts))
             farthest = np.linalg.norm(corners, axis=1).max()
@@ -273,7 +299,7 @@ class FilmPrior:
         return tuple(parameter.name for parameter in self.parameters)
 
     def index(self, name: str) -> int:
-        """Return the index of a parameter in the parameter vector."""
+        """Return the index of the parameter with the given name in the parameter vector."""
         return self.names.index(name)
 
     @cached_property
@@ -285,7 +311,8 @@ class FilmPrior:
     def mean(self) -> Array:
         """Means of the parameters, shape (n_parameter,).
 
-        These are the parameters of the described film with half of the largest pretension.
+        Except for the pretension, the means are the parameters of the described film. The mean of the pretension is
+        half of the largest pretension.
         """
         return np.array([parameter.mean(self) for parameter in self.parameters])
 
@@ -296,7 +323,7 @@ class FilmPrior:
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Smallest and largest values of the parameters of a film or a calibration, each of shape (n_parameter,)."""
+        """Smallest and largest allowed values of the parameters, each of shape (n_parameter,)."""
         low, high = np.array([parameter.bounds(self) for parameter in self.parameters]).T
         return low, high
 
@@ -307,26 +334,31 @@ class FilmPrior:
 
     @cached_property
     def _components(self) -> Components:
-        """The objects of the described sensor and probe that the parameters change."""
+        """Objects of the described sensor, and the described probe, whose attributes the parameters change."""
         return _components_of(self.sensor, self.probe)
 
     @property
     def described(self) -> Array:
-        """Parameters of the film exactly as described, including its pretension, shape (n_parameter,)."""
+        """Parameters of the film exactly as the sensor file describes it, shape (n_parameter,).
+
+        In contrast to `mean`, the pretension is that of the sensor file.
+        """
         return self.parameters_of(self.sensor, self.probe)
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Draw films from the prior distribution. Values outside the bounds are drawn again.
+        """Draw the parameters of films from the prior distribution.
+
+        Values outside the bounds are drawn again.
 
         Args:
             rng: Random number generator.
             count: Number of films.
 
         Returns:
-            Parameters, shape (count, n_parameter).
+            Parameters of each film, shape (count, n_parameter).
         """
-        # Draw all parameters from normal distributions, and repeat this for values outside the bounds. Each repetition
-        # draws an array of the full size, from which only the needed values are taken.
+        # Draw all parameters from normal distributions. Values outside the bounds are drawn again, until all values lie
+        # within the bounds. Each repetition draws a whole array, of which only the required values are used.
         lower_bounds, upper_bounds = self.bounds
         drawn = self.mean + self.std * rng.standard_normal((count, len(self.names)))
         is_outside = (drawn < lower_bounds) | (drawn > upper_bounds)
@@ -335,7 +367,7 @@ class FilmPrior:
             drawn = np.where(is_outside, replacement, drawn)
             is_outside = (drawn < lower_bounds) | (drawn > upper_bounds)
 
-        # The pretension is distributed uniformly, so the values that were drawn for it above are replaced.
+        # The pretension is distributed uniformly, so its values from the normal distribution are replaced.
         drawn[:, self.index("pretension")] = self.spread.pretension * rng.random(count)
         return drawn
 
@@ -346,25 +378,26 @@ class FilmPrior:
             parameters: Parameters, shape (n_parameter,).
 
         Returns:
-            The sensor, and the probe with its radius.
+            The described sensor and the described probe, with the changes that the parameters state.
 
         Raises:
-            SensorError: If no such sensor can exist, because electrodes lie off the film or the pretension is invalid.
+            SensorError: If no such sensor can exist, for example because an electrode lies over the rim.
         """
-        # Changed attributes of each component. The changes of tuples and mappings are collected by index or key.
+        # Collect the changed attributes of each component. If an attribute is a tuple or a mapping, collect its changed
+        # items by index or key.
         changes: dict[str, dict[str, Any]] = {component: {} for component in self._components}
         factors = np.exp(parameters)
         for declaration, described, parameter, factor in zip(
             self.parameters, self._described_values, parameters.tolist(), factors.tolist(), strict=True
         ):
-            value = declaration.changed(described, parameter, factor)
+            value = declaration.to_physical_value(described, parameter, factor)
             attributes = changes[declaration.component]
             if declaration.item is None:
                 attributes[declaration.attribute] = value
             else:
                 attributes.setdefault(declaration.attribute, {})[declaration.item] = value
 
-        # The shift is collected by index, 0 for x and 1 for y. The calibration needs a tuple.
+        # The items of the shift were collected by index (0 for x, 1 for y). The calibration requires a tuple.
         calibration = changes["calibration"]
         shift = calibration["shift"]
         calibration["shift"] = (shift[0], shift[1])
@@ -379,20 +412,23 @@ class FilmPrior:
     @cached_property
     def _described_values(self) -> tuple[float, ...]:
         """Physical values of the described sensor and probe, in the order of the parameter vector."""
-        return tuple(parameter.described(self._components) for parameter in self.parameters)
+        return tuple(parameter.physical_value(self._components) for parameter in self.parameters)
 
     def parameters_of(self, sensor: Sensor, probe: Circle) -> Array:
-        """Return the parameter vector of a sensor and a probe. This is the inverse of `film`.
+        """Return the parameter vector of a sensor and a probe.
+
+        This method is the inverse of `film`.
 
         Args:
-            sensor: Sensor that differs from the described sensor in the values of the parameters only.
-            probe: Probe that differs from the described probe in its radius only.
+            sensor: Sensor that may differ from the described sensor only in the values of the parameters.
+            probe: Probe that may differ from the described probe only in its radius.
 
         Returns:
             Parameters, shape (n_parameter,).
 
         Raises:
-            SensorError: If the sensor differs in other properties, such as the electrodes, the radius or the readout.
+            SensorError: If the sensor differs from the described sensor in other properties, such as the electrodes, or
+                if the sign of d31 or d32 differs.
         """
         described = self.sensor
         if _rounded_corners(sensor) != _rounded_corners(described):
@@ -400,7 +436,8 @@ class FilmPrior:
                 f"{sensor.name}: expected the electrodes of {described.name} ({_centres(described)}), got others "
                 f"({_centres(sensor)})"
             )
-        for what, value, expected in (  # properties that are not parameters must be equal
+        # All other properties that are not parameters must be equal, too.
+        for what, value, expected in (
             ("readout", (sensor.readout, sensor.surface), (described.readout, described.surface)),
             ("film radius (mm)", round(sensor.film.radius, 6), round(described.film.radius, 6)),
             ("film poisson", round(sensor.film.poisson, 9), round(described.film.poisson, 9)),
@@ -414,11 +451,11 @@ class FilmPrior:
             if value != expected:
                 raise SensorError(f"{sensor.name}: {what}: expected those of {described.name}, {expected}, got {value}")
 
-        # A logarithm raises a ValueError if the signs differ, which is possible for d31 and d32 only.
+        # Only d31 and d32 may have different signs. Their logarithm does not exist then, which is a ValueError.
         components = _components_of(sensor, probe)
         try:
             values = [
-                parameter.from_values(parameter.described(components), described_value)
+                parameter.from_physical_value(parameter.physical_value(components), described_value)
                 for parameter, described_value in zip(self.parameters, self._described_values, strict=True)
             ]
         except ValueError as error:
@@ -429,12 +466,12 @@ class FilmPrior:
 
 
 def _components_of(sensor: Sensor, probe: Circle) -> Components:
-    """Return the objects of a sensor and a probe that the parameters change."""
+    """Return the objects of a sensor, and the probe, whose attributes the parameters change."""
     return {"film": sensor.film, "piezo": sensor.piezo, "calibration": sensor.calibration, "probe": probe}
 
 
 def _rounded_corners(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
-    """Return the corners (mm) of the parts of each electrode, rounded to a nanometre."""
+    """Return the corners of the parts of each electrode by the name of the electrode, mm, rounded to a nanometre."""
     return {
         electrode.name: [(round(x, 6), round(y, 6)) for part in electrode.parts for x, y in part]
         for electrode in sensor.electrodes
@@ -442,7 +479,7 @@ def _rounded_corners(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
 
 
 def _centres(sensor: Sensor) -> str:
-    """List the centres of the first `MAX_SHOWN_CENTRES` electrodes for an error message."""
+    """Return a text that lists the centres of at most `MAX_SHOWN_CENTRES` electrodes, for an error message."""
     centres = []
     for electrode in sensor.electrodes[:MAX_SHOWN_CENTRES]:
         x, y = electrode.centre
@@ -454,22 +491,25 @@ def _centres(sensor: Sensor) -> str:
 
 
 def _ratio(value: float, described: float) -> float:
-    """Return value / described; 1 if both are zero, and 0 if only the described value is zero."""
+    """Return the ratio of a value to the described value.
+
+    If both values are zero, the ratio is 1. If only the described value is zero, the ratio is 0.
+    """
     if described != 0.0:
         return value / described
     return 1.0 if value == 0.0 else 0.0
 
 
 def virtual_film(sensor: Sensor, probe: Circle, seed: int) -> tuple[Sensor, Circle]:
-    """Draw a film from the prior distribution of a sensor and a probe.
+    """Draw a random film from the prior distribution of a described sensor and a described probe.
 
     Args:
-        sensor: The sensor as described.
-        probe: The probe as described.
+        sensor: Described sensor.
+        probe: Described probe.
         seed: Seed of the random number generator.
 
     Returns:
-        The drawn sensor, and the drawn probe.
+        Sensor with the drawn film, gains and electrode positions. Probe with the drawn radius.
     """
     prior = FilmPrior(sensor, probe)
     return prior.film(prior.draw(np.random.default_rng(seed), 1)[0])

@@ -1,4 +1,4 @@
-"""The probe shapes, and their notation on the command line and in files.
+"""List of all probe shapes, and a parser for the notation of probes on the command line and in files.
 
 Examples of the notation:
 
@@ -28,32 +28,29 @@ PROBE_SHAPES: tuple[type[Probe], ...] = (
     Ellipse,
     Finger,
 )
-"""All probe shapes. The parser, the help text and the error messages list these."""
+"""All probe shapes. The parser, the help text and the error messages are derived from this list."""
 
 NOTATIONS: tuple[ProbeNotation, ...] = tuple(notation for shape in PROBE_SHAPES for notation in shape.notations)
 """Notations of all probe shapes."""
 
 
-def _listed(forms: list[str]) -> str:
-    """Join the forms of several notations to a text such as "a, b or c"."""
+def _join_with_or(forms: list[str]) -> str:
+    """Join several texts into one text such as "a, b or c"."""
     return f"{', '.join(forms[:-1])} or {forms[-1]}"
 
 
 PROBE_HELP = (
-    f"Footprint, mm: {_listed([notation.form for notation in NOTATIONS])}; @DEGREES at the end rotates the footprint "
-    "anticlockwise."
+    f"Footprint, mm: {_join_with_or([notation.form for notation in NOTATIONS])}; @DEGREES at the end rotates the "
+    "footprint anticlockwise."
 )
-"""Help text of command-line options that take the notation of a probe."""
+"""Help text of command-line options whose value is the notation of a probe."""
 
 
 def parse_probe(text: str) -> Probe:
-    """Convert the notation of a probe into the probe.
+    """Create the probe that a notation describes.
 
     Args:
         text: Notation such as "rectangle:4.0x2.0@30"; see the docstring of this module.
-
-    Returns:
-        The probe.
 
     Raises:
         SceneError: If the text is not the notation of a probe, or no such footprint can exist.
@@ -64,6 +61,6 @@ def parse_probe(text: str) -> Probe:
             return probe
     forms = [f"'{notation.form}'" for notation in NOTATIONS]
     raise SceneError(
-        f"probe {cut(text)!r}: expected {_listed(forms)} in mm, each optionally rotated as in 'triangle:4.0@30' "
+        f"probe {cut(text)!r}: expected {_join_with_or(forms)} in mm, each optionally rotated as in 'triangle:4.0@30' "
         "(degrees)"
     )

@@ -1,8 +1,8 @@
-"""Description of a sensor: film, piezoelectric coefficients, electrodes, readout and calibration.
+"""Description of a sensor, which consists of a film with electrodes, their readout and their calibration.
 
-The origin of the coordinates is the centre of the film. The x axis is the drawn direction (1), the y axis is the
-transverse direction (2), and both are seen from the side of the probe. Force and deflection are positive in the
-direction of the push. Units are mm, N, MPa and pC.
+The origin of the coordinates is the centre of the film. The x axis is the drawn direction (1) of the film, and the y
+axis is the transverse direction (2). The film is seen from the side of the probe. Force and deflection are positive in
+the direction of the push. The units are mm, N, MPa and pC.
 """
 
 from dataclasses import dataclass, field, replace
@@ -21,32 +21,35 @@ from isocharge.simulate.sensor.film import Coat, Film, Piezo, Surface
 from isocharge.simulate.sensor.size_check import check_length
 
 Readout = Literal["area", "edge"]
-"""Mean of the stress over the area of an electrode, or over its edges (Mirbagheri et al. 2007, eq. 2 and 3)."""
+"""Part of an electrode over which the stress is averaged: the area or the edges (Mirbagheri et al. 2007, eq. 2, 3)."""
 
 Role = Literal["position", "guard"]
-"""Purpose of an electrode: to determine the contact, or to distinguish presses outside the working area from presses
-inside it. Models use the charges of both in the same way."""
+"""Purpose of an electrode.
+
+An electrode with the role "position" determines the contact. An electrode with the role "guard" distinguishes presses
+outside the working area from presses inside it. Models use the charges of both kinds in the same way.
+"""
 
 MAX_CORNERS = 256
 """Largest number of corners of a polygon."""
 
 MAX_ELECTRODE_CORNERS = 2048
-"""Largest number of corners of all polygons of an electrode.
+"""Largest number of corners of all polygons of an electrode together.
 
 The number is limited because all pairs of edges are searched for intersections.
 """
 
 MIN_EXTENT = 0.02
-"""Smallest accepted value of the larger extent of an electrode along x and y, mm.
+"""Smallest accepted size of an electrode, mm. The size is the larger one of its extents along x and along y.
 
-Smaller values are probably in metres.
+A smaller value was probably given in metres.
 """
 
 MAX_PART_SIDE = 3.0
-"""Longest side of the parts of an electrode that is not convex, mm."""
+"""Largest side of the quadrilaterals and triangles into which an electrode that is not convex is divided, mm."""
 
 MAX_CROSSTALK = 0.2
-"""Largest accepted crosstalk, dimensionless."""
+"""Largest accepted magnitude of the crosstalk, dimensionless."""
 
 MAX_NAME_LENGTH = 100
 """Largest number of characters of the name of an electrode."""
@@ -56,26 +59,32 @@ RESERVED_NAMES = (
     *("film_temperature_C",),
     *("probe", "orientation_deg", "t_us", "t_ms", "t_s", "seq"),
 )
-"""Names that an electrode cannot have: keys of the sensor file, columns of presses and fields of a frame."""
+"""Names that an electrode cannot have, because they have another meaning in a file or a frame.
+
+They are keys of the sensor file, columns of tables of presses, and fields of a frame.
+"""
 
 MAX_ELECTRODES = 64
-"""Largest number of electrodes on a film. The number is limited because each electrode is compared with all others."""
+"""Largest number of electrodes on a film.
+
+The number is limited because each electrode is compared with all other electrodes.
+"""
 
 
 Corners = tuple[tuple[float, float], ...]
-"""Corners (x, y) of a simple polygon, anticlockwise, mm. The polygon need not be convex."""
+"""Corners (x, y) of a polygon that does not cross itself, anticlockwise, mm. The polygon need not be convex."""
 
 
 @dataclass(frozen=True)
 class Electrode:
-    """A sensing element. It collects charge where its metal on the front overlaps its metal on the back.
+    """Electrode that collects charge where its metal on the front of the film overlaps its metal on the back.
 
     Attributes:
-        name: Name in the sensor file.
-        corners: Corners of the pad.
-        square: Whether `of_square` created the electrode. The edge readout accepts squares only.
-        more: Further metal on the front, such as traces. Overlapping areas count once.
-        back: Metal on the back. If empty, the back is completely covered with metal.
+        name: Name of the electrode in the sensor file.
+        corners: Corners of the pad, which is the first polygon of metal on the front.
+        square: Whether `of_square` created the electrode. The edge readout accepts only such electrodes.
+        more: Further polygons of metal on the front, such as traces. Overlapping areas count once.
+        back: Polygons of metal on the back. If there are none, the back is completely covered with metal.
         role: Purpose of the electrode.
     """
 
@@ -87,8 +96,9 @@ class Electrode:
     role: Role = "position"
 
     def __post_init__(self) -> None:
-        for polygons in ("corners", "more", "back"):
-            object.__setattr__(self, polygons, _as_tuples(getattr(self, polygons)))
+        """Convert the corners into nested tuples, which can be compared and hashed."""
+        for attribute in ("corners", "more", "back"):
+            object.__setattr__(self, attribute, _as_tuples(getattr(self, attribute)))  # the dataclass is frozen
 
     @classmethod
     def of_square(cls, name: str, centre: tuple[float, float], side: float) -> "Electrode":
@@ -96,22 +106,26 @@ class Electrode:
 
         Args:
             name: Name of the electrode.
-            centre: Centre (x, y), mm.
+            centre: Centre (x, y) of the square, mm.
             side: Length of the sides, mm.
 
         Returns:
-            The electrode, whose first corner is the lower left one.
+            The electrode, whose corners start at the lower left corner.
         """
         x, y = centre
-        half = 0.5 * side
-        corners = ((x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half))
+        half_side = 0.5 * side
+        left = x - half_side
+        right = x + half_side
+        bottom = y - half_side
+        top = y + half_side
+        corners = ((left, bottom), (right, bottom), (right, top), (left, top))
         return cls(name, corners, square=True)
 
     def with_trace(self, path: Corners, width: float) -> "Electrode":
-        """Return the electrode with an additional trace on the front.
+        """Return a copy of the electrode with an additional trace on the front.
 
         Args:
-            path: Points (x, y) of the centre line of the trace, mm.
+            path: Successive points (x, y) of the centre line of the trace, mm.
             width: Width of the trace, mm.
 
         Raises:
@@ -124,14 +138,15 @@ class Electrode:
 
     @property
     def front(self) -> tuple[Corners, ...]:
-        """All polygons of the metal on the front: the pad, and further metal."""
+        """All polygons of metal on the front: the pad, and further metal such as traces."""
         return (self.corners, *self.more)
 
     @cached_property
     def collecting_polygons(self) -> tuple[Array, ...]:
-        """The collecting area as polygons that do not overlap: one convex polygon, or several trapezoids.
+        """Polygons that do not overlap and together form the collecting area of the electrode.
 
-        Each polygon has the shape (n, 2), mm.
+        The collecting area consists of one convex polygon or of several trapezoids. The corners (x, y) of a polygon are
+        an array of shape (n, 2), mm.
 
         Raises:
             SensorError: If a polygon crosses itself, or there are too few or too many corners.
@@ -147,17 +162,18 @@ class Electrode:
         if self._is_convex:
             return (np.array(self.corners),)
 
-        # Charge is collected where metal on the front overlaps metal on the back. An empty back is metal everywhere.
+        # Charge is collected where metal on the front overlaps metal on the back. Without polygons on the back, the
+        # whole back is metal.
         front = [to_complex(np.array(polygon)) for polygon in self.front]
         back = [to_complex(np.array(polygon)) for polygon in self.back]
         return tuple(to_corners(part) for part in union_parts(front, back))
 
     @cached_property
     def parts(self) -> tuple[Array, ...]:
-        """The collecting area as convex parts that do not overlap, each of shape (n, 2), mm.
+        """Convex parts that do not overlap and together form the collecting area of the electrode.
 
-        A convex electrode is one part. All other electrodes are cut into quadrilaterals and triangles with sides of at
-        most `MAX_PART_SIDE`.
+        A convex electrode has one part. All other electrodes are divided into quadrilaterals and triangles with sides
+        of at most `MAX_PART_SIDE`. The corners (x, y) of a part are an array of shape (n, 2), mm.
         """
         if self._is_convex:
             return self.collecting_polygons
@@ -169,17 +185,18 @@ class Electrode:
 
     @property
     def _is_convex(self) -> bool:
-        """Whether the collecting area is the pad, and the pad is convex."""
+        """Whether the collecting area is the whole pad, and the pad is convex."""
         return not (self.more or self.back) and is_convex(np.array(self.corners))
 
     @property
     def area(self) -> float:
-        """Collecting area, mm^2."""
+        """Size of the collecting area, mm^2."""
         return sum(area_of(part) for part in self.parts)
 
     @cached_property
     def metal(self) -> tuple[Array, ...]:
-        """All metal on the front as convex parts like `parts`, including metal that collects no charge."""
+        """Convex parts of all metal on the front, including metal that collects no charge; see `parts`."""
+        # Without polygons on the back, the whole back is metal, and all metal on the front collects charge.
         return replace(self, back=()).parts if self.back else self.parts
 
     @cached_property
@@ -190,22 +207,23 @@ class Electrode:
         return low, high
 
     def overlaps(self, other: "Electrode", within: float = 0.0) -> bool:
-        """Return whether the metal of two electrodes overlaps on the front.
+        """Return whether the metal of this electrode and that of another electrode overlap on the front.
 
         Args:
             other: The other electrode.
             within: Distance below which the electrodes also count as overlapping, mm.
         """
-        # Compare only polygons whose bounding boxes are near along both axes, shape (n_part, n_other_part, 2).
+        # Only parts whose bounding boxes are near along both axes can overlap. The comparison of the boxes, which is
+        # fast, has the shape (n_part, n_other_part, 2).
         low, high = self.boxes
         other_low, other_high = other.boxes
         are_near_along_axis = (low[:, None] <= other_high + within) & (other_low - within <= high[:, None])
-        pairs_of_near_boxes = np.argwhere(are_near_along_axis.all(axis=2))
-        return any(overlap(self.metal[i], other.metal[j], within) for i, j in pairs_of_near_boxes)
+        pairs_of_near_parts = np.argwhere(are_near_along_axis.all(axis=2))
+        return any(overlap(self.metal[own], other.metal[others], within) for own, others in pairs_of_near_parts)
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Mean of the corners of the pad, mm."""
+        """Centre (x, y) of the electrode, which is the mean of the corners of its pad, mm."""
         x, y = np.mean(self.corners, axis=0)
         return float(x), float(y)
 
@@ -215,10 +233,13 @@ class Calibration:
     """Measured gains and positions of the electrodes of a real film.
 
     Attributes:
-        gain: Ratio of the charge that is read to the charge that is collected, by electrode name. A missing gain is 1.
-        shift: Displacement of the electrodes from the layout along x and y, mm.
-        rotation: Rotation of the electrodes about the centre of the film before the shift, anticlockwise, rad.
-        crosstalk: Share of the charge of every other electrode that an electrode reads, dimensionless.
+        gain: Ratio of the charge that is read to the charge that is collected, by the name of the electrode. The gain
+            of an electrode that is not contained is 1.
+        shift: Displacement (x, y) of the electrodes from their nominal positions in the layout, mm.
+        rotation: Rotation of the electrodes about the centre of the film, anticlockwise, rad. It is applied before the
+            shift.
+        crosstalk: Fraction of the charge of every other electrode that is added to the charge of an electrode,
+            dimensionless.
     """
 
     gain: dict[str, float] = field(default_factory=dict)
@@ -227,13 +248,13 @@ class Calibration:
     crosstalk: float = 0.0
 
     def read(self, charge: Array) -> Array:
-        """Add the crosstalk to collected charges.
+        """Add the crosstalk to the charges of the electrodes.
 
         Args:
-            charge: Charges, shape (..., n_electrode), pC.
+            charge: Charges without crosstalk, shape (..., n_electrode), pC.
 
         Returns:
-            Charges that are read, same shape, pC.
+            Charges with crosstalk, of the same shape, pC.
         """
         if self.crosstalk == 0.0:
             return charge
@@ -244,31 +265,36 @@ class Calibration:
         """Convert nominal positions in the layout into calibrated positions on the real film.
 
         Args:
-            points: Positions (x, y), shape (..., 2), mm.
+            points: Nominal positions (x, y), shape (..., 2), mm.
 
         Returns:
-            Positions, same shape, mm.
+            Calibrated positions (x, y), of the same shape, mm.
         """
+        # The points are row vectors, so they are multiplied by the transpose of the usual rotation matrix.
         cosine = np.cos(self.rotation)
         sine = np.sin(self.rotation)
-        rotation = np.array([[cosine, sine], [-sine, cosine]])
-        return np.asarray(points @ rotation + np.array(self.shift))
+        transposed_rotation = np.array([[cosine, sine], [-sine, cosine]])
+        return np.asarray(points @ transposed_rotation + np.array(self.shift))
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A film with electrodes. The module `sensor_file` reads and writes its file.
+    """Description of a film with electrodes, with the readout and the calibration of the electrodes.
+
+    The module `sensor_file` reads and writes the file of a sensor.
 
     Attributes:
         name: Name of the sensor.
-        film: Film without electrodes.
-        piezo: Piezoelectric coefficients.
+        film: Film without the metal of the electrodes.
+        piezo: Piezoelectric coefficients of the film.
         electrodes: Electrodes, in the order of the charges.
-        readout: Mean over the area of an electrode, or over its edges.
-        surface: Surface in the thickness of the film at which the stress is read.
-        calibration: Gains and positions that were measured on a real film.
-        coating: Young's modulus times thickness of the metal or ink of the electrodes, N/mm. It applies to the front,
-            and to the back if the back is not completely covered. Zero if the coating does not stiffen the film.
+        readout: "area" if the stress is averaged over the area of an electrode, "edge" if it is averaged over its
+            edges.
+        surface: Surface at which the stress is read: "middle", "top" or "bottom" of the film.
+        calibration: Gains and positions of the electrodes that were measured on a real film.
+        coating: Young's modulus of the metal or ink of the electrodes, times its thickness, N/mm. It applies to the
+            front, and to the back if the back is not completely covered. Zero if the stiffness of the metal is
+            neglected.
     """
 
     name: str
@@ -284,11 +310,11 @@ class Sensor:
         """Check the names, the gains and the positions of the electrodes.
 
         Raises:
-            SensorError: If a value is not allowed, or an electrode overlaps another one or the rim.
+            SensorError: If a value is not allowed, or an electrode overlaps another electrode or the rim.
         """
         object.__setattr__(self, "electrodes", _as_tuples(self.electrodes))  # the dataclass is frozen
 
-        # Readout, names of the electrodes, and calibration
+        # Check the readout, the names of the electrodes, and the calibration.
         for value, options in ((self.readout, get_args(Readout)), (self.surface, get_args(Surface))):
             if value not in options:
                 raise SensorError(f"expected one of {options}, got {value!r}")
@@ -310,7 +336,7 @@ class Sensor:
             unknown = sorted(set(gains) - set(names))
             raise SensorError(f"calibration gain: no electrode named {shown(unknown)}, have {cut(str(names))}")
 
-        # Shapes and positions of the electrodes
+        # Check the shapes and positions of the electrodes.
         _check_layout(self.electrodes)
         for electrode in self.electrodes:
             _check_on_film(electrode, self.film, self.calibration)
@@ -329,12 +355,12 @@ class Sensor:
 
     @cached_property
     def coated_film(self) -> Film:
-        """The film with the metal of the electrodes. If `coating` is zero, this is the film without electrodes."""
+        """Film with the metal of the electrodes as its coat. If `coating` is zero, this is `film`."""
         if self.coating == 0.0:
             return self.film
 
-        # The first layer is metal on the front or on the back. The second layer is metal on both sides, which is the
-        # collecting area of electrodes with metal on the back.
+        # The first area is covered by metal on the front or on the back, which `more` contains together. The second
+        # area is covered by metal on both sides: it is the collecting area of electrodes with metal on the back.
         electrodes_of_all_metal = [
             replace(electrode, more=(*electrode.more, *electrode.back), back=(), square=False)
             for electrode in self.electrodes
@@ -346,16 +372,20 @@ class Sensor:
         return replace(self.film, coat=Coat(self.coating, tuple(layers)))
 
     def _placed_parts(self, electrodes: list[Electrode]) -> tuple[Corners, ...]:
-        """Return the corners of the parts of electrodes at their calibrated positions, mm."""
+        """Return the corners (x, y) of all parts of electrodes at their calibrated positions, mm.
+
+        Args:
+            electrodes: Electrodes at their nominal positions.
+        """
         parts = [self.calibration.place(part) for electrode in electrodes for part in electrode.parts]
         return tuple(tuple((float(x), float(y)) for x, y in part) for part in parts)
 
     @cached_property
     def part_circles(self) -> tuple[tuple[Complexes, Array], ...]:
-        """Circles that enclose the parts of each electrode, at their calibrated positions.
+        """Circles that enclose the parts of each electrode at their calibrated positions.
 
         Returns:
-            Centres x + iy and radii of the circles of each electrode, each of shape (n_part,), mm.
+            For each electrode, the centres x + iy and the radii of the circles, each of shape (n_part,), mm.
         """
         circles = []
         for electrode in self.electrodes:
@@ -369,12 +399,16 @@ class Sensor:
 
     @property
     def gains(self) -> Array:
-        """Calibrated gain of each electrode, shape (n_electrode,)."""
+        """Calibrated gain of each electrode, shape (n_electrode,), dimensionless."""
         return np.array([self.calibration.gain.get(name, 1.0) for name in self.electrode_names])
 
 
 def electrode_index(sensor: Sensor, name: str) -> int:
     """Return the index of an electrode in the order of the charges.
+
+    Args:
+        sensor: Sensor with the electrode.
+        name: Name of the electrode.
 
     Raises:
         SensorError: If the sensor has no electrode with this name.
@@ -385,14 +419,20 @@ def electrode_index(sensor: Sensor, name: str) -> int:
 
 
 def _as_tuples(value: object) -> object:
-    """Convert nested lists and arrays into nested tuples, which can be compared. All other values remain unchanged."""
+    """Convert nested lists and arrays into nested tuples, which can be compared and hashed.
+
+    All other values are returned unchanged.
+    """
     if isinstance(value, list | tuple | np.ndarray):
         return tuple(_as_tuples(item) for item in value)
     return value
 
 
 def _check_name(name: str) -> None:
-    """Raise an error if a name cannot be the header of a column of charges.
+    """Raise an error if the name of an electrode cannot be the header of a column in a table of charges.
+
+    Args:
+        name: Name of the electrode.
 
     Raises:
         SensorError: If the name is empty, too long or reserved, or contains a comma or characters that are not
@@ -412,11 +452,16 @@ def _check_name(name: str) -> None:
 
 @lru_cache(maxsize=64)
 def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
-    """Raise an error if electrodes cannot exist on any film. The result is cached, because many films share a layout.
+    """Raise an error if a layout of electrodes is not possible on any film.
+
+    The result is cached, because many films have the same layout.
+
+    Args:
+        electrodes: Electrodes of the layout.
 
     Raises:
-        SensorError: If a polygon crosses itself, an electrode collects no charge or is too small, a square has other
-            corners, or two electrodes overlap.
+        SensorError: If a polygon crosses itself, an electrode collects no charge or is too small, a declared square has
+            the wrong corners, or two electrodes overlap.
     """
     for electrode in electrodes:
         name = f"electrode {electrode.name!r}"
@@ -425,7 +470,7 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
         corners = np.array(electrode.corners)
         check_length(name, float(np.ptp(corners, axis=0).max()), MIN_EXTENT, SensorError)
 
-        # An electrode that is declared as a square must have the corners of a square, and no other metal.
+        # An electrode that is declared as a square must have the corners of a square, and no further metal.
         lower_left, lower_right, *_ = corners
         side = float(lower_right[0] - lower_left[0])
         expected_corners = Electrode.of_square(electrode.name, electrode.centre, side).corners
@@ -445,17 +490,18 @@ def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -
     """Raise an error if an electrode does not lie completely on a film.
 
     Args:
-        electrode: The electrode.
-        film: The film.
+        electrode: Electrode at its nominal position.
+        film: Film with the radius of the rim.
         calibration: Shift and rotation of the electrodes on the film.
 
     Raises:
-        SensorError: If a part of the electrode lies beyond the rim.
+        SensorError: If a part of the electrode lies on or beyond the rim.
     """
     placed_corners = calibration.place(np.concatenate(electrode.collecting_polygons))  # shape (n, 2), mm
     if np.linalg.norm(placed_corners, axis=1).max() < film.radius:
         return
 
+    # Describe the position and the size of the electrode in the error message.
     centre = placed_corners.mean(axis=0)
     x, y = centre
     if electrode.square:
@@ -472,11 +518,11 @@ def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -
 
 
 def check_polygon(where: str, polygon: Corners) -> None:
-    """Raise an error if corners do not form a simple polygon.
+    """Raise an error if a polygon crosses itself or is clockwise, or if its corners are not valid.
 
     Args:
-        where: Beginning of the error message.
-        polygon: Corners, mm.
+        where: First words of the error message, which name the polygon.
+        polygon: Corners (x, y) of the polygon, mm.
 
     Raises:
         SensorError: If the polygon crosses itself, is clockwise, or has too few or too many corners.
@@ -484,8 +530,10 @@ def check_polygon(where: str, polygon: Corners) -> None:
     corners = np.array(polygon)
     if corners.ndim != 2 or not 3 <= len(corners) <= MAX_CORNERS or corners.shape[1] != 2:
         raise SensorError(f"{where}: expected 3 to {MAX_CORNERS} corners (x, y), got {shown(corners.tolist())}")
+
+    # A convex polygon does not cross itself. This case is tested first, because the test is faster and most polygons
+    # are convex.
     is_finite = np.isfinite(corners).all()
-    # The test for a convex polygon is faster, and most polygons are convex.
     if not (is_finite and (is_convex(corners) or is_simple(to_complex(corners)))):
         raise SensorError(
             f"{where}: expected a polygon that does not cross itself, with its corners anticlockwise, got "
@@ -494,5 +542,5 @@ def check_polygon(where: str, polygon: Corners) -> None:
 
 
 def _short(value: float) -> str:
-    """Return a number with six digits, for error messages."""
+    """Return a number as text with at most six significant digits, for error messages."""
     return str(float(f"{value:.6g}"))

@@ -1,6 +1,6 @@
-"""Reader and writer of sensor files. The files are TOML, and the names of the keys contain the units.
+"""Reader and writer of sensor files.
 
-Unknown and missing keys are errors.
+A sensor file is a TOML file whose keys contain the units of the values. Unknown keys and missing keys are errors.
 """
 
 import logging
@@ -32,28 +32,28 @@ from isocharge.simulate.sensor.sensor import Calibration, Corners, Electrode, Re
 from isocharge.simulate.sensor.size_check import tidy
 
 MAX_COORDINATE_mm = 1e6
-"""Largest absolute value of a coordinate, mm."""
+"""Largest accepted magnitude of a coordinate or a length in a sensor file, mm."""
 
 PPM = 1e6
-"""Parts per million in one."""
+"""Factor that converts a fraction into parts per million."""
 
 PASCAL_PER_MPA = 1e6
-"""Pascal per megapascal."""
+"""Factor that converts megapascals into pascals."""
 
 log = logging.getLogger(__name__)
 
 SIDE = "side_mm"
-"""Key of the section `electrodes` for the side of all square electrodes."""
+"""Key of the section `electrodes` whose value is the side of all square electrodes."""
 
 COATING = "coating_N_per_mm"
-"""Key of the section `electrodes` for the stiffness of their metal or ink."""
+"""Key of the section `electrodes` whose value is the stiffness of the metal or ink of the electrodes."""
 
 Coordinate = Annotated[float, Meta(ge=-MAX_COORDINATE_mm, le=MAX_COORDINATE_mm)]
 Point = Annotated[tuple[Coordinate, Coordinate], Meta(description=f"[x, y] in mm, each at most {MAX_COORDINATE_mm:g}")]
 
 
 class FilmTable(Settings, frozen=True):
-    """The section `film` of a sensor file."""
+    """Content of the section `film` of a sensor file, with the mechanical properties of the film."""
 
     radius_mm: Annotated[float, Meta(gt=0.0, le=MAX_COORDINATE_mm)]
     thickness_um: Positive
@@ -71,7 +71,7 @@ class FilmTable(Settings, frozen=True):
 
 
 class PiezoTable(Settings, frozen=True):
-    """The section `piezo` of a sensor file. The piezoelectric coefficients are in pC/N."""
+    """Content of the section `piezo` of a sensor file. The piezoelectric coefficients are in pC/N."""
 
     d31: Finite
     d32: Finite
@@ -81,10 +81,10 @@ class PiezoTable(Settings, frozen=True):
 
 
 class PolygonTable(Settings, frozen=True):
-    """Description of an electrode that is not a square.
+    """Description in a sensor file of an electrode that is not a square.
 
-    The electrode has a pad on the front. It may also have further polygons and a trace on the front, and polygons on
-    the back.
+    The electrode has a pad on the front of the film. The electrode may have further polygons and a trace on the front,
+    and polygons on the back.
     """
 
     polygon_mm: tuple[Point, ...]
@@ -95,7 +95,7 @@ class PolygonTable(Settings, frozen=True):
 
 
 class CalibrationTable(Settings, frozen=True):
-    """The section `calibration` of a sensor file."""
+    """Content of the section `calibration` of a sensor file, with the gains and positions of the electrodes."""
 
     gain: dict[str, Positive] = field(default_factory=dict)
     shift_mm: Point = (0.0, 0.0)
@@ -106,9 +106,9 @@ class CalibrationTable(Settings, frozen=True):
 class SensorTable(Settings, frozen=True):
     """Content of a sensor file.
 
-    The keys of the section `electrodes` are the names of the electrodes. The value of a square electrode is its centre,
-    and the value of any other electrode is a table. The section also contains the side of the squares and the stiffness
-    of the coating.
+    In the section `electrodes`, the keys are the names of the electrodes. The value of a square electrode is its
+    centre, and the value of every other electrode is a table of polygons. The section may also contain the side of the
+    squares and the stiffness of the coating.
     """
 
     name: Text
@@ -123,16 +123,16 @@ class SensorTable(Settings, frozen=True):
     def __post_init__(self) -> None:
         """Check the section `electrodes` and the names of the section `roles`.
 
-        The keys of `electrodes` are not declared, because they are the names of the electrodes. Only two keys have
-        another meaning: `SIDE` and `COATING` are numbers that apply to all electrodes.
+        Most keys of the section `electrodes` are the names of the electrodes. The values of the keys `SIDE` and
+        `COATING` are numbers that apply to all electrodes.
 
         Raises:
-            WrongKey: If a value has the wrong type, or a key is missing.
+            WrongKey: If a value is not allowed, if a key is missing, or if a role belongs to no electrode.
         """
         for name, value in self.electrodes.items():
             if name not in (SIDE, COATING) and isinstance(value, float):
                 raise WrongKey(f"electrodes.{name}", "[x, y] in mm or a table", value)
-            if isinstance(value, PolygonTable):
+            if isinstance(value, PolygonTable):  # a trace needs a width, and a width needs a trace
                 has_trace = bool(value.trace_mm)
                 has_width = value.width_mm > 0.0
                 if has_trace != has_width:
@@ -145,7 +145,8 @@ class SensorTable(Settings, frozen=True):
         side = self.electrodes.get(SIDE)
         if side is not None and not (isinstance(side, float) and 0.0 < side <= MAX_COORDINATE_mm):
             raise WrongKey(f"electrodes.{SIDE}", f"a number above 0 and at most {MAX_COORDINATE_mm:g}", side)
-        if side is None and any(isinstance(value, tuple) for value in self.electrodes.values()):
+        has_squares = any(isinstance(value, tuple) for value in self.electrodes.values())
+        if side is None and has_squares:
             raise WrongKey(f"electrodes.{SIDE}")
         for name in self.roles:
             if name in (SIDE, COATING) or name not in self.electrodes:
@@ -153,16 +154,21 @@ class SensorTable(Settings, frozen=True):
 
 
 def built_in_sensors() -> tuple[str, ...]:
-    """Return the names of the sensors in the package."""
+    """Return the names of the sensors whose files are part of the package."""
     folder = resources.files("isocharge.simulate") / "sensors"
     return tuple(sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml")))
 
 
 def load_sensor(sensor: str | Path) -> Sensor:
-    """Read a sensor file. If the sensor has only one electrode, log a warning.
+    """Read a sensor file.
+
+    If the sensor has only one electrode, a warning is logged.
 
     Args:
-        sensor: A built-in name such as "three-25um-biaxial", or the path of a TOML file.
+        sensor: Name of a built-in sensor such as "three-25um-biaxial", or path of a TOML file.
+
+    Returns:
+        The sensor that the file describes.
 
     Raises:
         SensorError: If there is no such sensor, or its file is invalid. The message contains the file and the key.
@@ -188,8 +194,8 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
     """Create a sensor from the tables of its file.
 
     Args:
-        table: Tables of the file, with the units in the keys.
-        where: Beginning of the error messages.
+        table: Tables of the file. The keys contain the units of the values.
+        where: First words of the error messages, such as the path of the file.
 
     Raises:
         SensorError: If a key or a value is invalid.
@@ -217,15 +223,15 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
 
 
 def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
-    """Return a sensor as the tables of a sensor file. The tables can be written as JSON or TOML.
+    """Convert a sensor into the tables of a sensor file, which can be written as JSON or TOML.
 
-    If `sensor_from_dict` reads these tables, the result is the same sensor, except for rounding errors.
+    The function `sensor_from_dict` converts the tables back into the same sensor, except for rounding errors.
 
     Args:
-        sensor: The sensor.
+        sensor: Sensor to be converted.
 
     Raises:
-        SensorError: If no file can describe the sensor.
+        SensorError: If a sensor file cannot describe the sensor.
     """
     piezo = sensor.piezo
     calibration = sensor.calibration
@@ -253,20 +259,24 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
 
 
 def film_to_dict(film: Film) -> dict[str, Any]:
-    """Return the section `film` of a sensor file. This is the inverse of `_film`.
+    """Convert a film into the section `film` of a sensor file.
 
-    Young's modulus and the pretension are single numbers if they do not depend on the direction, and lists otherwise.
+    This function is the inverse of `_film`. Young's modulus is a single number if it does not depend on the direction,
+    and a list if it does. The same applies to the pretension.
+
+    Args:
+        film: Film to be converted.
     """
     half_difference, shear_tension = film.deviator
     mean_tension = film.pretension
     tension_components = (mean_tension + half_difference, mean_tension - half_difference, shear_tension)
     tension_MPa = [tidy(component) for component in tension_components]
 
-    # The moduli along the axes are E1 = E r and E2 = E / r, with r^2 = E1 / E2.
+    # If E is the geometric mean of the moduli and r^2 = E1 / E2, the moduli are E1 = E r and E2 = E / r.
     root_of_ratio = np.sqrt(film.young_ratio)
     young_GPa = [tidy(film.young * 1e-3 * root_of_ratio), tidy(film.young * 1e-3 / root_of_ratio)]
 
-    # Optional keys are omitted if their value is zero or None.
+    # Collect the optional keys. Keys whose value is zero or None are omitted below.
     optional: dict[str, Any] = {
         "shear_GPa": None if film.shear is None else tidy(film.shear * 1e-3),
         "axis_deg": tidy(float(np.rad2deg(film.axis))),
@@ -289,16 +299,16 @@ def film_to_dict(film: Film) -> dict[str, Any]:
 
 
 def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
-    """Return a sensor as the text of a sensor file.
+    """Convert a sensor into the text of a sensor file.
 
-    If `load_sensor` reads this text, the result is the same sensor, except for rounding errors.
+    If `load_sensor` reads a file with this text, the result is the same sensor, except for rounding errors.
 
     Args:
-        sensor: The sensor.
-        comment: Comment lines at the beginning of the file, without "#".
+        sensor: Sensor to be converted.
+        comment: Comment lines at the beginning of the text, without "#".
 
     Raises:
-        SensorError: If no file can describe the sensor, for example because its name is empty.
+        SensorError: If a sensor file cannot describe the sensor, for example because its name is empty.
     """
     text = to_toml(sensor_to_dict(sensor), comment)
     try:
@@ -306,22 +316,22 @@ def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
     except UnicodeEncodeError as error:
         raise SensorError(f"sensor {sensor.name!r}: a name cannot be encoded in UTF-8 ({error})") from error
 
-    # Read the text again, which raises an error if the file would not be valid.
+    # Parse the text, which raises an error if the file would not be valid.
     where = f"sensor {sensor.name!r}"
     sensor_from_dict(parse_toml(text, where, SensorError, dict[str, Any]), where)
     return text
 
 
 def write_sensor(sensor: Sensor, path: Path, comment: Iterable[str] = ()) -> None:
-    """Write the file of a sensor. If an error occurs, no file is written.
+    """Write a sensor file. If an error occurs, no file is written.
 
     Args:
-        sensor: The sensor.
+        sensor: Sensor that the file describes.
         path: Path of the new file.
         comment: Comment lines at the beginning of the file, without "#".
 
     Raises:
-        SensorError: If no file can describe the sensor.
+        SensorError: If a sensor file cannot describe the sensor.
         OutputExists: If `path` exists.
     """
     refuse_existing(path)
@@ -329,16 +339,22 @@ def write_sensor(sensor: Sensor, path: Path, comment: Iterable[str] = ()) -> Non
 
 
 def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
-    """Return the section `electrodes` of a sensor file.
+    """Convert the electrodes and the coating of a sensor into the section `electrodes` of a sensor file.
 
-    All squares of a file have the same side. A square whose side differs from that of the first square is described as
-    a polygon.
+    All squares of a file have the same side. A square whose side differs from that of the first square is therefore
+    described as a polygon.
+
+    Args:
+        sensor: Sensor with the electrodes.
 
     Raises:
-        SensorError: If the readout needs squares, and their sides differ.
+        SensorError: If the readout requires squares, and the sides of the squares differ.
     """
     squares = [electrode for electrode in sensor.electrodes if electrode.square]
-    sides = {square.name: tidy(square.corners[1][0] - square.corners[0][0]) for square in squares}
+    sides = {}
+    for square in squares:
+        lower_left, lower_right, *_ = square.corners
+        sides[square.name] = tidy(lower_right[0] - lower_left[0])
     if sensor.readout == "edge" and len(set(sides.values())) > 1:
         raise SensorError(
             f"readout 'edge' needs squares, and in a sensor file all squares have one side: got {sides} mm"
@@ -358,7 +374,10 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
 
 
 def _polygon_table(electrode: Electrode) -> dict[str, Any]:
-    """Return the table of an electrode that is described by polygons."""
+    """Convert an electrode into a table of polygons for the section `electrodes` of a sensor file.
+
+    The table contains traces as polygons.
+    """
     table: dict[str, Any] = {"polygon_mm": _corners(electrode.corners)}
     if electrode.more:
         table["more_mm"] = [_corners(polygon) for polygon in electrode.more]
@@ -368,25 +387,31 @@ def _polygon_table(electrode: Electrode) -> dict[str, Any]:
 
 
 def _corners(polygon: Corners) -> list[list[float]]:
-    """Return the corners of a polygon as lists of rounded numbers, mm."""
+    """Return the corners (x, y) of a polygon as lists of rounded numbers, mm."""
     return [[tidy(value) for value in corner] for corner in polygon]
 
 
 def _film(table: FilmTable) -> Film:
-    """Create the film from the section `film` of a sensor file.
+    """Create a film from the section `film` of a sensor file.
 
-    The section contains either one Young's modulus or the moduli (E1, E2), and either one pretension or the components
-    (T11, T22, T12).
+    The section contains either one Young's modulus or the moduli (E1, E2). The section contains either one pretension
+    or the components (T11, T22, T12).
+
+    Args:
+        table: Content of the section.
+
+    Raises:
+        SensorError: If a property is outside its accepted range.
     """
-    # Young's moduli along both axes, and their geometric mean
+    # Young's moduli along both axes, and their geometric mean. The mean of equal values is not computed, because it
+    # would have a rounding error.
     if isinstance(table.young_GPa, list):
         young_1, young_2 = table.young_GPa
     else:
         young_1 = young_2 = table.young_GPa
-    # The mean of equal values is not computed, because it would have rounding errors.
     mean_young = young_1 if young_1 == young_2 else float(np.sqrt(young_1 * young_2))
 
-    # Components of the pretension, and the mean of the components along both axes
+    # Components of the pretension, and the mean of the components along x and y
     if isinstance(table.pretension_MPa, list):
         tension_11, tension_22, tension_12 = table.pretension_MPa
     else:
@@ -414,7 +439,14 @@ def _film(table: FilmTable) -> Film:
 
 
 def _expansion(table: FilmTable) -> tuple[float, float] | None:
-    """Return the expansion coefficients of the film along its axes, 1/K; None if the section has none."""
+    """Return the thermal expansion coefficients of a film along its axes 1 and 2, 1/K.
+
+    Args:
+        table: Content of the section `film` of a sensor file.
+
+    Returns:
+        The coefficients; None if the section contains none.
+    """
     coefficients = table.expansion_ppm_per_K
     if coefficients is None:
         return None
@@ -425,16 +457,16 @@ def _expansion(table: FilmTable) -> tuple[float, float] | None:
 
 
 def _electrodes(table: Mapping[str, float | Point | PolygonTable], roles: Mapping[str, Role]) -> Iterator[Electrode]:
-    """Yield the electrodes of the section `electrodes`.
+    """Create the electrodes of the section `electrodes` of a sensor file, and yield one after the other.
 
     A value of the section is a table of polygons, the centre of a square, or a number that applies to all electrodes.
 
     Args:
-        table: The section `electrodes`.
-        roles: The section `roles`. An electrode that it does not contain determines the position.
+        table: Content of the section `electrodes`.
+        roles: Content of the section `roles`. An electrode that it does not contain has the role "position".
     """
-    side = table.get(SIDE)  # of all squares
-    for name, value in table.items():
+    side = table.get(SIDE)  # side of all squares, mm
+    for name, value in table.items():  # the values of SIDE and COATING are numbers and yield no electrode
         role = roles.get(name, "position")
         if isinstance(value, PolygonTable):
             electrode = Electrode(name, value.polygon_mm, more=value.more_mm, back=value.back_mm, role=role)

@@ -1,1 +1,1 @@
-"""Solver of presses: choice of the mesh, assembly, Newton's method, and estimates of the error."""
+"""Solver of presses, which computes the equilibrium of the film under a probe and estimates its error."""

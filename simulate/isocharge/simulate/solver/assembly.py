@@ -1,13 +1,14 @@
 """Solution of the linear system of a mesh by static condensation of the elements and a sparse direct solver.
 
-A node in the interior of an element belongs to no other element. The unknowns of such nodes are eliminated element by
-element with dense matrices. Only the unknowns of the skeleton (the sides of the elements) are factorised together. At
-order 4 this reduces the number of unknowns by a factor of 2.3. The numbering and the sparsity pattern depend on the
-template only and are computed once.
+A node in the interior of an element belongs to no other element. Therefore the unknowns of interior nodes are
+eliminated element by element with dense matrices. The nodes on the sides of all elements form the skeleton of the mesh.
+Only the unknowns of the skeleton are factorised together. For elements of order 4, the elimination reduces the number
+of unknowns by a factor of 2.3. The numbers of the unknowns and the sparsity pattern depend only on the template, so
+they are computed once for each template.
 
-The unknowns of a node are U1, U2, W and, with bending, the auxiliary unknown of `mechanics.energy`. The first three are
-zero on the rim. On the line of symmetry of a half template, U2 is zero for even fields, and all other unknowns are zero
-for odd fields.
+The unknowns of a node are U1, U2 and W. With bending, each node also has the auxiliary unknown of `mechanics.energy`.
+On the rim, U1, U2 and W are zero. On the line of symmetry of a half template, U2 is zero for even fields, and all other
+unknowns are zero for odd fields.
 """
 
 from functools import lru_cache
@@ -21,7 +22,7 @@ from isocharge.simulate.mesh.template import Template
 
 
 class Assembly:
-    """Linear solver for one template and one number of unknowns per node.
+    """Linear solver for a given template and a given number of unknowns per node.
 
     Attributes:
         components: Number of unknowns per node.
@@ -30,8 +31,8 @@ class Assembly:
         inner_global: Indices of the interior unknowns of each element, shape (n_element, n_inner).
         outer_global: Indices of the unknowns on the sides of each element, shape (n_element, n_outer).
         skeleton: Indices of the free unknowns on sides, in the order of elimination, shape (n_skeleton,).
-        constraint: Matrix that computes all skeleton unknowns from those of nodes that are not hanging nodes; None if
-            there are no hanging nodes.
+        constraint: Matrix that computes all skeleton unknowns from the unknowns of nodes that are not hanging nodes;
+            None if there are no hanging nodes.
     """
 
     def __init__(self, mesh: Template, components: int, odd: bool = False) -> None:
@@ -46,22 +47,22 @@ class Assembly:
         self.odd = odd
         self.free = _free(mesh, components, odd)
 
-        # Local indices of the unknowns on the sides of an element and in its interior, component by component. The
-        # nodes of an element form a square grid.
-        line = np.arange(mesh.resolution.order + 1)
-        is_end = (line == line[0]) | (line == line[-1])
+        # Compute the local indices of the unknowns on the sides of an element and in its interior. Within an element,
+        # the unknowns are numbered component by component. The nodes of an element form a square grid.
+        grid_index = np.arange(mesh.resolution.order + 1)
+        is_end = (grid_index == grid_index[0]) | (grid_index == grid_index[-1])
         is_on_side = (is_end[:, None] | is_end[None, :]).ravel()
         component = np.arange(components)[:, None]
         n_local = is_on_side.size
         self._outer = (component * n_local + np.flatnonzero(is_on_side)).ravel()
         self._inner = (component * n_local + np.flatnonzero(~is_on_side)).ravel()
 
-        # Global indices of the unknowns of each element, which are numbered node by node
+        # Compute the global indices of the unknowns of each element. Globally, the unknowns are numbered node by node.
         unknown = (components * mesh.nodes[:, None] + component).reshape(len(mesh.nodes), -1)
         self.inner_global = unknown[:, self._inner]
         self.outer_global = unknown[:, self._outer]
 
-        # The skeleton consists of the free unknowns on sides. Fixed unknowns have the number -1.
+        # The skeleton consists of the free unknowns on sides. All other unknowns have the skeleton number -1.
         is_in_skeleton = np.zeros(self.free.size, dtype=bool)
         is_in_skeleton[self.outer_global.ravel()] = True
         self.skeleton = np.flatnonzero(is_in_skeleton & self.free.ravel())
@@ -72,7 +73,7 @@ class Assembly:
         self._reorder()
 
     def _skeleton_constraint(self, node_constraint: csr_array) -> csc_array:
-        """Return the matrix that computes all skeleton unknowns from those of nodes that are not hanging nodes.
+        """Return the matrix that computes all skeleton unknowns from the unknowns of nodes that are not hanging nodes.
 
         Args:
             node_constraint: Matrix that computes the values at all nodes from the values at nodes that are not hanging
@@ -80,17 +81,18 @@ class Assembly:
         """
         unknown_constraint = kron(node_constraint, eye_array(self.components)).tocsr()
         skeleton_constraint = unknown_constraint[self.skeleton][:, self.skeleton]
-        is_regular = skeleton_constraint.diagonal() > 0.0
+        is_regular = skeleton_constraint.diagonal() > 0.0  # false for hanging nodes, whose columns are zero
         return skeleton_constraint[:, is_regular].tocsc()
 
     def _set_pattern(self, skeleton_numbers: Integers) -> None:
-        """Compute the sparsity pattern of the skeleton matrix, and the position of each element entry in it.
+        """Compute the sparsity pattern of the skeleton matrix, and the positions of the element entries in its data.
 
-        Entries of fixed unknowns get a position after the last entry.
+        The data of a sparse matrix are the entries of its pattern in the compressed sparse column format. An entry that
+        belongs to a fixed unknown gets the position after the last entry of the pattern.
 
         Args:
-            skeleton_numbers: Number of each outer unknown in the skeleton, -1 if it is fixed, shape (n_element,
-                n_outer).
+            skeleton_numbers: Number of each outer unknown in the skeleton, shape (n_element, n_outer). Fixed unknowns
+                have the number -1.
         """
         # Row and column of each entry of the element matrices in the skeleton matrix
         n_element, n_outer = skeleton_numbers.shape
@@ -100,143 +102,167 @@ class Assembly:
         column = np.broadcast_to(skeleton_numbers[:, None, :], shape)
         is_free = (row >= 0) & (column >= 0)
 
-        # One code for each row and column. The order of the codes is that of the compressed sparse column format.
+        # Combine the row and the column of each entry into one code. In the compressed sparse column format, the
+        # entries are ordered by their columns and then by their rows, which is the order of the codes.
         entry_codes = column[is_free] * size + row[is_free]
         codes, position = np.unique(entry_codes, return_inverse=True)
-        positions = np.full(shape, codes.size, dtype=np.intp)
+        position_of_fixed = codes.size
+        positions = np.full(shape, position_of_fixed, dtype=np.intp)
         positions[is_free] = position
         self._entry_positions = positions.ravel()
+
+        # Compute the row of each entry of the pattern, and the position of the first entry of each column.
         self._indices = (codes % size).astype(np.int32)
         entries_per_column = np.bincount(codes // size, minlength=size)
         self._indptr = np.concatenate([[0], np.cumsum(entries_per_column)]).astype(np.int32)
 
     def _reorder(self) -> None:
-        """Renumber the skeleton unknowns so that the factorisation has little fill-in (minimum degree).
+        """Renumber the skeleton unknowns by the minimum-degree method, so that the factorisation has little fill-in.
 
         If there are hanging nodes, only the columns of the constraint are renumbered, because the factorised matrix
-        contains only the unknowns of the other nodes.
+        does not contain the unknowns of hanging nodes.
         """
-        # The order is that of a matrix with this pattern and a dominant diagonal, which needs no pivoting.
-        pattern = self._skeleton(np.ones(self._indices.size))
-        dominant = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
-        order = np.argsort(_factorise(dominant, "MMD_AT_PLUS_A").perm_c)
+        # SuperLU returns its column order only after a factorisation. The factorised matrix has the pattern of the
+        # skeleton matrix and a dominant diagonal, because such a matrix needs no pivoting.
+        pattern = self._skeleton_matrix(np.ones(self._indices.size))
+        dominant_matrix = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
+        order = np.argsort(_factorise(dominant_matrix, "MMD_AT_PLUS_A").perm_c)
         if self.constraint is not None:
             self.constraint = self.constraint[:, order]
             return
 
-        # Permute a matrix whose entries are their own positions, and read the new position of each entry from it.
+        # Permute a matrix whose entries are their own positions, and read the new position of each entry from it. The
+        # last position, which is for fixed unknowns, does not change.
         pattern.data = np.arange(pattern.nnz)
         permuted = pattern[:, order][order]
         permuted.sort_indices()
-        new_position = np.append(np.argsort(permuted.data), permuted.nnz)  # the last position is for fixed unknowns
+        position_of_fixed = permuted.nnz
+        new_position = np.append(np.argsort(permuted.data), position_of_fixed)
         self._entry_positions = new_position[self._entry_positions]
         self._indices = permuted.indices
         self._indptr = permuted.indptr
         self.skeleton = self.skeleton[order]
 
     def factor(self, matrix: Array) -> "Factor":
-        """Factorise the matrix K of the mesh.
+        """Factorise the matrix of the mesh.
 
         Args:
-            matrix: Element matrices, shape (n_element, n_local, components, n_local, components), symmetric.
+            matrix: Symmetric element matrices, shape (n_element, n_local, components, n_local, components).
 
         Returns:
-            Factorisation that solves K x = b for any b.
+            Factorisation that solves the linear system for arbitrary right-hand sides.
         """
         inner = self._inner
         outer = self._outer
         n_local = matrix.shape[1]
         n_unknown = n_local * self.components
-        element_matrix = matrix.transpose(0, 2, 1, 4, 3).reshape(-1, n_unknown, n_unknown)  # component by component
+        # Number the unknowns of an element component by component.
+        element_matrix = matrix.transpose(0, 2, 1, 4, 3).reshape(-1, n_unknown, n_unknown)
 
-        # Static condensation: eliminate the interior unknowns of each element. With the blocks A (interior), B
+        # Eliminate the interior unknowns of each element by static condensation. With the blocks A (interior), B
         # (coupling) and C (outer), the Schur complement is C - B' A^-1 B.
-        coupling = element_matrix[:, inner[:, None], outer]
-        inverse = np.linalg.inv(element_matrix[:, inner[:, None], inner]).astype(float, copy=False)
-        reduced = inverse @ coupling
-        schur_complement = element_matrix[:, outer[:, None], outer] - coupling.transpose(0, 2, 1) @ reduced
+        coupling = element_matrix[:, inner[:, None], outer]  # B
+        inner_inverse = np.linalg.inv(element_matrix[:, inner[:, None], inner]).astype(float, copy=False)  # A^-1
+        reduced_coupling = inner_inverse @ coupling  # A^-1 B
+        outer_block = element_matrix[:, outer[:, None], outer]  # C
+        schur_complement = outer_block - coupling.transpose(0, 2, 1) @ reduced_coupling
 
-        # Sum the Schur complements of the elements. The last position, which collects the entries of fixed unknowns,
-        # is dropped.
+        # Add the Schur complements of all elements. The last sum is not used, because it contains the entries of fixed
+        # unknowns.
         entry_count = self._indices.size + 1
         skeleton_entries = np.bincount(self._entry_positions, schur_complement.ravel(), entry_count)[:-1]
-        skeleton_factor = _factorise(self._skeleton(skeleton_entries), "NATURAL")
-        return Factor(self, inverse, coupling, reduced, skeleton_factor)
+        skeleton_factor = _factorise(self._skeleton_matrix(skeleton_entries), "NATURAL")
+        return Factor(self, inner_inverse, coupling, reduced_coupling, skeleton_factor)
 
-    def _skeleton(self, data: np.ndarray) -> csc_matrix:
-        """Return the matrix of the skeleton unknowns, without those of hanging nodes.
+    def _skeleton_matrix(self, entries: np.ndarray) -> csc_matrix:
+        """Create the matrix of the skeleton unknowns, without the unknowns of hanging nodes.
 
         Args:
-            data: Entries of the sparsity pattern, in the order of the compressed sparse column format.
+            entries: Entries of the sparsity pattern, in the order of the compressed sparse column format.
         """
-        matrix = csc_matrix((data, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
+        matrix = csc_matrix((entries, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
         if self.constraint is None:
             return matrix
         return csc_matrix(self.constraint.T @ matrix @ self.constraint)
 
 
 class Factor:
-    """Factorisation of the matrix K of a mesh."""
+    """Factorisation of the matrix of a mesh."""
 
-    def __init__(self, assembly: Assembly, inverse: Array, coupling: Array, reduced: Array, skeleton: SuperLU) -> None:
+    def __init__(
+        self,
+        assembly: Assembly,
+        inner_inverse: Array,
+        coupling: Array,
+        reduced_coupling: Array,
+        skeleton_factor: SuperLU,
+    ) -> None:
         """Store the factors.
 
         Args:
-            assembly: Numbers of the unknowns.
-            inverse: Inverse of the block of the interior unknowns of each element, shape (n_element, n_inner, n_inner).
+            assembly: Linear solver with the indices of the unknowns.
+            inner_inverse: Inverse of the block of the interior unknowns of each element, shape
+                (n_element, n_inner, n_inner).
             coupling: Block between interior and outer unknowns, shape (n_element, n_inner, n_outer).
-            reduced: Product of `inverse` and `coupling`, same shape.
-            skeleton: Factorisation of the matrix of the skeleton unknowns.
+            reduced_coupling: Product of `inner_inverse` and `coupling`, same shape as `coupling`.
+            skeleton_factor: Factorisation of the matrix of the skeleton unknowns.
         """
         self._assembly = assembly
-        self._inverse = inverse
+        self._inner_inverse = inner_inverse
         self._coupling = coupling
-        self._reduced = reduced
-        self._skeleton = skeleton
+        self._reduced_coupling = reduced_coupling
+        self._skeleton_factor = skeleton_factor
 
     def solve(self, right: Array) -> Array:
-        """Solve K x = b for the free unknowns.
+        """Solve the linear system for the free unknowns.
 
         Args:
-            right: Right-hand side b for (U1, U2, W) at the nodes, shape (n_node, 3). Values of fixed unknowns are
+            right: Right-hand side for (U1, U2, W) at the nodes, shape (n_node, 3). The values of fixed unknowns are
                 ignored.
 
         Returns:
-            (U1, U2, W) at the nodes, shape (n_node, 3). Fixed unknowns are zero.
+            Solution (U1, U2, W) at the nodes, shape (n_node, 3). Fixed unknowns are zero.
         """
         assembly = self._assembly
         padded_right = np.zeros(assembly.free.shape)
-        padded_right[:, :3] = right  # the auxiliary unknown of bending has no load
+        padded_right[:, :3] = right  # the right-hand side of the auxiliary unknown of bending is zero
         flat_right = padded_right.ravel()
 
-        # Eliminate the interior unknowns from the right-hand side.
-        inner_solution = self._inverse @ flat_right[assembly.inner_global][..., None]
-        condensed = self._coupling.transpose(0, 2, 1) @ inner_solution
-        reduced_right = flat_right - np.bincount(assembly.outer_global.ravel(), condensed.ravel(), flat_right.size)
+        # Eliminate the interior unknowns of each element from the right-hand side.
+        inner_right = flat_right[assembly.inner_global][..., None]  # shape (n_element, n_inner, 1)
+        inner_solution = self._inner_inverse @ inner_right
+        coupled_right = self._coupling.transpose(0, 2, 1) @ inner_solution  # shape (n_element, n_outer, 1)
+        reduced_right = flat_right - np.bincount(assembly.outer_global.ravel(), coupled_right.ravel(), flat_right.size)
 
         # Solve for the unknowns of the skeleton.
         skeleton_right = reduced_right[assembly.skeleton]
         if assembly.constraint is None:
-            skeleton_solution = self._skeleton.solve(skeleton_right)
+            skeleton_solution = self._skeleton_factor.solve(skeleton_right)
         else:
-            regular_solution = self._skeleton.solve(assembly.constraint.T @ skeleton_right)
+            regular_solution = self._skeleton_factor.solve(assembly.constraint.T @ skeleton_right)
             skeleton_solution = assembly.constraint @ regular_solution
         solution = np.zeros(flat_right.size)
         solution[assembly.skeleton] = skeleton_solution
 
-        # Compute the interior unknowns from those of the skeleton.
-        correction = self._reduced @ solution[assembly.outer_global][..., None]
+        # Compute the interior unknowns of each element from the unknowns on its sides.
+        outer_solution = solution[assembly.outer_global][..., None]  # shape (n_element, n_outer, 1)
+        correction = self._reduced_coupling @ outer_solution
         solution[assembly.inner_global] = (inner_solution - correction)[..., 0]
         return solution.reshape(assembly.free.shape)[:, :3]
 
 
-def _factorise(matrix: csc_matrix, order: str) -> SuperLU:
-    """Factorise a symmetric matrix without pivoting. `order` is the name of a column ordering of SuperLU."""
-    return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+def _factorise(matrix: csc_matrix, column_order: str) -> SuperLU:
+    """Factorise a symmetric matrix without pivoting.
+
+    Args:
+        matrix: The matrix.
+        column_order: Name of a column ordering of SuperLU, which is the parameter `permc_spec` of SciPy.
+    """
+    return splu(matrix, permc_spec=column_order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:
-    """Return which unknowns are free. The other unknowns are zero.
+    """Return which unknowns are free. All other unknowns are fixed at zero.
 
     The clamp fixes U1, U2 and W on the rim. On the line of symmetry, U2 is fixed for even fields, and all unknowns
     except U2 are fixed for odd fields.
@@ -262,7 +288,7 @@ def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def assembly(mesh: Template, components: int, odd: bool = False) -> Assembly:
-    """Return the linear solver of a template, which is cached.
+    """Return the linear solver for the mesh of a template. Linear solvers are cached.
 
     Args:
         mesh: Template of the mesh.

@@ -1,8 +1,8 @@
-"""The equilibrium of the film under a press, and its deflection and stress at any point.
+"""Equilibrium of the film under a press, and functions that compute its deflection and stress at given points.
 
-Every press is rotated onto the positive x axis before it is solved, together with the film. The results are rotated
-back when they are read. If the film is axisymmetric, one equilibrium is valid for all directions of the press, all
-electrode layouts and all piezoelectric coefficients.
+Before a press is solved, the press and the film are rotated such that the press lies on the positive x axis. The
+functions that evaluate an equilibrium rotate the results back. If the film is axisymmetric, an equilibrium is valid for
+all directions of the press. An equilibrium is also valid for all electrode layouts and all piezoelectric coefficients.
 """
 
 from dataclasses import dataclass
@@ -21,33 +21,34 @@ from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.probe import Probe
 
-HEIGHT = {"middle": 0.0, "top": 1.0, "bottom": -1.0}
-"""Position of each surface in the thickness, in half thicknesses, positive towards the probe."""
+SURFACE_HEIGHT = {"middle": 0.0, "top": 1.0, "bottom": -1.0}
+"""Height of each surface above the mid-surface in half thicknesses, positive towards the probe."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Equilibrium:
-    """Equilibrium of a film under a press. The functions `deflection`, `touch_stress` and `touch_charge` evaluate it.
+    """Equilibrium of a film under a press.
+
+    The functions `deflection`, `touch_stress` and `touch_charge` compute the results of a press from its equilibrium.
 
     Attributes:
         film: The film.
         probe: The probe.
         at: Centroid (x, y) of the footprint, mm.
         force: Force, N, positive in the direction of the push.
-        side_force: Force (Fx, Fy) of the probe on the film along the film, N.
+        side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N.
         theory: Terms of the film theory that were modelled.
-        mesh: Mesh under the press, which is rotated onto the x axis.
+        mesh: Mesh under the press. The press is rotated onto the x axis.
         field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3), dimensionless. The press is rotated
             onto the x axis.
         groups: Dimensionless groups of the press.
         status: "converged" or "failed".
         message: Description of the outcome in one sentence.
         iterations: Number of Newton steps with a new tangent. For a linear theory, the number of linear solves.
-        residual: Out-of-balance force relative to the load. For a linear theory, the energy norm of the last
-            correction.
-        seconds: Process CPU time for meshing and solving, s.
-        proven_error: Relative difference of the charges between this mesh and a mesh of one order less; None if only
-            one mesh was solved.
+        residual: Out-of-balance force divided by the load. For a linear theory, the energy norm of the last correction.
+        seconds: CPU time of the process for meshing and solving, s.
+        proven_error: Relative difference of the charges between this mesh and a mesh whose order is lower by one; None
+            if only one mesh was solved.
         rest: Equilibrium on the same mesh before the contact, under the static pressure alone; None if there is no
             static pressure. The touch stress does not include the stress of this equilibrium.
     """
@@ -70,7 +71,10 @@ class Equilibrium:
     rest: "Equilibrium | None" = None
 
     def __repr__(self) -> str:
-        """Return a summary of the press, the deflection and the largest stress, with a warning if PVDF would yield."""
+        """Return a summary of the press, the deflection and the largest stress.
+
+        If the stress exceeds the limit at which PVDF yields, the summary contains a warning.
+        """
         (depth,) = deflection(self, np.array([self.at]))
         _, largest_stress = principal_stress(self)
         exceeds_limit = largest_stress > DEFAULT_STRESS_LIMIT
@@ -83,9 +87,9 @@ class Equilibrium:
 
 
 def deflection(equilibrium: Equilibrium, points: Array) -> Array:
-    """Compute the deflection at points of the film, relative to the flat film.
+    """Compute the deflection of the film from its flat shape at given points.
 
-    The result includes the deflection by a static pressure.
+    The result includes the deflection that a static pressure causes.
 
     Args:
         equilibrium: The solved press.
@@ -98,7 +102,7 @@ def deflection(equilibrium: Equilibrium, points: Array) -> Array:
         SceneError: If a point lies outside the film.
     """
     mesh = equilibrium.mesh
-    element, xi, eta, _ = _locate(equilibrium, points)
+    element, xi, eta, _ = _locate(equilibrium, points)  # a reflection of points does not change the deflection
     basis_values = tensor_values(mesh.resolution.order, xi, eta)  # shape (n, n_local)
     nodal_field = equilibrium.field[mesh.template.nodes[element]]  # (U1, U2, W), shape (n, n_local, 3)
     scaled_deflection = (basis_values * nodal_field[..., 2]).sum(axis=1)
@@ -112,8 +116,8 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     Args:
         equilibrium: The solved press.
         points: Points (x, y) on the film, shape (n, 2), mm.
-        surface: Surface in the thickness; the probe touches "top". The bending stress is linear through the thickness.
-            It is included also if the theory neglects the resistance of the film to bending.
+        surface: Surface of the film at which the stress is computed. The probe touches the surface "top". The bending
+            stress is included even if the theory neglects the resistance of the film to bending.
 
     Returns:
         Stress (s11, s22, s12) in the axes of the film, shape (n, 3), MPa, tension positive.
@@ -127,40 +131,41 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
 
     # Strain of the mid-surface
     gradient = mesh.gradient(element, xi, eta)  # derivatives of the basis functions, shape (n, 2, n_local)
-    nodal_displacement = equilibrium.field[mesh.template.nodes[element]]
+    nodal_displacement = equilibrium.field[mesh.template.nodes[element]]  # (U1, U2, W), shape (n, n_local, 3)
     total_strain = strain(gradient @ nodal_displacement, groups.squared_amplitude)
 
-    # Strain of bending from the second derivatives of W
+    # Strain by bending, from the second derivatives of W
     if surface != "middle":
-        nodal_slope_of_deflection = node_slope(equilibrium)[element, :, :, 2]
+        nodal_slope_of_deflection = node_slopes(equilibrium)[element, :, :, 2]
         second_derivatives = gradient @ nodal_slope_of_deflection
         total_strain += _bending_strain(equilibrium, surface, second_derivatives)
 
-    # At the edges of a coat, the mesh represents the mean strain of the bare and the coated film.
+    # At the edges of a coat, the strain of the mesh is the mean strain of the bare and the coated film.
     if mesh.coat is not None:
-        total_strain = mesh.coat.film_strain(_rotated(equilibrium, points), total_strain)
+        total_strain = mesh.coat.film_strain(_to_press_frame(equilibrium, points), total_strain)
 
-    # Stress in the frame of the press, with s12 reversed in the reflected half, and then in the axes of the film
-    press_stress = equilibrium.film.young * groups.squared_amplitude * scaled_stress(total_strain, groups)
-    press_stress[is_reflected, 2] *= -1.0
+    # Compute the stress in the frame of the press. The shear stress has the opposite sign in the reflected half.
+    press_frame_stress = equilibrium.film.young * groups.squared_amplitude * scaled_stress(total_strain, groups)
+    press_frame_stress[is_reflected, 2] *= -1.0
+
+    # Rotate the stress into the axes of the film, and subtract the stress of the film before the contact, which is zero
+    # without a static pressure.
     x, y = equilibrium.at
-    film_stress = rotate_stress(press_stress, np.arctan2(y, x))
-
-    # Subtract the stress of the film before the contact. It is zero without a static pressure.
+    film_stress = rotate_stress(press_frame_stress, np.arctan2(y, x))
     if equilibrium.rest is None:
         return film_stress
     return np.asarray(film_stress - touch_stress(equilibrium.rest, points, surface))
 
 
 def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute the scaled touch stress C : E' at the nodes of every element, with the press rotated onto the x axis.
+    """Compute the scaled touch stress at the nodes of every element. The press is rotated onto the x axis.
 
     Args:
         equilibrium: The solved press.
-        surface: Surface in the thickness; see `touch_stress`.
+        surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
-        (S11, S22, S12) in units of E_young A^2, shape (n_element, n_local, 3).
+        Stress (S11, S22, S12) in units of E_young A^2, shape (n_element, n_local, 3).
     """
     if equilibrium.rest is None:
         return _induced_stress(equilibrium, surface)
@@ -168,19 +173,19 @@ def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array
 
 
 def _induced_stress(equilibrium: Equilibrium, surface: Surface) -> Array:
-    """Compute the scaled stress that all loads add to the pretension.
+    """Compute the scaled stress at the nodes that the probe and the static pressure add to the pretension.
 
     Args:
         equilibrium: The solved press.
-        surface: Surface in the thickness; see `touch_stress`.
+        surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
-        (S11, S22, S12) at the nodes in units of E_young A^2, shape (n_element, n_local, 3).
+        Stress (S11, S22, S12) in units of E_young A^2, shape (n_element, n_local, 3).
     """
-    slope = node_slope(equilibrium)  # of (U1, U2, W)
-    total_strain = strain(slope, equilibrium.groups.squared_amplitude)
+    slopes = node_slopes(equilibrium)
+    total_strain = strain(slopes, equilibrium.groups.squared_amplitude)
     if surface != "middle":
-        slope_of_deflection = slope[..., 2]
+        slope_of_deflection = slopes[..., 2]
         second_derivatives = equilibrium.mesh.node_derivatives(slope_of_deflection)
         total_strain += _bending_strain(equilibrium, surface, second_derivatives)
     return scaled_stress(total_strain, equilibrium.groups)
@@ -196,60 +201,64 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
         equilibrium: The solved press.
 
     Returns:
-        Smallest and largest stress, MPa, tension positive.
+        Smallest and largest principal stress, MPa, tension positive.
     """
-    # Scaled stresses, without the mean pretension, which is added last
+    # Compute the scaled principal stresses without the mean pretension. The deviator of the pretension is added before,
+    # because it changes the directions of the principal stresses.
     groups = equilibrium.groups
-    uneven_pretension = np.zeros(3) if groups.anisotropy is None else groups.anisotropy.tension
-    smallest, largest = principal_stresses(_induced_stress(equilibrium, "middle") + uneven_pretension)
+    deviator = np.zeros(3) if groups.anisotropy is None else groups.anisotropy.tension
+    smallest, largest = principal_stresses(_induced_stress(equilibrium, "middle") + deviator)
     if equilibrium.theory.bending:
         for surface in ("top", "bottom"):
-            _, largest_at_surface = principal_stresses(_induced_stress(equilibrium, surface) + uneven_pretension)
+            _, largest_at_surface = principal_stresses(_induced_stress(equilibrium, surface) + deviator)
             largest = max(largest, largest_at_surface)
 
+    # Convert the stresses to MPa, and add the mean pretension, which is the same in all directions.
     stress_unit = equilibrium.film.young * groups.squared_amplitude
     mean_pretension = equilibrium.film.pretension
     return stress_unit * smallest + mean_pretension, stress_unit * largest + mean_pretension
 
 
-def node_slope(equilibrium: Equilibrium) -> Array:
+def node_slopes(equilibrium: Equilibrium) -> Array:
     """Compute the derivatives of (U1, U2, W) with respect to (X1, X2) at the nodes of every element.
 
     Args:
         equilibrium: The solved press.
 
     Returns:
-        Derivatives, shape (n_element, n_local, 2, 3): the derivative, then the component.
+        Derivatives, shape (n_element, n_local, 2, 3). The last two axes are the coordinate and the displacement
+        component.
     """
     mesh = equilibrium.mesh
     return mesh.node_derivatives(equilibrium.field[mesh.template.nodes])
 
 
-def _bending_strain(equilibrium: Equilibrium, surface: Surface, hessian: Array) -> Array:
-    """Compute the scaled bending strain at a surface: the height of the surface times the curvatures of the film.
+def _bending_strain(equilibrium: Equilibrium, surface: Surface, second_derivatives: Array) -> Array:
+    """Compute the scaled bending strain at a surface of the film.
 
-    The height of a surface above the mid-surface is `HEIGHT` times half of the thickness.
+    The bending strain is the height of the surface above the mid-surface times the curvature of the film.
 
     Args:
         equilibrium: The solved press.
-        surface: Surface in the thickness.
-        hessian: Second derivatives of W, shape (..., 2, 2).
+        surface: Surface of the film.
+        second_derivatives: Second derivatives of W with respect to (X1, X2), shape (..., 2, 2).
 
     Returns:
-        (E11, E22, 2 E12), shape (..., 3), in units of A^2.
+        Strain (E11, E22, 2 E12), shape (..., 3), in units of A^2.
     """
     film = equilibrium.film
     amplitude = np.sqrt(equilibrium.groups.squared_amplitude)
-    half_thickness = 0.5 * film.thickness / (film.radius * amplitude)  # scaled, for curvatures in units of the strain
-    curvature = np.stack(
-        [hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1] + hessian[..., 1, 0]],
-        axis=-1,
-    )
-    return np.asarray((HEIGHT[surface] * half_thickness) * curvature)
+    # Half of the thickness in the unit of the deflection, which is the film radius times the amplitude
+    half_thickness = 0.5 * film.thickness / (film.radius * amplitude)
+    curvature_11 = second_derivatives[..., 0, 0]
+    curvature_22 = second_derivatives[..., 1, 1]
+    double_curvature_12 = second_derivatives[..., 0, 1] + second_derivatives[..., 1, 0]
+    curvature = np.stack([curvature_11, curvature_22, double_curvature_12], axis=-1)
+    return np.asarray((SURFACE_HEIGHT[surface] * half_thickness) * curvature)
 
 
 def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, Array, Booleans]:
-    """Find the elements that contain points, and the local coordinates of the points in their elements.
+    """Find the elements that contain given points, and the local coordinates of the points in their elements.
 
     Args:
         equilibrium: The solved press.
@@ -264,25 +273,33 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
     """
     points = np.asarray(points, dtype=float)
     film = equilibrium.film
-    distance = np.hypot(points[:, 0], points[:, 1])
-    rim_distance: Array | float = film.radius  # from the centre, in the direction of each point
+    distance = np.hypot(points[:, 0], points[:, 1])  # from the centre of the film
+
+    # Distance of the rim from the centre in the direction of each point
+    rim_distance: Array | float = film.radius
     if film.oval:
         angle = np.arctan2(points[:, 1], points[:, 0])
         rim_distance = film.radius * (1.0 + film.oval * np.cos(2.0 * (angle - film.oval_axis)))
+
     # The condition is negated, so that points with NaN count as outside. The tolerance is for rounding errors.
     is_outside = ~(distance <= rim_distance * (1.0 + 1e-9))
     if is_outside.any():
-        x, y = points[np.argmax(is_outside)]  # the first point outside
+        first_outside = np.argmax(is_outside)
+        x, y = points[first_outside]
         raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {film.radius:.4g} mm")
-    return equilibrium.mesh.locate(_rotated(equilibrium, points))
+    return equilibrium.mesh.locate(_to_press_frame(equilibrium, points))
 
 
-def _rotated(equilibrium: Equilibrium, points: Array) -> Complexes:
-    """Rotate points (x, y), shape (n, 2), mm, into the frame with the press on the positive x axis, as x + iy.
+def _to_press_frame(equilibrium: Equilibrium, points: Array) -> Complexes:
+    """Rotate points into the frame in which the press lies on the positive x axis.
+
+    Args:
+        equilibrium: The solved press.
+        points: Points (x, y) in the axes of the film, shape (n, 2), mm.
 
     Returns:
-        Points, shape (n,), in film radii.
+        Points x + iy, shape (n,), in film radii.
     """
-    z = (points[:, 0] + 1j * points[:, 1]) / equilibrium.film.radius
+    complex_points = (points[:, 0] + 1j * points[:, 1]) / equilibrium.film.radius
     press_x, press_y = equilibrium.at
-    return np.asarray(z * np.exp(-1j * np.arctan2(press_y, press_x)))
+    return np.asarray(complex_points * np.exp(-1j * np.arctan2(press_y, press_x)))

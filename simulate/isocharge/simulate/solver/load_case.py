@@ -1,4 +1,4 @@
-"""Decisions about a press before the solve: checks, the theory, and the coarsest mesh that the accuracy allows."""
+"""Checks of a press before the solve, and choice of the theory and of the coarsest mesh that is accurate enough."""
 
 import math
 from collections.abc import Iterator
@@ -23,14 +23,16 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.solver.error_estimate import shape_error
 
 TOLERANCE = 1e-7
-"""Ratio of the out-of-balance force to the load at which a solve has converged, dimensionless. The ratio is far below
-the error of the mesh and well above rounding errors."""
+"""Ratio of the out-of-balance force to the load at which a solve has converged, dimensionless.
+
+The ratio is far below the error of the mesh, and well above rounding errors.
+"""
 
 Auto = Literal["auto"]
 """Value of a setting that is chosen automatically for a press, or for all presses of a forward map."""
 
 LAYER_WIDTH = 6.0
-"""Width of the thin rings at the rim, in bending lengths. Widths from 4 to 14 change a charge by at most 1e-4."""
+"""Total width of the thin rings at the rim, in bending lengths. Widths from 4 to 14 change a charge by at most 1e-4."""
 
 MIN_LAYER_REUSE = 0.75
 """Smallest ratio of the width of the thin rings of a starting equilibrium to `LAYER_WIDTH` at which it is reused."""
@@ -39,40 +41,51 @@ MAX_LAYER_REUSE = 2.0
 """Largest ratio of the width of the thin rings of a starting equilibrium to `LAYER_WIDTH` at which it is reused."""
 
 MAX_AMPLITUDE2 = 0.1
-"""Largest squared amplitude A^2, which is the order of the strains, for which St. Venant-Kirchhoff elasticity is
-valid."""
+"""Largest squared amplitude A^2 for which Saint-Venant-Kirchhoff elasticity is valid, dimensionless.
+
+The strains are of the order A^2.
+"""
 
 MAX_SIDE_SHARE = 1.0
 """Largest ratio of the side force to the force of the press. It corresponds to a coefficient of friction of one."""
 
 MIN_PROBE_REACH = 1e-5
-"""Smallest reach of a probe, in film radii. The grading of the mesh for smaller probes exceeds the resolution of
-float64."""
+"""Smallest reach of a probe, in film radii.
+
+For smaller probes, the ratio of the largest to the smallest element of the mesh would exceed the resolution of float64.
+"""
 
 REFINEMENTS = ((0, 1), (1, 1), (0, 2), (2, 1), (1, 2), (0, 3), (2, 2), (1, 3), (2, 3), (3, 3))
-"""Meshes that are tried one after the other. Each pair consists of the increase of the order and the factor of the
-number of elements around the circle."""
+"""Refinements of the mesh that are tried one after the other.
+
+Each pair consists of the increase of the order, and of the factor by which the number of elements around the innermost
+circle is multiplied.
+"""
 
 THIN_RINGS_PER_FACTOR = 0.8
-"""Number of thin rings at the rim per factor of three between their largest and smallest width."""
+"""Number of thin rings at the rim for each factor of three between their largest and their smallest width."""
 
 MAX_SHAPE_ERROR = 0.05
-"""Largest predicted relative error of a charge on the finest mesh. A press with a larger error is rejected, because it
-is too close to the rim."""
+"""Largest allowed relative error of a charge that is predicted for the finest mesh.
+
+A press with a larger error is rejected, because it is too close to the rim.
+"""
 
 RELIABLE_RADIUS = 0.6
 """Distance from the centre within which the shapes of the elements predict the error reliably, in film radii."""
 
 MIN_RIM_DISTANCE = 0.2
-"""Smallest distance from the rim of a curved footprint that is not circular, relative to its reach.
+"""Smallest distance between the rim and a curved footprint that is not circular, divided by the reach of the footprint.
 
 If the footprint is closer to the rim, the mesh between the footprint and the innermost circle is so thin that points
 cannot be located.
 """
 
 RELIABLE_REACH = 0.08
-"""Largest reach of a footprint that is not circular for which the shapes of the elements predict the error reliably, in
-film radii."""
+"""Largest reach of a footprint, in film radii, for which the shapes of the elements predict the error reliably.
+
+The limit applies to footprints that are not circular.
+"""
 
 
 @dataclass(frozen=True)
@@ -80,12 +93,12 @@ class SolveSettings:
     """Settings of a solve.
 
     Attributes:
-        accuracy: Target of the relative error of a charge.
+        accuracy: Largest allowed relative error of a charge.
         theory: Terms of the film theory; "auto" for the fewest terms that the accuracy allows.
         resolution: Fineness of the mesh; "auto" for the coarsest mesh that reaches the accuracy.
-        layer: Width of the thin rings at the rim, in film radii; "auto" for six bending lengths, or for the width of
-            the starting equilibrium if that is similar.
-        tolerance: Out-of-balance force over load at which a solve has converged.
+        layer: Total width of the thin rings at the rim, in film radii. "auto" for six bending lengths, or for the width
+            of the thin rings of the starting equilibrium if it is similar.
+        tolerance: Ratio of the out-of-balance force to the load at which a solve has converged.
     """
 
     accuracy: float = ACCURACY
@@ -96,7 +109,7 @@ class SolveSettings:
 
 
 def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float) -> None:
-    """Raise an error if a press cannot exist or exceeds the range of Saint-Venant-Kirchhoff elasticity.
+    """Raise an error if a press cannot exist, or if its strains exceed the range of Saint-Venant-Kirchhoff elasticity.
 
     Args:
         film: The film.
@@ -105,8 +118,8 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
         force: Force, N.
 
     Raises:
-        SceneError: If the footprint is too small or not completely on the film, if the force is not positive and
-            finite, or if the strains are not small.
+        SceneError: If the force is not positive and finite, if the footprint is too small, too close to the rim or not
+            completely on the film, or if the strains are not small.
     """
     if not (np.isfinite(force) and force > 0.0):
         raise SceneError(f"force: expected a positive number of newtons (F > 0 pushes), got {force}")
@@ -115,7 +128,9 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
             f"probe: expected a reach of at least {MIN_PROBE_REACH:g} of the film's radius ({film.radius:.4g} mm), got "
             f"{probe.reach:.4g} mm"
         )
-    farthest_distance = probe.farthest_distance(at)  # of a point of the footprint from the centre of the film
+
+    # Distance of the farthest point of the footprint from the centre of the film
+    farthest_distance = probe.farthest_distance(at)
     if not farthest_distance < film.radius * (1.0 - 1e-6):
         raise SceneError(
             f"probe off the film: centre ({at[0]:.4g}, {at[1]:.4g}) mm, farthest point of {probe.notation} "
@@ -130,6 +145,7 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
             f"expected at least {min_rim_distance:.3g} mm, because the mesh around the footprint would be too thin; "
             "press farther inside"
         )
+
     squared_amplitude = amplitude_squared(film, force)
     if squared_amplitude > MAX_AMPLITUDE2:
         raise SceneError(
@@ -142,27 +158,36 @@ def check_side_force(side_force: tuple[float, float], force: float) -> None:
     """Raise an error if a side force is not finite or exceeds the force of the press.
 
     Args:
-        side_force: Force (Fx, Fy) along the film, N.
+        side_force: Force (Fx, Fy) in the plane of the film, N.
         force: Force of the press, N.
 
     Raises:
-        SceneError: If a component is not finite, or the side force exceeds `MAX_SIDE_SHARE` times the force.
+        SceneError: If a component is not finite, or if the side force exceeds `MAX_SIDE_SHARE` times the force.
     """
-    size = float(np.hypot(*side_force))
-    if not size <= MAX_SIDE_SHARE * force:
+    side_x, side_y = side_force
+    magnitude = float(np.hypot(side_x, side_y))
+    if not magnitude <= MAX_SIDE_SHARE * force:  # the condition is negated, so that NaN raises the error
         raise SceneError(
             f"side force: expected at most {MAX_SIDE_SHARE:g} times the force of {force:.4g} N, got {side_force} N"
         )
 
 
 def layer_for(film: Film, force: float) -> float:
-    """Return the width (film radii) of the thin rings at the rim for a force (N)."""
+    """Compute the total width of the thin rings at the rim.
+
+    Args:
+        film: The film.
+        force: Force of the press, N.
+
+    Returns:
+        Width, in film radii.
+    """
     return LAYER_WIDTH * bending_length(film, force)
 
 
 @dataclass(frozen=True)
 class LoadCase:
-    """A press, and all settings of its solve except the resolution of the mesh.
+    """A press with all settings of its solve except the resolution of the mesh.
 
     Attributes:
         film: The film.
@@ -170,11 +195,11 @@ class LoadCase:
         at: Centroid (x, y) of the footprint, mm.
         force: Force, N.
         theory: Terms of the film theory.
-        layer: Width of the thin rings at the rim, in film radii.
-        accuracy: Target of the relative error of a charge.
-        tolerance: Out-of-balance force over load at which the solve has converged.
+        layer: Total width of the thin rings at the rim, in film radii.
+        accuracy: Largest allowed relative error of a charge.
+        tolerance: Ratio of the out-of-balance force to the load at which the solve has converged.
         began: Reading of the CPU clock of the process at the beginning of the work on the press, s.
-        side_force: Force (Fx, Fy) of the probe on the film along the film, N.
+        side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N.
     """
 
     film: Film
@@ -199,7 +224,7 @@ class LoadCase:
         start: PlacedMesh | None,
         side_force: tuple[float, float] = (0.0, 0.0),
     ) -> Self:
-        """Check a press, and replace the theory and the width of the thin rings if they are "auto".
+        """Check a press, and choose the theory and the width of the thin rings if their settings are "auto".
 
         Args:
             film: The film.
@@ -207,22 +232,25 @@ class LoadCase:
             at: Centroid (x, y) of the footprint, mm.
             force: Force, N.
             settings: Settings of the solve.
-            start: Mesh of the equilibrium from which the solve starts; None if there is none.
-            side_force: Force (Fx, Fy) of the probe on the film along the film, N.
+            start: Mesh of the equilibrium from which the solve starts; None if there is no such equilibrium.
+            side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N.
 
         Raises:
-            SceneError: If the press cannot exist, or a linear theory is requested for a side force or for a film with a
-                pressure on its back.
+            SceneError: If the press cannot exist, or if a linear theory is requested for a side force or for a film
+                with a pressure on its back.
         """
         began = process_time()
         check_press(film, probe, at, force)
         check_side_force(side_force, force)
+        has_side_force = any(side_force)
+
+        # Linear theories omit the effect of a side force on the deflection.
         theory = settings.theory
         if theory == "auto":
             theory = choose_theory(film, probe, force, settings.accuracy)
-            if any(side_force):  # linear theories omit the effect of the side force on the deflection
+            if has_side_force:
                 theory = replace(theory, stretching=True)
-        elif any(side_force) and not theory.stretching:
+        elif has_side_force and not theory.stretching:
             raise SceneError(
                 f"theory {theory.name!r}: a side force changes the deflection through the stress that it induces, "
                 "which a linear theory omits; use 'nonlinear membrane', 'nonlinear membrane + bending' or 'auto'"
@@ -232,27 +260,39 @@ class LoadCase:
                 f"theory {theory.name!r}: linear theories have no static pressure and no closed back; use 'nonlinear "
                 "membrane', 'nonlinear membrane + bending' or 'auto'"
             )
+
         layer = settings.layer
         if layer == "auto":
             layer = _choose_layer(film, force, probe, settings, start)
-        return cls(film, probe, at, force, theory, layer, settings.accuracy, settings.tolerance, began, side_force)
+        return cls(
+            film=film,
+            probe=probe,
+            at=at,
+            force=force,
+            theory=theory,
+            layer=layer,
+            accuracy=settings.accuracy,
+            tolerance=settings.tolerance,
+            began=began,
+            side_force=side_force,
+        )
 
     def place(self, resolution: Resolution) -> PlacedMesh:
-        """Return the mesh of a resolution under this press."""
+        """Create the mesh under this press with a given resolution."""
         return place_coated(self.film, self.probe, self.at, resolution, self.layer, whole=any(self.side_force))
 
 
 def place_coated(
     film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float, *, whole: bool = False
 ) -> PlacedMesh:
-    """Place a mesh under a press, as `place` does. If the film has a coat, refine the mesh along the edges of the coat.
+    """Create the mesh under a press. If the film has a coat, refine the mesh along the edges of the coat.
 
     Args:
         film: The film.
         probe: The probe.
         at: Centroid (x, y) of the footprint, mm.
         resolution: Fineness of the mesh.
-        layer: Width of the thin rings at the rim, in film radii.
+        layer: Total width of the thin rings at the rim, in film radii.
         whole: Whether to mesh the whole film although film and footprint are symmetric.
 
     Returns:
@@ -262,7 +302,7 @@ def place_coated(
     if film.coat is None:
         return mesh
 
-    # Outlines of the coat as complex numbers, in film radii, rotated with the press onto the x axis
+    # Convert the outlines of the coat to complex numbers in film radii, and rotate them with the press onto the x axis.
     x, y = at
     angle = float(np.arctan2(y, x))
     rotation_and_scale = np.exp(-1j * angle) / film.radius
@@ -271,8 +311,8 @@ def place_coated(
         outlines = [to_complex(np.array(part)) * rotation_and_scale for part in coat_layer]
         coat_layers.append(tuple(outlines))
 
-    # The stresses of the three unit strains form an elasticity matrix over E of the film. The elasticity does not
-    # depend on the force, so any force may be used.
+    # Compute the elasticity matrices of the film and of the coat, divided by Young's modulus of the film. The rows are
+    # the stresses of the three unit strains. The elasticity does not depend on the force, so any force may be used.
     unit_strains = np.eye(3)
     groups = DimensionlessGroups.of(film, force=1.0, bending=False, angle=angle)
     film_moduli = scaled_stress(unit_strains, groups)
@@ -282,17 +322,18 @@ def place_coated(
 
 
 def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None) -> float:
-    """Choose the width of the thin rings, in film radii.
+    """Choose the total width of the thin rings at the rim.
 
-    The width is `LAYER_WIDTH` bending lengths. If the starting equilibrium can have the same mesh and has a similar
-    width, its width is reused. The field of the equilibrium can then be the first iterate.
+    The width is `LAYER_WIDTH` bending lengths. If the mesh of a starting equilibrium has thin rings of a similar width
+    and may have the same elements, the width of its thin rings is used instead. The field of the starting equilibrium
+    can then be the first iterate of the solve.
 
     Args:
         film: The film.
         force: Force, N.
         probe: The probe.
-        settings: Settings of the solver.
-        start: Mesh of the starting equilibrium; None if there is none.
+        settings: Settings of the solve.
+        start: Mesh of the starting equilibrium; None if there is no starting equilibrium.
 
     Returns:
         Width of the thin rings, in film radii.
@@ -300,19 +341,24 @@ def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSetting
     layer = layer_for(film, force)
     if start is None:
         return layer
-    is_similar_width = MIN_LAYER_REUSE < start.layer / layer < MAX_LAYER_REUSE
+    has_similar_width = MIN_LAYER_REUSE < start.layer / layer < MAX_LAYER_REUSE
     may_have_same_resolution = settings.resolution in ("auto", start.resolution)
     has_same_topology = probe.topology == start.template.topology
-    if is_similar_width and may_have_same_resolution and has_same_topology:
+    if has_similar_width and may_have_same_resolution and has_same_topology:
         return start.layer
     return layer
 
 
 def choose_mesh(case: LoadCase) -> PlacedMesh:
-    """Return the coarsest mesh whose element shapes predict the required accuracy, or the finest mesh if none does.
+    """Return the coarsest mesh whose predicted error is small enough, or the finest mesh if no mesh is sufficient.
+
+    The error is predicted from the shapes of the elements.
+
+    Args:
+        case: The press and the required accuracy.
 
     Raises:
-        SceneError: If the press is so near the rim that even the finest mesh is too distorted.
+        SceneError: If the press is so close to the rim that even the finest mesh is too distorted.
     """
     for resolution in _candidate_resolutions(case):
         mesh = case.place(resolution)
@@ -320,14 +366,20 @@ def choose_mesh(case: LoadCase) -> PlacedMesh:
         if error <= 0.5 * case.accuracy:  # the other half is for the omitted terms of the theory
             return mesh
 
-    # No mesh is sufficient. The last one is the finest mesh.
+    # No mesh is sufficient. The last mesh, which is the finest, is still used if its error is moderate.
     if error > MAX_SHAPE_ERROR:
         raise too_near_the_rim(case, resolution)
     return mesh
 
 
 def needs_second_mesh(case: LoadCase) -> bool:
-    """Return whether a press must be solved on two meshes, so that its error can be estimated; see `error_estimate`."""
+    """Return whether a press must be solved on two meshes in order to estimate its error.
+
+    The docstring of the module `error_estimate` states the reasons.
+
+    Args:
+        case: The press and the required accuracy.
+    """
     radius = case.film.radius
     is_large = not case.probe.topology.fills_circle and case.probe.reach > RELIABLE_REACH * radius
     is_near_rim = case.probe.farthest_distance(case.at) > RELIABLE_RADIUS * radius
@@ -335,7 +387,12 @@ def needs_second_mesh(case: LoadCase) -> bool:
 
 
 def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
-    """Return the error that reports that the mesh under a press is too distorted."""
+    """Create the exception for a press that is so close to the rim that its mesh is too distorted.
+
+    Args:
+        case: The press.
+        resolution: Fineness of the distorted mesh.
+    """
     return SceneError(
         f"press at ({case.at[0]:.4g}, {case.at[1]:.4g}) mm comes within "
         f"{case.film.radius - case.probe.farthest_distance(case.at):.3g} mm of the rim, too near for a mesh of order "
@@ -344,54 +401,58 @@ def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
 
 
 def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
-    """Yield the resolutions of a press from coarse to fine.
+    """Generate the resolutions that are tried for a press, from coarse to fine.
 
-    A small probe needs more rings. If the press is close to the rim, the conformal map stretches the template, and the
-    mesh needs more rings and more elements around the circle. In the inner half of the film, the first resolution is
+    A small probe needs more rings. A press close to the rim needs more rings and more elements around the innermost
+    circle, because the conformal map stretches the template. In the inner half of the film, the first resolution is
     sufficient.
 
     Args:
-        case: The press and its accuracy.
+        case: The press and the required accuracy.
     """
     film = case.film
     probe = case.probe
-    # Place a mesh to obtain the conformal map. All meshes under the press have the same conformal map.
+
+    # Place a coarse mesh to obtain the conformal map, which is the same for all meshes under the press.
     coarse_resolution = Resolution(order=2, around=8, rings=1)
     placement = place(film, probe, case.at, coarse_resolution, layer=0.1).placement
 
-    # If the circle around a footprint that is not circular does not fit on the film, it needs more elements around it.
-    needed_radius = probe.farthest_distance(case.at) + CLEARANCE * probe.reach
-    is_crowded = not probe.topology.fills_circle and needed_radius > film.radius
+    # A footprint that is not circular is enclosed by a circle with a gap. If this circle does not fit on the film, the
+    # mesh needs more elements around the circle.
+    enclosing_extent = probe.farthest_distance(case.at) + CLEARANCE * probe.reach
+    is_crowded = not probe.topology.fills_circle and enclosing_extent > film.radius
 
-    # A better accuracy requires a higher order. A small probe (rho) and the stretch of the conformal map require more
-    # rings. The factors are empirical.
+    # A better accuracy requires a higher order. A small radius `rho` of the innermost circle and the stretch of the
+    # conformal map require more rings. The factors are empirical.
     extra_order = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.accuracy)))
     first_order = 5 if case.theory.bending and film.coat is None else 4
     rings_for_stretch = min(2.0 * math.log(_stretch(placement)), 4.0)
     rings = math.ceil(-1.3 * math.log(float(placement.rho)) + rings_for_stretch)
-    base = Resolution(
+    first_resolution = Resolution(
         order=first_order + extra_order,
         around=16 if is_crowded else 8,
         rings=max(3, rings) + extra_order // 2,
-        rim=_thin_rings(placement, case.layer) if case.theory.bending else 0,
+        rim=_thin_ring_count(placement, case.layer) if case.theory.bending else 0,
     )
     for order_increase, around_factor in REFINEMENTS:
-        yield replace(base, order=base.order + order_increase, around=base.around * around_factor)
+        order = first_resolution.order + order_increase
+        around = first_resolution.around * around_factor
+        yield replace(first_resolution, order=order, around=around)
 
 
-def _thin_rings(placement: Placement, layer: float) -> int:
-    """Return the number of thin rings at the rim.
+def _thin_ring_count(placement: Placement, layer: float) -> int:
+    """Compute the number of thin rings at the rim.
 
-    Each ring is a third as wide as the previous ring. In the template plane, the boundary layer of bending has its
-    largest width next to the probe. The boundary layer has its smallest width on the far side of the film, where the
-    conformal map compresses it. The widths of the rings cover the range between these two widths.
+    Each thin ring is a third as wide as the previous thin ring. In the template plane, the boundary layer of bending is
+    widest next to the probe. The boundary layer is narrowest on the opposite side of the film, where the conformal map
+    compresses it. The widths of the thin rings cover the range between the largest and the smallest width.
 
     Args:
         placement: Placement of the mesh under the press.
-        layer: Width of the thin rings, in film radii.
+        layer: Total width of the thin rings on the film, in film radii.
     """
-    # Widths of the boundary layer in the template plane, relative to the depth of all rings in ln r. The upper bounds
-    # limit the thin rings to the neighbourhood of the rim.
+    # Widths of the boundary layer in the template plane, divided by the depth of all rings in ln r. The limit of 1 / 8
+    # restricts the thin rings to the neighbourhood of the rim.
     stretch = _stretch(placement)
     total_depth = -float(np.log(placement.rho))
     largest_width = min(layer * stretch / total_depth, 1.0 / 8.0)
@@ -402,5 +463,5 @@ def _thin_rings(placement: Placement, layer: float) -> int:
 
 
 def _stretch(placement: Placement) -> float:
-    """Return the factor by which the conformal map stretches the rim next to the probe."""
+    """Return the factor by which the conformal map stretches the template at the rim next to the probe."""
     return float((1.0 + placement.c) / (1.0 - placement.c))

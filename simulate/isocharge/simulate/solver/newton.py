@@ -1,10 +1,12 @@
 """Newton's method for the equilibrium of the film, and the direct solution of the linear theories.
 
-A flat film without pretension has no transverse stiffness, so the plain Newton method fails. Three measures make the
-method reliable. The first iterate has the shape of Schwerin's solution. A line search on the energy determines the
-length of each step. A tension proportional to the residual is added to the tangent matrix, but not to the residual.
-With this tension, each step is a descent direction, and the convergence near the equilibrium remains quadratic. The
-iteration stops after `MAX_ITERATIONS` steps, or if the steps no longer become smaller (`PATIENCE`).
+A flat film without pretension has no transverse stiffness, so Newton's method fails without modifications. Three
+modifications make the method reliable. First, the initial iterate has the shape of Schwerin's solution. Second, a line
+search on the energy determines the length of each step. Third, a stabilising tension is added to the tangent matrix,
+but not to the residual. With this tension, each step is a descent direction. The tension is proportional to the
+residual and vanishes near the equilibrium, so the convergence remains quadratic there.
+
+The iteration stops after `MAX_ITERATIONS` steps, or if the steps no longer become smaller (`PATIENCE`).
 """
 
 from dataclasses import dataclass
@@ -19,20 +21,23 @@ from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.solver.assembly import Assembly
 from isocharge.simulate.solver.tangent_factor import TangentFactor, factor_tangent
 
-GUARD_TENSION = 0.4
-"""Tension that is added to the tangent at a relative residual of one, in units of the induced tension of a film without
-pretension."""
+STABILISING_TENSION = 0.4
+"""Stabilising tension at a relative residual of one.
 
-GUARD_BELOW = 1e-2
-"""Relative residual below which no tension is added to the tangent, dimensionless."""
+The unit is the tension that the load induces in a film without pretension.
+"""
+
+UNSTABILISED_BELOW = 1e-2
+"""Relative residual below which no stabilising tension is added to the tangent, dimensionless."""
 
 MAX_ITERATIONS = 60
-"""Largest number of Newton steps. Typical presses need five to ten."""
+"""Largest number of Newton steps. Typical presses need five to ten steps."""
 
 PATIENCE = 8
-"""Number of steps after which stagnation is detected.
+"""Number of recent steps that are compared with all earlier steps.
 
-The iteration stops if the smallest of the last PATIENCE steps is not below half of the smallest step before them."""
+The iteration stops if the smallest recent step is not smaller than half of the smallest earlier step.
+"""
 
 MAX_REFINEMENTS = 5
 """Largest number of corrections of a linear solve."""
@@ -41,22 +46,31 @@ REFINEMENT_TOLERANCE = 1e-5
 """Energy norm of a correction of a linear solve at which the solve has converged."""
 
 CHORD_START = 0.15
-"""Largest ratio of the residual after a Newton step to the residual before it at which the factorised tangent is used
-again."""
+"""Largest ratio of the residual after a Newton step to the residual before the step at which the tangent is reused."""
 
 CHORD_CONTINUE = 0.3
-"""Largest ratio of the residual after a step with a reused tangent to the residual before it at which the tangent is
-used once more."""
+"""Largest ratio of the residual after a step with a reused tangent to the residual before the step.
+
+If the ratio is larger, the tangent is not reused again.
+"""
 
 ROUND_OFF = 1e-9
-"""Size of a Newton step that is caused by rounding errors only. The size is the energy norm relative to the work of the
-load."""
+"""Size below which a Newton step is caused by rounding errors only.
+
+The size of a step is its energy norm relative to the work of the load.
+"""
 
 FIRST_DESCENT_TENSION = 0.05
-"""Smallest tension that is added to the tangent to obtain a descent direction, in units of the guard tension."""
+"""Smallest tension that is added to the tangent to obtain a descent direction.
+
+The unit is the stabilising tension at a relative residual of one.
+"""
 
 MAX_DESCENT_TRIALS = 12
-"""Largest number of tensions that are tried to obtain a descent direction. Each tension is twice the previous one."""
+"""Largest number of tensions that are tried to obtain a descent direction.
+
+Each tension is twice the previous tension.
+"""
 
 MAX_HALVINGS = 30
 """Largest number of step lengths that the line search tries."""
@@ -65,7 +79,7 @@ ARMIJO_SHARE = 1e-4
 """Smallest accepted ratio of the decrease of the energy to the decrease that the slope predicts, dimensionless."""
 
 ENERGY_ROUND_OFF = 1e-12
-"""Relative change of the energy that is caused by round-off only."""
+"""Relative change of the energy that may be caused by rounding errors only."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +90,8 @@ class NewtonResult:
         field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
         converged: Whether the residual is below the tolerance or at the level of rounding errors.
         iterations: Number of Newton steps. For a linear theory, the number of linear solves.
-        residual: Relative residual, which is the larger one of two ratios: the transverse residual to the load, and the
-            in-plane residual to the in-plane forces. For a linear theory, the energy norm of the last correction.
+        residual: Larger of two ratios, namely of the transverse residual to the load, and of the in-plane residual to
+            the in-plane forces. For a linear theory, the energy norm of the last correction.
         message: Description of the outcome in one sentence.
     """
 
@@ -89,56 +103,60 @@ class NewtonResult:
 
 
 def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Array:
-    """Compute the first iterate of Newton's method: Schwerin's deflection, and no in-plane displacement.
+    """Compute the first iterate of Newton's method from Schwerin's deflection of a membrane.
 
-    Schwerin's deflection is W = (3 / pi)^(1/3) (1 - r^(2/3)). This deflection is exact for a membrane without
-    pretension under a point load if Poisson's ratio is 1/3 (Schwerin 1929). The radius r is measured in the template
-    plane. For a film with pretension or bending, the deflection is reduced.
+    Schwerin's deflection is W = (3 / pi)^(1/3) (1 - r^(2/3)), where r is the distance from the origin of the template
+    plane. This deflection is exact for a membrane without pretension under a point load if Poisson's ratio is 1/3
+    (Schwerin 1929). In the first iterate, the estimated height of the film under the probe replaces the factor
+    (3 / pi)^(1/3). The in-plane displacements are zero.
 
     Args:
-        z: Nodes in the template plane, shape (n_node,).
+        z: Nodes x + iy in the template plane, shape (n_node,).
         rho: Radius of the innermost circle in the template plane.
         groups: Dimensionless groups of the press.
 
     Returns:
-        Scaled displacements (U1, U2, W), shape (n_node, 3).
+        Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
     """
-    # The height replaces the factor (3 / pi)^(1/3), which is about 1. The term rho^2 rounds the tip of the deflection
-    # under the probe.
-    shape = np.cbrt(1.0 + rho**2) - np.cbrt(np.abs(z) ** 2 + rho**2)
+    # The term rho^2 rounds the tip of the deflection under the probe.
+    deflection_shape = np.cbrt(1.0 + rho**2) - np.cbrt(np.abs(z) ** 2 + rho**2)
     field = np.zeros((z.size, 3))
-    field[:, 2] = groups.height * shape
+    field[:, 2] = groups.height * deflection_shape
     is_on_rim = np.abs(z) > 1.0 - 1e-9
     field[is_on_rim] = 0.0
     return field
 
 
 def parabolic_start(radius: np.ndarray, groups: DimensionlessGroups) -> Array:
-    """Compute the first iterate for a film under static pressure without a probe.
+    """Compute the first iterate of Newton's method for a film under static pressure without a probe.
+
+    The deflection is a paraboloid with the height that the static pressure approximately causes.
 
     Args:
-        radius: Distances of the nodes from the centre, shape (n_node,), in film radii.
+        radius: Distances of the nodes from the centre of the film, shape (n_node,), in film radii.
         groups: Dimensionless groups of the film.
 
     Returns:
-        Scaled displacements (U1, U2, W), shape (n_node, 3).
+        Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
     """
     field = np.zeros((radius.size, 3))
     field[:, 2] = groups.static_height * np.maximum(1.0 - radius**2, 0.0)
-    field[radius > 1.0 - 1e-9] = 0.0
+    is_on_rim = radius > 1.0 - 1e-9
+    field[is_on_rim] = 0.0
     return field
 
 
 def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
-    """Solve a linear theory: the deflection W under the load, and the in-plane displacement U that W causes.
+    """Solve a linear theory of the film.
 
-    The induced stress does not affect the deflection. The tangent of the flat film does not couple W and U. Each
-    further solve therefore computes U, and also a correction of W (iterative refinement). The energy norm of the
+    The first solve computes the deflection W under the load. The deflection causes the in-plane displacement U. In a
+    linear theory, the induced stress does not affect the deflection. The tangent of the flat film does not couple W and
+    U. Therefore each further solve computes U and, by iterative refinement, a correction of W. The energy norm of the
     correction is a measure of the error of W.
 
     Args:
-        elastic: The discrete film.
-        assembly: Linear solver for its mesh.
+        elastic: Discrete model of the film.
+        assembly: Linear solver for the mesh of the film.
 
     Returns:
         The result, which has not converged if the linear system is nearly singular.
@@ -150,12 +168,12 @@ def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
     n_solve = 1
     correction_size = np.inf
     for _ in range(MAX_REFINEMENTS):
-        # In-plane residual with the stress that W induces; transverse residual without it
+        # The in-plane residual includes the stress that W induces. The transverse residual does not include it.
         residual = elastic.residual(field)
         residual[:, 2] = _linear_residual(elastic, field)[:, 2]
         correction = factor.solve(-residual)
         n_solve += 1
-        correction_size = _energy_norm(elastic, field, correction[:, 2], residual[:, 2])
+        correction_size = _step_size(elastic, field, correction[:, 2], residual[:, 2])
         field = field + correction
         if correction_size <= REFINEMENT_TOLERANCE:
             message = f"linear theory, solved to round-off: corrected by {correction_size:.0e}"
@@ -164,46 +182,51 @@ def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
 
 
 def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
-    """Compute the residual without the forces of the induced stress.
+    """Compute the transverse residual without the forces of the induced stress.
 
-    The forces of the induced stress are cubic in the field, and the other forces are linear. A field with the amplitude
-    a therefore changes the residual by r(a) = k a + c a^3. Two amplitudes determine the linear part k = (8 r(a) - r(2
-    a)) / (6 a).
+    For a deflection without in-plane displacement, the transverse forces of the induced stress are cubic functions of
+    the deflection, and all other transverse forces are linear functions. Compared with the flat film, a deflection that
+    is multiplied by a factor a therefore changes the residual by r(a) = k a + c a^3. The linear part k = (8 r(a) - r(2
+    a)) / (6 a) follows from the changes for the factors a and 2 a.
 
     Args:
-        elastic: The discrete film.
-        field: Scaled displacements, shape (n_node, 3).
+        elastic: Discrete model of the film.
+        field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
 
     Returns:
-        Residual, shape (n_node, 3).
+        Residual, shape (n_node, 3). Only the last column is meaningful.
     """
-    amplitude = 0.01  # any amplitude gives the same linear part, except for rounding errors
+    factor = 0.01  # every small factor results in the same linear part
     flat_residual = elastic.residual(np.zeros_like(field))
-    single_change = elastic.residual(amplitude * field) - flat_residual
-    double_change = elastic.residual(2.0 * amplitude * field) - flat_residual
-    return flat_residual + (8.0 * single_change - double_change) / (6.0 * amplitude)
+    single_change = elastic.residual(factor * field) - flat_residual
+    double_change = elastic.residual(2.0 * factor * field) - flat_residual
+    return flat_residual + (8.0 * single_change - double_change) / (6.0 * factor)
 
 
 def solve_newton(
-    elastic: ElasticFilm, assembly: Assembly, start: Array, tolerance: float, local_below: float = GUARD_BELOW
+    elastic: ElasticFilm,
+    assembly: Assembly,
+    first_field: Array,
+    tolerance: float,
+    full_steps_below: float = UNSTABILISED_BELOW,
 ) -> NewtonResult:
-    """Solve for the equilibrium with Newton's method.
+    """Solve for the equilibrium of the film by Newton's method.
 
-    Each iteration factorises the tangent, takes one Newton step, and reuses the factorised tangent for further steps as
-    long as they reduce the residual.
+    Each iteration factorises the tangent and takes one Newton step. The factorised tangent is then reused for further
+    steps as long as these steps reduce the residual sufficiently.
 
     Args:
-        elastic: The discrete film.
-        assembly: Linear solver for its mesh.
-        start: First iterate, shape (n_node, 3), zero where the film is fixed.
+        elastic: Discrete model of the film.
+        assembly: Linear solver for the mesh of the film.
+        first_field: First iterate, shape (n_node, 3), which is zero where the film is fixed.
         tolerance: Relative residual at which the solve has converged.
-        local_below: Relative residual below which a full Newton step that halves the residual is accepted even if it
-            increases the energy.
+        full_steps_below: Relative residual below which a full Newton step that halves the residual is accepted even if
+            the step increases the energy.
 
     Returns:
         The result, which may not have converged.
     """
-    iterate = _Iterate.at(elastic, assembly.free[:, :3], start)
+    iterate = _Iterate.of(elastic, assembly.free[:, :3], first_field)
     step_sizes: list[float] = []
     for iteration in range(MAX_ITERATIONS + 1):
         relative_residual = iterate.relative_residual
@@ -215,31 +238,31 @@ def solve_newton(
             return iterate.result(False, iteration, f"no progress any more after {iteration} steps")
 
         # Compute the Newton step.
-        guard_tension = _guard_tension(elastic, relative_residual)
-        factor = factor_tangent(elastic, assembly, iterate.field, guard_tension)
+        stabilising_tension = _stabilising_tension(elastic, relative_residual)
+        factor = factor_tangent(elastic, assembly, iterate.field, stabilising_tension)
         step = factor.solve(-iterate.residual)
-        step_size = _energy_norm(elastic, iterate.field, step, iterate.residual)
+        step_size = _step_size(elastic, iterate.field, step, iterate.residual)
         step_sizes.append(step_size)
         if step_size <= ROUND_OFF:
             return iterate.result(True, iteration, f"converged to round-off in {iteration} steps")
 
-        # Close to the equilibrium, take the full step if it halves the residual. Otherwise search the step length.
-        next_iterate = _local_step(iterate, step) if relative_residual <= local_below else None
+        # Close to the equilibrium, take the full step if it halves the residual. Otherwise search for the step length.
+        next_iterate = _take_full_step(iterate, step) if relative_residual <= full_steps_below else None
         if next_iterate is None:
             next_iterate = _line_search(iterate, _descent_step(iterate, assembly, step))
         if next_iterate is None:
             return iterate.result(False, iteration, "no step lowers the energy any more")
         iterate = _chord_steps(next_iterate, factor, relative_residual, tolerance)
-    raise AssertionError("the loop returns")  # at the latest in its last iteration
+    raise AssertionError("the loop returns")  # the last iteration returns in every case
 
 
 @dataclass(frozen=True)
 class _Iterate:
-    """An iterate of Newton's method.
+    """Iterate of Newton's method.
 
     Attributes:
-        elastic: The discrete film.
-        free: Whether each component at each node is free, shape (n_node, 3).
+        elastic: Discrete model of the film.
+        free: Whether each displacement component at each node is free, shape (n_node, 3).
         field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
         residual: Out-of-balance forces at the nodes, shape (n_node, 3).
     """
@@ -250,23 +273,27 @@ class _Iterate:
     residual: Array
 
     @classmethod
-    def at(cls, elastic: ElasticFilm, free: Booleans, field: Array) -> Self:
-        """Return the iterate with a given field, shape (n_node, 3)."""
+    def of(cls, elastic: ElasticFilm, free: Booleans, field: Array) -> Self:
+        """Create the iterate with a given field, and compute its residual."""
         return cls(elastic, free, field, elastic.residual(field))
 
-    def moved(self, step: Array) -> Self:
-        """Return the iterate after a step, shape (n_node, 3)."""
-        return type(self).at(self.elastic, self.free, self.field + step)
+    def after(self, step: Array) -> Self:
+        """Return the next iterate, in which a step of shape (n_node, 3) is added to the field."""
+        return type(self).of(self.elastic, self.free, self.field + step)
 
     @cached_property
     def relative_residual(self) -> float:
-        """Maximum of the relative transverse residual and the relative in-plane residual."""
-        residual = self.residual * self.free
+        """Larger of the relative transverse residual and the relative in-plane residual, dimensionless.
+
+        The transverse residual is divided by the norm of the load. The in-plane residual is divided by the norm of the
+        in-plane forces of the elements.
+        """
+        free_residual = self.residual * self.free  # without the reactions at fixed nodes
         load = self.elastic.load_scale
-        in_plane_force = max(self.elastic.in_plane_scale(self.field), 1e-300)
-        transverse_residual = np.linalg.norm(residual[:, 2]) / load
-        in_plane_residual = np.linalg.norm(residual[:, :2]) / in_plane_force
-        return float(max(transverse_residual, in_plane_residual))
+        in_plane_force = max(self.elastic.in_plane_scale(self.field), 1e-300)  # the limit avoids a division by zero
+        transverse_ratio = np.linalg.norm(free_residual[:, 2]) / load
+        in_plane_ratio = np.linalg.norm(free_residual[:, :2]) / in_plane_force
+        return float(max(transverse_ratio, in_plane_ratio))
 
     def result(self, converged: bool, iterations: int, message: str) -> NewtonResult:
         """Return the result of a solve that ends with this iterate."""
@@ -276,10 +303,10 @@ class _Iterate:
 def _stalled(step_sizes: list[float]) -> bool:
     """Return whether the sizes of the steps no longer decrease.
 
-    This occurs along a direction in which the film has no stiffness.
+    This stagnation occurs if the film has no stiffness in some direction.
 
     Args:
-        step_sizes: Sizes of all steps so far, from the first to the last.
+        step_sizes: Sizes of all previous steps, in the order of the steps.
     """
     if len(step_sizes) <= 2 * PATIENCE:
         return False
@@ -288,77 +315,94 @@ def _stalled(step_sizes: list[float]) -> bool:
     return min(recent) > 0.5 * min(earlier)
 
 
-def _energy_norm(elastic: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
-    """Compute the size of a step.
+def _step_size(elastic: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
+    """Compute the size of a step, which is its energy norm relative to the work of the load.
 
-    The size of a step is the square root of the energy of the step divided by the work of the load.
+    The size is the square root of the ratio of the energy of the step to the work of the load.
 
     Args:
-        elastic: The discrete film.
-        field: Scaled displacements before the step, shape (n_node, 3).
-        step: The step, shape (n_node, 3).
-        residual: Out-of-balance forces before the step, shape (n_node, 3).
+        elastic: Discrete model of the film.
+        field: Scaled displacements before the step, shape (n_node, 3) or (n_node,).
+        step: Change of the displacements, shape (n_node, 3) or (n_node,).
+        residual: Out-of-balance forces before the step, same shape as `step`.
     """
     step_energy = abs(float(np.sum(step * residual)))
-    return float(np.sqrt(step_energy / max(elastic.work(field), 1e-300)))
+    work = max(elastic.work(field), 1e-300)  # the limit avoids a division by zero
+    return float(np.sqrt(step_energy / work))
 
 
-def _guard_tension(elastic: ElasticFilm, relative_residual: float) -> float:
-    """Return the tension that is added to the tangent, because a flat film without pretension has no stiffness.
+def _stabilising_tension(elastic: ElasticFilm, relative_residual: float) -> float:
+    """Compute the tension that is added to the tangent, because a flat film without pretension has no stiffness.
 
-    The tension is proportional to the relative residual, and at most `GUARD_TENSION` times the tension that the load
-    induces. It is zero if the relative residual is at most `GUARD_BELOW`.
+    The tension is proportional to the relative residual. The tension does not exceed `STABILISING_TENSION` times the
+    tension that the load induces. The tension is zero if the relative residual is at most `UNSTABILISED_BELOW`.
+
+    Args:
+        elastic: Discrete model of the film.
+        relative_residual: Relative residual of the present iterate.
+
+    Returns:
+        Tension, in units of E_young A^2.
     """
-    if relative_residual <= GUARD_BELOW:
+    if relative_residual <= UNSTABILISED_BELOW:
         return 0.0
-    induced_tension = float(np.cbrt(elastic.groups.total_load)) ** 2
-    return GUARD_TENSION * induced_tension * min(1.0, relative_residual)
+    return STABILISING_TENSION * _induced_tension(elastic) * min(1.0, relative_residual)
 
 
-def _local_step(iterate: _Iterate, step: Array) -> _Iterate | None:
+def _induced_tension(elastic: ElasticFilm) -> float:
+    """Return the order of magnitude of the tension that the load induces in a film without pretension."""
+    return float(np.cbrt(elastic.groups.total_load)) ** 2
+
+
+def _take_full_step(iterate: _Iterate, step: Array) -> _Iterate | None:
     """Return the iterate after the full Newton step if this step at least halves the residual, and None otherwise.
 
-    The step may increase the energy, because a compressed film can have a flat equilibrium with a slightly higher
-    energy than the wrinkled equilibrium.
+    The step may increase the energy. An increase of the energy is allowed, because the flat equilibrium of a compressed
+    film can have a slightly higher energy than its wrinkled equilibrium.
+
+    Args:
+        iterate: Present iterate.
+        step: Newton step, shape (n_node, 3).
     """
     if not np.isfinite(step).all():
         return None
-    trial = iterate.moved(step)
-    halves_residual = trial.relative_residual < 0.5 * iterate.relative_residual
-    return trial if halves_residual else None
+    next_iterate = iterate.after(step)
+    halves_residual = next_iterate.relative_residual < 0.5 * iterate.relative_residual
+    return next_iterate if halves_residual else None
 
 
-def _chord_steps(iterate: _Iterate, factor: TangentFactor, residual_before: float, tolerance: float) -> _Iterate:
-    """Continue with the factorised tangent of the last Newton step as long as it reduces the residual (chord method).
+def _chord_steps(iterate: _Iterate, factor: TangentFactor, previous_residual: float, tolerance: float) -> _Iterate:
+    """Take further steps with the factorised tangent of the last Newton step, as long as they reduce the residual.
 
-    A step with a reused tangent costs a seventh of a Newton step. If the last step multiplied the residual by s, the
-    next step with the same tangent multiplies it by about 2 s (Kelley 1995).
+    This is the chord method. A step with a reused tangent costs a seventh of a Newton step. If the last step multiplied
+    the residual by a factor s, the next step with the same tangent multiplies the residual by about 2 s (Kelley 1995).
 
     Args:
         iterate: Iterate after the Newton step.
-        factor: Factorised tangent of this step.
-        residual_before: Relative residual before this step.
+        factor: Factorised tangent of the Newton step.
+        previous_residual: Relative residual before the Newton step.
         tolerance: Relative residual at which the solve has converged.
 
     Returns:
         The last iterate whose step reduced the residual sufficiently.
     """
-    if iterate.relative_residual > CHORD_START * residual_before:
+    if iterate.relative_residual > CHORD_START * previous_residual:
         return iterate
     while iterate.relative_residual > tolerance:
-        trial = iterate.moved(factor.solve(-iterate.residual))
-        if not trial.relative_residual < CHORD_CONTINUE * iterate.relative_residual:
+        next_iterate = iterate.after(factor.solve(-iterate.residual))
+        # The condition is negated, so that a residual that is NaN ends the loop.
+        if not next_iterate.relative_residual < CHORD_CONTINUE * iterate.relative_residual:
             break
-        iterate = trial
+        iterate = next_iterate
     return iterate
 
 
 def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
     """Return the Newton step if it is a descent direction of the energy, and a modified step otherwise.
 
-    A step is a descent direction if its product with the residual, which is the gradient of the energy, is negative.
-    For a modified step, a tension is added to the tangent. The tension is doubled until the step is a descent
-    direction, at most `MAX_DESCENT_TRIALS` times.
+    The residual is the gradient of the energy. A step is therefore a descent direction if its product with the residual
+    is negative. A modified step is computed after a tension is added to the tangent. The tension is doubled until the
+    modified step is a descent direction, or until `MAX_DESCENT_TRIALS` tensions were tried.
 
     Args:
         iterate: Present iterate.
@@ -366,38 +410,38 @@ def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
         step: Newton step, shape (n_node, 3).
 
     Returns:
-        The step, shape (n_node, 3). After the largest number of trials, it may not be a descent direction.
+        The step, shape (n_node, 3). If no tension is sufficient, the step may not be a descent direction.
     """
     elastic = iterate.elastic
-    induced_tension = float(np.cbrt(elastic.groups.total_load)) ** 2
-    tension = FIRST_DESCENT_TENSION * GUARD_TENSION * induced_tension
+    added_tension = FIRST_DESCENT_TENSION * STABILISING_TENSION * _induced_tension(elastic)
     for _ in range(MAX_DESCENT_TRIALS):
         energy_slope = float(np.sum(step * iterate.residual))
         is_descent_direction = np.isfinite(step).all() and energy_slope < 0.0
         if is_descent_direction:
             break
-        stiffer_tangent = factor_tangent(elastic, assembly, iterate.field, tension)
-        step = stiffer_tangent.solve(-iterate.residual)
-        tension *= 2.0
+        stiffer_factor = factor_tangent(elastic, assembly, iterate.field, added_tension)
+        step = stiffer_factor.solve(-iterate.residual)
+        added_tension *= 2.0
     return step
 
 
 def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
-    """Halve a step until it lowers the energy sufficiently (condition of Armijo).
+    """Halve a step until it lowers the energy sufficiently.
 
-    The energy must decrease by at least `ARMIJO_SHARE` times the decrease that the slope along the step predicts. If
-    the change of the energy is not larger than its rounding errors, the step must lower the residual instead.
+    According to the condition of Armijo, the energy must decrease by at least `ARMIJO_SHARE` times the decrease that
+    the slope of the energy along the step predicts. If the change of the energy may be caused by rounding errors, the
+    step must lower the residual instead.
 
     Args:
         iterate: Present iterate.
         step: Full step, shape (n_node, 3).
 
     Returns:
-        The iterate after the step, or None if no step length is accepted.
+        The iterate after the accepted step. None if no step length is accepted.
     """
     elastic = iterate.elastic
     energy = elastic.energy(iterate.field)
-    energy_slope = float(np.sum(step * iterate.residual))  # along the step
+    energy_slope = float(np.sum(step * iterate.residual))  # derivative of the energy by the step length
     residual_norm = np.linalg.norm(iterate.residual[iterate.free])
     step_length = 1.0
     for _ in range(MAX_HALVINGS):
@@ -406,8 +450,9 @@ def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
         lowers_energy = energy_change <= ARMIJO_SHARE * step_length * energy_slope
         is_round_off = abs(energy_change) <= ENERGY_ROUND_OFF * abs(energy)
         if lowers_energy or is_round_off:
-            trial = _Iterate.at(elastic, iterate.free, field)
-            if lowers_energy or np.linalg.norm(trial.residual[iterate.free]) < residual_norm:
-                return trial
+            next_iterate = _Iterate.of(elastic, iterate.free, field)
+            lowers_residual = np.linalg.norm(next_iterate.residual[iterate.free]) < residual_norm
+            if lowers_energy or lowers_residual:
+                return next_iterate
         step_length *= 0.5
     return None

@@ -1,6 +1,7 @@
-"""Solver of a press.
+"""Solver of a press, which computes the equilibrium of the film under a probe.
 
-The solver chooses the mesh and solves with the selected theory. If this solve fails, the load is applied in steps.
+The solver chooses the mesh, and solves the press with the selected theory. If the solve with the full load fails, the
+load is applied in steps.
 """
 
 from dataclasses import replace
@@ -30,7 +31,7 @@ from isocharge.simulate.solver.load_case import (
     too_near_the_rim,
 )
 from isocharge.simulate.solver.newton import (
-    GUARD_BELOW,
+    UNSTABILISED_BELOW,
     NewtonResult,
     parabolic_start,
     schwerin_start,
@@ -39,14 +40,16 @@ from isocharge.simulate.solver.newton import (
 )
 
 MAX_EXTRA_ORDERS = 3
-"""Largest number of increases of the order after the first mesh."""
+"""Largest number of times that the order of the elements is increased after the first mesh."""
 
 DIFFERENT_EQUILIBRIUM = 0.1
-"""Relative difference of the charges above which the solutions on two meshes count as different equilibria. A film that
-wrinkles has many equilibria."""
+"""Relative difference of the charges above which the solutions on two meshes are treated as different equilibria.
+
+A film that wrinkles has many equilibria.
+"""
 
 FIRST_LOAD_SHARE = 0.0625
-"""Share of the load with which the load steps begin if the solve with the full load fails."""
+"""Share of the full load in the first load step, if the solve with the full load fails."""
 
 MAX_LOAD_STEPS = 12
 """Largest number of load steps."""
@@ -63,25 +66,26 @@ def press(
     start: Equilibrium | None = None,
     throw: bool = True,
 ) -> Equilibrium:
-    """Solve the film under a press.
+    """Solve the equilibrium of the film under a press.
 
     Args:
         film: The clamped film.
-        probe: The probe. The direction of its pressure does not change as the film deflects.
+        probe: The probe. The direction of its pressure does not change while the film deflects.
         at: Centroid (x, y) of the footprint, mm.
         force: Force, N, positive in the direction of the push.
         settings: Accuracy, theory and mesh.
-        side_force: Force (Fx, Fy) of the probe on the film along the film, N. It is spread over the footprint like
-            the pressure and keeps its direction. `solver.friction.friction_force` computes the side force of a probe
-            with friction.
-        start: Equilibrium of a similar press on the same mesh, whose field is the first iterate.
-        throw: Whether to raise an error if the solve fails. Otherwise `status` of the result is "failed".
+        side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N. It is distributed over the
+            footprint like the pressure, and its direction does not change. `solver.friction.friction_force` computes
+            the side force of a probe with friction.
+        start: Equilibrium of a similar press on the same mesh, whose field is the first iterate; None if there is no
+            such equilibrium.
+        throw: Whether to raise an error if the solve fails. Otherwise the `status` of the result is "failed".
 
     Returns:
         The equilibrium.
 
     Raises:
-        SceneError: If the press cannot exist, or the mesh is too distorted.
+        SceneError: If the press cannot exist, or if the mesh is too distorted.
         SolveError: If the solve fails and `throw` is True.
     """
     start_mesh = start.mesh if start else None
@@ -101,7 +105,9 @@ def press(
 def needed_resolution(
     film: Film, probe: Probe, at: tuple[float, float], force: float, settings: SolveSettings = SolveSettings()
 ) -> Resolution:
-    """Return the resolution that `press` would choose. The press is solved only if two meshes must be compared.
+    """Return the resolution that the function `press` would choose for a press.
+
+    The press is only solved if the solutions on two meshes must be compared.
 
     Args:
         film: The clamped film.
@@ -111,8 +117,8 @@ def needed_resolution(
         settings: Accuracy, theory and mesh.
 
     Raises:
-        SceneError: If the press cannot exist, or every mesh for it is too distorted.
-        SolveError: If two meshes must be compared and no equilibrium is reached.
+        SceneError: If the press cannot exist, or if every mesh for the press is too distorted.
+        SolveError: If two meshes must be compared and no equilibrium is found.
     """
     case = LoadCase.of(film, probe, at, force, settings, None)
     if settings.resolution != "auto":
@@ -123,15 +129,15 @@ def needed_resolution(
 
 
 def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equilibrium:
-    """Solve on meshes of increasing order until the charges of two meshes agree within half of the accuracy.
+    """Solve a press on meshes of increasing order until the charges of two meshes agree within half of the accuracy.
 
     The order is increased at most `MAX_EXTRA_ORDERS` times. If no equilibrium is found on the first or the second mesh,
-    the result is failed. If no equilibrium is found on a further mesh, the result is the equilibrium on the previous
-    mesh. If the last two meshes have different equilibria, the status of the result is "failed".
+    the status of the result is "failed". If no equilibrium is found on a later mesh, the result is the equilibrium on
+    the previous mesh. If the equilibria on the last two meshes are different, the status of the result is "failed".
 
     Args:
-        case: The press and its accuracy.
-        start: Equilibrium of a similar press from which the first solve starts; None if there is none.
+        case: The press and the required accuracy.
+        start: Equilibrium of a similar press from which the first solve starts; None if there is no such equilibrium.
 
     Returns:
         Equilibrium on the finest mesh. Its `proven_error` is the difference from the previous mesh.
@@ -145,7 +151,8 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
         finer = _solve(case, finer_mesh, solved)
         iterations = solved.iterations + finer.iterations
         if finer.status != "converged":
-            if solved.proven_error is None:  # only one mesh has an equilibrium, so its error is unknown
+            only_one_mesh_is_solved = solved.proven_error is None
+            if only_one_mesh_is_solved:  # the error of this mesh is unknown
                 return replace(finer, iterations=iterations)
             break
         error = relative_difference(solved, finer)
@@ -165,12 +172,12 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
 
 
 def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equilibrium:
-    """Solve a press on one mesh.
+    """Solve a press on a given mesh.
 
     Args:
-        case: The press and its accuracy.
+        case: The press and the settings of its solve.
         mesh: The mesh.
-        start: Equilibrium of a similar press from which the solve starts; None if there is none.
+        start: Equilibrium of a similar press from which the solve starts; None if there is no such equilibrium.
 
     Returns:
         The equilibrium. Its status is "failed" if no equilibrium was found.
@@ -178,11 +185,12 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
     Raises:
         SceneError: If an element of the mesh is folded.
     """
-    if np.isinf(shape_error(mesh)):
+    has_folded_element = np.isinf(shape_error(mesh))
+    if has_folded_element:
         raise too_near_the_rim(case, mesh.resolution)
     components = 4 if case.theory.bending else 3  # bending has an auxiliary unknown
     solver = assembly(mesh.template, components)
-    elastic = _elastic(case, mesh.geometry, case.force)
+    elastic = _elastic_film(case, mesh.geometry, case.force)
     if case.theory.stretching:
         result = _solve_nonlinear(case, elastic, solver, mesh, start)
     else:
@@ -209,14 +217,17 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 
 
 def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
-    """Solve the film under the static pressure alone, and store the solution as `rest` of the equilibrium of a press.
+    """Solve the film before the contact, and store the solution as the attribute `rest` of the equilibrium of a press.
+
+    Before the contact, only the static pressure acts on the film.
 
     Args:
         equilibrium: Equilibrium of the press.
         tolerance: Relative residual at which the solve has converged.
 
     Returns:
-        The equilibrium of the press with the film before the contact as `rest`.
+        Equilibrium of the press with the attribute `rest`. Its status is "failed" if the solve before the contact
+        fails.
     """
     mesh = equilibrium.mesh
     elastic = ElasticFilm(mesh.geometry, equilibrium.groups.without_probe)
@@ -224,22 +235,31 @@ def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
     first_field = _static_start(mesh, elastic.groups)
     result = solve_newton(elastic, solver, first_field, tolerance)
 
-    # Both solves count as iterations, and both must converge.
+    # The number of iterations is the sum of both solves.
     rest = replace(equilibrium, groups=elastic.groups, field=result.field, force=0.0, side_force=(0.0, 0.0))
-    equilibrium = replace(equilibrium, rest=rest, iterations=equilibrium.iterations + result.iterations)
+    iterations = equilibrium.iterations + result.iterations
+    equilibrium_with_rest = replace(equilibrium, rest=rest, iterations=iterations)
     if result.converged:
-        return equilibrium
+        return equilibrium_with_rest
     message = f"under the static pressure without a contact, {result.message}"
-    return replace(equilibrium, status="failed", message=message)
+    return replace(equilibrium_with_rest, status="failed", message=message)
 
 
 def _static_start(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
-    """Return the first iterate of a film under the static pressure, shape (n_node, 3)."""
-    return parabolic_start(np.abs(from_oval(mesh.node_points, mesh.oval)), groups)
+    """Return the first iterate of the solve of a film under static pressure, shape (n_node, 3).
+
+    Args:
+        mesh: Mesh of the film.
+        groups: Dimensionless groups of the film.
+    """
+    radius = np.abs(from_oval(mesh.node_points, mesh.oval))
+    return parabolic_start(radius, groups)
 
 
-def _elastic(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
-    """Return the discrete film for a press with another force. The side force is scaled by the same factor.
+def _elastic_film(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
+    """Create the discrete model of the film for a press with another force.
+
+    The side force is multiplied by the ratio of the other force to the force of the press.
 
     Args:
         case: The press.
@@ -249,7 +269,7 @@ def _elastic(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
     x, y = case.at
     force_factor = force / case.force
     side_x, side_y = case.side_force
-    direction = float(np.arctan2(y, x))  # of the press from the centre
+    direction = float(np.arctan2(y, x))  # from the centre of the film to the press
     groups = DimensionlessGroups.of(
         case.film,
         force,
@@ -263,127 +283,136 @@ def _elastic(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
 def _solve_nonlinear(
     case: LoadCase, elastic: ElasticFilm, solver: Assembly, mesh: PlacedMesh, start: Equilibrium | None
 ) -> NewtonResult:
-    """Solve with Newton's method.
+    """Solve a press with a nonlinear theory by Newton's method.
 
-    The first iterate is the field of the starting equilibrium if this equilibrium has the same mesh. Otherwise it is
-    the field of `schwerin_start`. If Newton's method fails, the load is applied in steps.
+    If the starting equilibrium has the same mesh, its field is the first iterate. Otherwise the first iterate is the
+    field of `schwerin_start`. If Newton's method fails, the load is applied in steps.
 
     Args:
-        case: The press and its tolerance.
-        elastic: The discrete film.
+        case: The press and the settings of its solve.
+        elastic: Discrete model of the film.
         solver: Linear solver for the mesh.
         mesh: The mesh.
-        start: Equilibrium of a similar press; None if there is none.
+        start: Equilibrium of a similar press from which the solve starts; None if there is no such equilibrium.
 
     Returns:
         The result, which may not have converged.
     """
-    # First iterate without a starting equilibrium
+    # Compute the first iterate without a starting equilibrium.
     template_points = mesh.placement.to_template(from_oval(mesh.node_points, mesh.oval))
-    schwerin_field = schwerin_start(template_points, float(mesh.placement.rho), elastic.groups)
+    default_field = schwerin_start(template_points, float(mesh.placement.rho), elastic.groups)
     if elastic.groups.static_pressure != 0.0:
-        schwerin_field += _static_start(mesh, elastic.groups)
+        default_field += _static_start(mesh, elastic.groups)
 
-    start_field = _start_field(start, mesh.template, default=schwerin_field)
-    result = solve_newton(elastic, solver, start_field, case.tolerance)
+    first_field = _first_field(start, mesh.template, default_field)
+    result = solve_newton(elastic, solver, first_field, case.tolerance)
     if result.converged:
         return result
-    return _solve_by_load_steps(case, result, mesh.geometry, solver, schwerin_field)
+    return _solve_by_load_steps(case, result, mesh.geometry, solver, default_field)
 
 
 def _solve_by_load_steps(
     case: LoadCase, failed: NewtonResult, geometry: Geometry, solver: Assembly, first_field: Array
 ) -> NewtonResult:
-    """Solve with increasing forces, after the solve with the full force has failed.
+    """Solve a press with increasing forces, after the solve with the full force has failed.
 
-    Each solve starts from the field of the largest force with an equilibrium. The force is doubled after a solve. If a
-    solve fails, the factor is reduced to its square root. If the solve with the smallest force fails, no further force
-    is tried.
+    Each solve starts from the field of the largest force with an equilibrium. After each successful solve, the force is
+    multiplied by a factor, which is two at the beginning. If a solve fails, the factor is replaced by its square root.
+    If the solve with the first force fails, no further force is tried.
 
     Args:
         case: The press.
-        failed: Result of the solve with the full force.
-        geometry: Elements of the mesh.
+        failed: Result of the failed solve with the full force.
+        geometry: Integration rules of the elements.
         solver: Linear solver for the mesh.
-        first_field: First iterate of the smallest force, shape (n_node, 3).
+        first_field: First iterate of the solve with the first force, shape (n_node, 3).
 
     Returns:
-        The result with the full force, or `failed` with the total number of iterations.
+        Result of a successful solve with the full force. If there is none, `failed` with the total number of
+        iterations.
     """
-    solved_force = 0.0  # largest force with an equilibrium
-    force_ratio = 2.0  # of the next force to `solved_force`
+    solved_force = 0.0  # largest force with an equilibrium; 0 if there is none
+    force_factor = 2.0  # ratio of the next force to `solved_force`
     iterations = failed.iterations
     field = first_field
     force = FIRST_LOAD_SHARE * case.force
     for _ in range(MAX_LOAD_STEPS):
-        # A start from an equilibrium is close to the solution, so full Newton steps are allowed from the beginning.
-        local_below = np.inf if solved_force else GUARD_BELOW
-        result = solve_newton(_elastic(case, geometry, force), solver, field, case.tolerance, local_below)
+        # An equilibrium with a smaller force is close to the solution, so full Newton steps are allowed at once.
+        full_steps_below = np.inf if solved_force else UNSTABILISED_BELOW
+        elastic = _elastic_film(case, geometry, force)
+        result = solve_newton(elastic, solver, field, case.tolerance, full_steps_below)
         iterations += result.iterations
         if result.converged and force == case.force:
             message = f"converged in {iterations} steps, the load in parts"
             return replace(result, iterations=iterations, message=message)
+
+        # Choose the next force.
         if result.converged:
             solved_force = force
             field = result.field
         elif solved_force == 0.0:
             break
         else:
-            force_ratio = np.sqrt(force_ratio)
-        force = min(case.force, solved_force * force_ratio)
+            force_factor = np.sqrt(force_factor)
+        force = min(case.force, solved_force * force_factor)
     return replace(failed, iterations=iterations)
 
 
-def _start_field(start: Equilibrium | None, template: Template, default: Array) -> Array:
+def _first_field(start: Equilibrium | None, template: Template, default: Array) -> Array:
     """Return the first iterate of Newton's method, shape (n_node, 3).
 
-    This is the field of the starting equilibrium if its mesh has the same elements. If the elements have another order,
-    the field is interpolated.
+    If the mesh of the starting equilibrium has the same elements, the first iterate is the field of the starting
+    equilibrium. If the elements differ only in their order, the field is interpolated.
 
     Args:
-        start: Equilibrium of a similar press; None if there is none.
+        start: Equilibrium of a similar press; None if there is no such equilibrium.
         template: Template of the mesh.
-        default: Field that is returned if the mesh of `start` differs in more than the order of its elements.
+        default: First iterate in all other cases, shape (n_node, 3).
     """
     if start is None:
         return default
-    start_template = start.mesh.template
+
     # Compare the blocks, the resolution except for the order, and the refinement along a coat.
-    if (start_template.topology, start_template.half) != (template.topology, template.half):
-        return default
+    start_template = start.mesh.template
+    has_same_blocks = start_template.topology == template.topology and start_template.half == template.half
     resolution_with_same_order = replace(start_template.resolution, order=template.resolution.order)
-    has_same_elements = resolution_with_same_order == template.resolution
-    if not has_same_elements or not np.array_equal(start_template.splits, template.splits):
+    has_same_resolution_except_order = resolution_with_same_order == template.resolution
+    has_same_splits = np.array_equal(start_template.splits, template.splits)
+    if not (has_same_blocks and has_same_resolution_except_order and has_same_splits):
         return default
-    if start_template.resolution == template.resolution:
+
+    if start_template.resolution.order == template.resolution.order:
         return start.field
-    return resampled(start.field, start_template, template)
+    return _interpolate_to_order(start.field, start_template, template)
 
 
-def resampled(field: Array, before: Template, after: Template) -> Array:
-    """Interpolate a nodal field to the same mesh with elements of another order.
+def _interpolate_to_order(field: Array, field_template: Template, template: Template) -> Array:
+    """Interpolate a nodal field to the same elements with another order.
 
     Args:
-        field: Values at the nodes of `before`, shape (n_node_before, 3).
-        before: Template of the field.
-        after: Template with elements of another order.
+        field: Values at the nodes of `field_template`, shape (n_field_node, 3).
+        field_template: Template of the field.
+        template: Template with elements of another order.
 
     Returns:
-        Values at the nodes of `after`, shape (n_node, 3).
+        Values at the nodes of `template`, shape (n_node, 3).
     """
-    values = tensor_values(before.resolution.order, after.xi, after.eta)
-    interpolated = np.empty((after.n_node, 3))
+    # Weights of the nodes of an element for the values at its new nodes, shape (n_local, n_field_local)
+    weights = tensor_values(field_template.resolution.order, template.xi, template.eta)
+    interpolated = np.empty((template.n_node, 3))
     # A node of several elements is assigned several times. The field is continuous, so the values are equal.
-    interpolated[after.nodes] = values @ field[before.nodes]
+    interpolated[template.nodes] = weights @ field[field_template.nodes]
     return interpolated
 
 
 def _failure_reason(solved: Equilibrium, tolerance: float) -> str:
     """Return the error message of a failed solve.
 
+    If the film is compressed, the message explains that the film wrinkles, and what the user can do.
+
     Args:
         solved: Result of the failed solve.
-        tolerance: Relative residual that was expected.
+        tolerance: Relative residual that was required.
     """
     x, y = solved.at
     smallest_stress, _ = principal_stress(solved)

@@ -1,16 +1,19 @@
 """First-order change of an equilibrium by imperfections of the film, such as anisotropy and an oval clamp.
 
-The residual of the equilibrium is R(u, m) = 0, and its tangent is K = dR/du. A small imperfection m changes the
-displacement by
+The displacements u of an equilibrium satisfy R(u, m) = 0, where R is the residual and m is the value of an
+imperfection. The tangent is K = dR/du. A small imperfection changes the displacements by
 
-    du/dm = -K^-1 dR/dm,
+    du/dm = -K^-1 dR/dm.
 
-which costs one additional back substitution. Let alpha be the angle between an axis of the imperfection and the
-direction of the press. For an imperfection with two axes, the change is the sum of two fields with the factors cos(2
-alpha) and sin(2 alpha). With respect to a reflection in this direction, the first field is even and the second field is
-odd. Both fields are solved on the meshed half of the film. The two fields have different fixed displacement components
-on the line of symmetry. The derivative dR/dm and the change of the stress are central differences of the residual and
-of the stress of a press.
+The solution of this equation costs one back substitution with the factorised tangent.
+
+An imperfection may have two axes, like an ellipse. Let alpha be the angle between one axis of the imperfection and the
+direction of the press. The change of the equilibrium is then the sum of two fields with the factors cos(2 alpha) and
+sin(2 alpha). With respect to a reflection in the line through the centre of the film and the press, the first field is
+even and the second field is odd. Both fields are solved on the meshed half of the film, with different displacement
+components fixed on the line of symmetry.
+
+The derivative dR/dm and the change of the stress are computed as central differences.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,208 +29,230 @@ from isocharge.simulate.mechanics.stress import stress_rotation
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.solver.assembly import assembly
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
-from isocharge.simulate.solver.tangent_factor import factor_tangent
+from isocharge.simulate.solver.tangent_factor import TangentFactor, factor_tangent
 
 STEP = 1e-3
 """Step of the central differences, in units of the imperfection."""
 
-Change = Callable[[Equilibrium, float], Equilibrium]
-"""Function that adds a value of an imperfection to the film of an equilibrium, and keeps the displacements."""
+AddImperfection = Callable[[Equilibrium, float], Equilibrium]
+"""Function that adds a given value of an imperfection to the film of an equilibrium.
+
+The displacements of the returned equilibrium are unchanged, and are therefore not in equilibrium.
+"""
 
 
 @dataclass(frozen=True)
 class StressField:
-    """A field of stress changes that one imperfection causes.
+    """Field of the stress changes that an imperfection causes.
 
     Attributes:
-        change: Function that adds the imperfection.
+        add: Function that adds the imperfection to the film of an equilibrium.
         odd: Whether the field is odd about the direction of the press.
     """
 
-    change: Change
+    add: AddImperfection
     odd: bool
 
 
-def _tension(direction: tuple[float, float, float]) -> Change:
-    """Return the function that adds a tension to the pretension of a film.
+def _tension_imperfection(direction: tuple[float, float, float]) -> AddImperfection:
+    """Create a function that adds a tension to the pretension of a film.
 
-    The unit of the tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A the amplitude
-    that scales the deflection of the press.
+    The unit of the tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A is the
+    amplitude of the press.
 
     Args:
         direction: Components (T11, T22, T12) of one unit.
     """
 
-    def with_tension(solved: Equilibrium, value: float) -> Equilibrium:
-        """Return the equilibrium with `value` units of the additional tension."""
-        unit = 1.0 + solved.groups.tension  # over E A^2, like all tensions in `groups`
+    def add_tension(solved: Equilibrium, value: float) -> Equilibrium:
+        """Return the equilibrium with `value` units of additional tension."""
+        unit = 1.0 + solved.groups.tension  # divided by E A^2, like all tensions in `groups`
         anisotropy = Anisotropy(moduli=np.zeros((3, 3)), tension=value * unit * np.array(direction))
         return replace(solved, groups=replace(solved.groups, anisotropy=anisotropy))
 
-    return with_tension
+    return add_tension
 
 
-def _stiffness(angle: float) -> Change:
-    """Return a function that makes a film orthotropic.
+def _stiffness_imperfection(angle: float) -> AddImperfection:
+    """Create a function that makes a film orthotropic.
 
     The value of the imperfection is ln(E1 / E2). To first order, E1 = E (1 + value / 2) and E2 = E (1 - value / 2).
 
     Args:
-        angle: Angle of axis 1 from the direction of the press, rad.
+        angle: Angle from the direction of the press to axis 1 of the film, rad.
     """
 
-    def with_stiffness_ratio(solved: Equilibrium, log_ratio: float) -> Equilibrium:
-        """Return the equilibrium of a film with this value of ln(E1 / E2)."""
-        # Change of the elasticity matrix over E, in the axes of the film and then in the frame of the press
+    def add_stiffness(solved: Equilibrium, log_ratio: float) -> Equilibrium:
+        """Return the equilibrium of a film with the given value of ln(E1 / E2)."""
+        # Change of the elasticity matrix divided by E, in the axes of the film
         plane_modulus = 1.0 / (1.0 - solved.groups.poisson**2)
         change_along_axis_1 = 0.5 * log_ratio * plane_modulus
         change_in_film_axes = np.diag([change_along_axis_1, -change_along_axis_1, 0.0])
+
+        # Rotate the change into the frame of the press.
         rotation = stress_rotation(angle)
         moduli_change = rotation @ change_in_film_axes @ rotation.T
         anisotropy = Anisotropy(moduli=moduli_change, tension=np.zeros(3))
         return replace(solved, groups=replace(solved.groups, anisotropy=anisotropy))
 
-    return with_stiffness_ratio
+    return add_stiffness
 
 
-def _poisson(solved: Equilibrium, value: float) -> Equilibrium:
-    """Return the equilibrium of a film whose Poisson's ratio is larger by a value.
+def _add_poisson(solved: Equilibrium, value: float) -> Equilibrium:
+    """Return the equilibrium of a film whose Poisson's ratio is increased by a given value.
 
-    The bending stiffness, which contains 1 / (1 - poisson^2), changes accordingly.
+    The bending stiffness is proportional to 1 / (1 - poisson^2), and changes accordingly.
 
     Args:
         solved: The solved press.
-        value: Change of Poisson's ratio.
+        value: Increase of Poisson's ratio.
     """
     poisson = solved.groups.poisson
-    changed_poisson = poisson + value
-    bending = solved.groups.bending * (1.0 - poisson**2) / (1.0 - changed_poisson**2)
-    return replace(solved, groups=replace(solved.groups, poisson=changed_poisson, bending=bending))
+    increased_poisson = poisson + value
+    bending = solved.groups.bending * (1.0 - poisson**2) / (1.0 - increased_poisson**2)
+    return replace(solved, groups=replace(solved.groups, poisson=increased_poisson, bending=bending))
 
 
-def _oval(direction: complex) -> Change:
-    """Return the function that makes the clamp of a film oval.
+def _oval_imperfection(direction: complex) -> AddImperfection:
+    """Create a function that makes the clamp of a film oval.
 
-    The value of the imperfection is the parameter e of the oval; see `PlacedMesh.oval`.
+    The value of the imperfection is the parameter e of the oval clamp; see `PlacedMesh.oval`.
 
     Args:
-        direction: exp(2 i alpha), where alpha is the angle of the long axis from the direction of the press.
+        direction: exp(2 i alpha), where alpha is the angle from the direction of the press to the longer axis.
     """
 
-    def with_oval(solved: Equilibrium, value: float) -> Equilibrium:
-        """Return the equilibrium of a film with an oval clamp."""
+    def add_oval(solved: Equilibrium, value: float) -> Equilibrium:
+        """Return the equilibrium of a film whose oval clamp has the parameter `value`."""
         return replace(solved, mesh=replace(solved.mesh, oval=value * direction))
 
-    return with_oval
+    return add_oval
 
 
 FIELDS = {
-    "tension": (StressField(_tension((1.0, -1.0, 0.0)), False), StressField(_tension((0.0, 0.0, 1.0)), True)),
-    "stiffness": (StressField(_stiffness(0.0), False), StressField(_stiffness(0.25 * np.pi), True)),
-    "poisson": (StressField(_poisson, False),),
-    "oval": (StressField(_oval(1.0), False), StressField(_oval(1j), True)),
+    "tension": (
+        StressField(_tension_imperfection((1.0, -1.0, 0.0)), odd=False),
+        StressField(_tension_imperfection((0.0, 0.0, 1.0)), odd=True),
+    ),
+    "stiffness": (
+        StressField(_stiffness_imperfection(0.0), odd=False),
+        StressField(_stiffness_imperfection(0.25 * np.pi), odd=True),
+    ),
+    "poisson": (StressField(_add_poisson, odd=False),),
+    "oval": (
+        StressField(_oval_imperfection(1.0), odd=False),
+        StressField(_oval_imperfection(1j), odd=True),
+    ),
 }
-"""Fields by the name of the imperfection. Imperfections with two axes have an even and an odd field, in this order."""
+"""Stress fields of each imperfection.
+
+An imperfection with two axes has an even field and an odd field, in this order.
+"""
 
 
-def _side_load(direction: tuple[float, float]) -> Change:
-    """Return the function that adds a side load to a press.
+def _side_load_imperfection(direction: tuple[float, float]) -> AddImperfection:
+    """Create a function that adds a side load to a press.
 
-    The unit of the side load is E h a A^2, with Young's modulus E, thickness h and radius a of the film, and the
-    amplitude A that scales the deflection of the press.
+    The unit of the side load is E h a A^2. In this product, E, h and a are Young's modulus, the thickness and the
+    radius of the film, and A is the amplitude of the press.
 
     Args:
         direction: Unit vector (x, y) of the side load.
     """
 
-    def with_side_load(solved: Equilibrium, value: float) -> Equilibrium:
-        """Return the equilibrium with an additional side load."""
+    def add_side_load(solved: Equilibrium, value: float) -> Equilibrium:
+        """Return the equilibrium with `value` units of additional side load."""
         load_x, load_y = solved.groups.side_load
-        unit_x, unit_y = direction
-        side_load = (load_x + value * unit_x, load_y + value * unit_y)
+        direction_x, direction_y = direction
+        side_load = (load_x + value * direction_x, load_y + value * direction_y)
         return replace(solved, groups=replace(solved.groups, side_load=side_load))
 
-    return with_side_load
+    return add_side_load
 
 
-SIDE_FORCE_FIELDS = (StressField(_side_load((1.0, 0.0)), False), StressField(_side_load((0.0, 1.0)), True))
-"""Fields of a side force along the direction of the press from the centre (even), and across it (odd)."""
+SIDE_FORCE_FIELDS = (
+    StressField(_side_load_imperfection((1.0, 0.0)), odd=False),
+    StressField(_side_load_imperfection((0.0, 1.0)), odd=True),
+)
+"""Stress fields of a side force along the direction of the press (even), and across this direction (odd)."""
 
 SIDE_FORCE_IS_ODD = np.array([field.odd for field in SIDE_FORCE_FIELDS])
 """Whether each of `SIDE_FORCE_FIELDS` is odd, shape (2,)."""
 
-TENSION_FIELDS = (StressField(_tension((1.0, 1.0, 0.0)), False), *FIELDS["tension"])
-"""Fields of a change of the mean pretension, and of both components of an uneven pretension."""
+TENSION_FIELDS = (StressField(_tension_imperfection((1.0, 1.0, 0.0)), odd=False), *FIELDS["tension"])
+"""Field of a change of the mean pretension, and fields of both components of an uneven pretension."""
 
 TENSION_IS_ODD = np.array([field.odd for field in TENSION_FIELDS])
 """Whether each of `TENSION_FIELDS` is odd, shape (3,)."""
 
 IS_ODD = np.array([field.odd for fields in FIELDS.values() for field in fields])
-"""Whether each field is odd, in the order of `stress_changes`, shape (n_field,)."""
+"""Whether each field of `FIELDS` is odd, in the order of `stress_changes`, shape (n_field,)."""
 
 
 def stress_changes(solved: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute the change of the scaled stress at the nodes that each of `FIELDS` causes, for a press on the x axis.
+    """Compute the changes of the scaled stress at the nodes that are caused by all imperfections in `FIELDS`.
 
-    The change is computed at fixed points of the film. If the rim becomes oval, the nodes move, so the effect of their
-    displacement is subtracted.
+    The changes are computed at fixed points of a film whose press is rotated onto the x axis. If the clamp becomes
+    oval, the nodes move. The change of the stress by the movement of the nodes is subtracted.
 
     Args:
         solved: Press with a circular probe on an axisymmetric film, solved with a theory that includes stretching.
-        surface: Surface in the thickness; see `touch_stress`.
+        surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
-        Change of the stress of `nodal_stress`, per unit of the imperfection, shape (n_field, n_element, n_local, 3).
+        Changes of the stress of `nodal_stress` per unit of the imperfection, shape (n_field, n_element, n_local, 3).
     """
-    return _stress_changes(solved, [field for fields in FIELDS.values() for field in fields], surface)
+    all_fields = [field for fields in FIELDS.values() for field in fields]
+    return _stress_changes(solved, all_fields, surface)
 
 
 def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute the change of the scaled stress at the nodes by each of `SIDE_FORCE_FIELDS`, per scaled side load.
+    """Compute the changes of the scaled stress at the nodes that are caused by the forces in `SIDE_FORCE_FIELDS`.
 
-    The probe and the film are as in `stress_changes`. `scaling.side_force_unit` is the side force of one scaled side
-    load.
+    The changes are computed for a scaled side load of one. The function `scaling.side_force_unit` computes the side
+    force that belongs to this side load.
 
     Args:
         solved: Press with a circular probe on an axisymmetric film, solved with a theory that includes stretching.
-        surface: Surface in the thickness; see `touch_stress`.
+        surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
-        Changes, shape (n_element, n_local, 2, 3): the field, then the stress (S11, S22, S12). This is the order of the
-        table of a `ForwardMap` with several fields.
+        Changes, shape (n_element, n_local, 2, 3), in the order of the table of a `ForwardMap` with several fields. The
+        last two axes are the field and the stress component (S11, S22, S12).
     """
     return np.moveaxis(_stress_changes(solved, SIDE_FORCE_FIELDS, surface), 0, 2)
 
 
 def tension_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute the change of the scaled stress at the nodes by each of `TENSION_FIELDS`, per unit of the tension.
+    """Compute the changes of the scaled stress at the nodes that are caused by the tensions in `TENSION_FIELDS`.
 
-    The unit is E A^2 plus the mean pretension. The probe and the film are as in `stress_changes`.
+    The changes are computed for one unit of tension. The unit is the sum of E A^2 and the mean pretension, where E is
+    Young's modulus and A is the amplitude of the press.
 
     Args:
         solved: Press with a circular probe on an axisymmetric film, solved with a theory that includes stretching.
-        surface: Surface in the thickness; see `touch_stress`.
+        surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
-        Changes, shape (n_element, n_local, 3, 3): the field, then the stress (S11, S22, S12), as in
-        `side_force_stress`.
+        Changes, shape (n_element, n_local, 3, 3), in the order of the table of a `ForwardMap` with several fields. The
+        last two axes are the field and the stress component (S11, S22, S12).
     """
     return np.moveaxis(_stress_changes(solved, TENSION_FIELDS, surface), 0, 2)
 
 
 def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: Surface) -> Array:
-    """Compute the change of the scaled stress at the nodes that each field causes.
+    """Compute the changes of the scaled stress at the nodes that are caused by several imperfections.
 
-    Even and odd fields have different fixed displacements on the line of symmetry, so each kind has its own
-    factorisation of the tangent.
+    Even and odd fields have different fixed displacements on the line of symmetry. Therefore the tangent is factorised
+    once for all even fields, and once for all odd fields.
 
     Args:
         solved: The solved press.
-        fields: The fields.
-        surface: Surface in the thickness.
+        fields: Stress fields of the imperfections.
+        surface: Surface of the film at which the stress is computed.
 
     Returns:
-        Change per unit of the imperfection, shape (n_field, n_element, n_local, 3).
+        Changes per unit of the imperfection, shape (n_field, n_element, n_local, 3).
     """
     with single_threaded_blas():
         components = 3 if solved.groups.bending == 0.0 else 4  # bending has an auxiliary unknown
@@ -239,41 +264,45 @@ def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface:
         changes = []
         for field in fields:
             factor = odd_factor if field.odd else even_factor
-            changes.append(_stress_change(solved, field, factor.solve, surface))
+            changes.append(_stress_change(solved, field.add, factor, surface))
         return np.stack(changes)
 
 
-def _stress_change(solved: Equilibrium, field: StressField, solve: Callable[[Array], Array], surface: Surface) -> Array:
-    """Compute the change of the scaled stress at the nodes that one field causes.
+def _stress_change(
+    solved: Equilibrium, add_imperfection: AddImperfection, factor: TangentFactor, surface: Surface
+) -> Array:
+    """Compute the change of the scaled stress at the nodes that is caused by one imperfection.
 
     Args:
         solved: The solved press.
-        field: The imperfection, whose attribute `change` applies it to a press.
-        solve: Function that solves K x = b for a vector b at the nodes, shape (n_node, 3).
-        surface: Surface in the thickness.
+        add_imperfection: Function that adds a given value of the imperfection to the film of the press.
+        factor: Factorised tangent of the press.
+        surface: Surface of the film at which the stress is computed.
 
     Returns:
         Change per unit of the imperfection, shape (n_element, n_local, 3).
     """
     # Add a positive and a negative step of the imperfection. The displacements are not in equilibrium yet.
-    above = field.change(solved, STEP)
-    below = field.change(solved, -STEP)
+    positive = add_imperfection(solved, STEP)
+    negative = add_imperfection(solved, -STEP)
 
     # Compute the change of the displacements that restores the equilibrium after one positive step. The change of the
-    # residual by one step is half of the difference.
-    residual_above = ElasticFilm(above.mesh.geometry, above.groups).residual(above.field)
-    residual_below = ElasticFilm(below.mesh.geometry, below.groups).residual(below.field)
-    displacement_change = -0.5 * solve(residual_above - residual_below)
+    # residual by one step is half of the difference between both residuals.
+    positive_residual = ElasticFilm(positive.mesh.geometry, positive.groups).residual(positive.field)
+    negative_residual = ElasticFilm(negative.mesh.geometry, negative.groups).residual(negative.field)
+    displacement_change = -0.5 * factor.solve(positive_residual - negative_residual)
 
     # Compute the derivative of the stress by a central difference.
-    equilibrium_above = replace(above, field=above.field + displacement_change)
-    equilibrium_below = replace(below, field=below.field - displacement_change)
-    stress_above = nodal_stress(equilibrium_above, surface)
-    stress_below = nodal_stress(equilibrium_below, surface)
-    change = (stress_above - stress_below) / (2.0 * STEP)
-    if above.mesh.oval != 0.0:
-        # The nodes move with the rim. Subtract the change of the stress by this displacement of the nodes (x + iy).
-        node_shift = (above.mesh.points - below.mesh.points) / (2.0 * STEP)
+    positive_equilibrium = replace(positive, field=positive.field + displacement_change)
+    negative_equilibrium = replace(negative, field=negative.field - displacement_change)
+    positive_stress = nodal_stress(positive_equilibrium, surface)
+    negative_stress = nodal_stress(negative_equilibrium, surface)
+    change = (positive_stress - negative_stress) / (2.0 * STEP)
+
+    # The nodes of an oval film move with the rim. Subtract the change of the stress that the movement of the nodes
+    # causes, so that the result holds for fixed points of the film.
+    if positive.mesh.oval != 0.0:
+        node_shift = (positive.mesh.points - negative.mesh.points) / (2.0 * STEP)  # x + iy, shape (n_element, n_local)
         stress_gradient = solved.mesh.node_derivatives(nodal_stress(solved, surface))
         x_contribution = node_shift.real[..., None] * stress_gradient[..., 0, :]
         y_contribution = node_shift.imag[..., None] * stress_gradient[..., 1, :]

@@ -1,9 +1,10 @@
-"""The largest stress of a film under a press, and the force that keeps this stress below a limit.
+"""Largest stress of a film under a press, and the largest force for which this stress does not exceed a limit.
 
-The largest principal stress occurs under the probe, at the surface of the film. Within 0.7 film radii, it hardly
-depends on the position of the press, so it is computed for a press at the centre. Closer to the rim the stress is
-larger: 1.4 times at 0.8 film radii, and 3.7 times at 0.93 film radii. Under a small probe, the stress increases
-slightly less than F^(2/3), which holds for a membrane.
+The largest principal stress occurs under the probe, at the surface of the film. For presses within 0.7 film radii, the
+largest stress hardly depends on the position. The stress is therefore computed for a press at the centre. Closer to the
+rim, the largest stress is larger. The stress is 1.4 times as large for a press at 0.8 film radii as for a press at the
+centre, and 3.7 times as large for a press at 0.93 film radii. Under a small probe, the stress increases slightly more
+slowly with the force F than F^(2/3), which is the power law of a membrane.
 """
 
 from functools import lru_cache
@@ -21,7 +22,7 @@ from isocharge.simulate.solver.press import press
 
 @lru_cache(maxsize=256)
 def largest_stress(film: Film, probe: Probe, force: float) -> float:
-    """Compute the largest principal stress under a press at the centre, including the pretension.
+    """Compute the largest principal stress under a press at the centre of the film, including the pretension.
 
     Args:
         film: The film.
@@ -40,13 +41,13 @@ def largest_stress(film: Film, probe: Probe, force: float) -> float:
 
 
 def stress_caution(film: Film, probe: Probe, force: float, limit: float = DEFAULT_STRESS_LIMIT) -> str:
-    """Return a warning if a press exceeds a stress limit, and an empty text otherwise.
+    """Return a warning if the stress under a press exceeds a limit, and an empty text otherwise.
 
     Args:
         film: The film.
         probe: The probe.
         force: Force, N.
-        limit: Stress limit, MPa.
+        limit: Largest allowed stress, MPa.
 
     Raises:
         SceneError: If the press cannot exist.
@@ -62,14 +63,15 @@ def stress_caution(film: Film, probe: Probe, force: float, limit: float = DEFAUL
 
 
 def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tuple[float, float]) -> float:
-    """Compute the largest force of a range whose stress does not exceed a limit. The relative error is below 0.1 %.
+    """Compute the largest force of a range for which the stress does not exceed a limit.
 
-    The equation ln(stress / limit) = 0 is solved for ln F by the secant method.
+    The equation ln(stress / limit) = 0 is solved for the logarithm of the force by the secant method. The relative
+    error of the force is below 0.1 %.
 
     Args:
         film: The film.
         probe: The probe.
-        limit: Stress limit, MPa.
+        limit: Largest allowed stress, MPa.
         force_range: Smallest and largest force, N.
 
     Returns:
@@ -90,8 +92,13 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
         return max_force
 
     def log_stress_ratio(log_force: float) -> float:
-        """Return ln(stress / limit). It is nearly linear in ln F, because the stress is nearly a power of F."""
-        return float(np.log(largest_stress(film, probe, float(np.exp(log_force))) / limit))
+        """Compute ln(stress / limit), which is nearly a linear function of the logarithm of the force.
+
+        Args:
+            log_force: Logarithm of the force in N.
+        """
+        stress = largest_stress(film, probe, float(np.exp(log_force)))
+        return float(np.log(stress / limit))
 
     # The secant method ends after a step of 1 %, when its error is about 0.01 %.
     log_force = scipy.optimize.newton(log_stress_ratio, np.log(min_force), x1=np.log(max_force), tol=0.01)

@@ -1,13 +1,13 @@
-"""Factorisation of the tangent of an equilibrium, with the stiffness of trapped air.
+"""Factorisation of the tangent of an equilibrium, including the stiffness of trapped air.
 
-The air behind the film resists a deflection W that compresses it. The stiffness of the air is c v v'. The vector v
-contains the weights with which the deflections of the nodes contribute to the volume. The matrix c v v' couples all
-nodes, and its rank is one. The system (K + c v v') x = b is therefore solved with the factorisation of the sparse
-matrix K (Sherman and Morrison 1950):
+The air behind the film resists a deflection of the film that compresses the air. The stiffness matrix of the air is c v
+v', where c is a number. The vector v contains the weights with which the deflections of the nodes contribute to the
+displaced volume. The matrix c v v' couples all nodes, but its rank is only one. Therefore the system (K + c v v') x = b
+can be solved with the factorisation of the sparse matrix K (Sherman and Morrison 1950). The solution is
 
     x = K^-1 b - y c (v' K^-1 b) / (1 + c v' y),   y = K^-1 v.
 
-Fields that are odd about the line of symmetry do not change the volume, so their matrix is K.
+Fields that are odd about the line of symmetry do not change the volume of the air. Their matrix is K.
 """
 
 from dataclasses import dataclass
@@ -21,21 +21,29 @@ from isocharge.simulate.solver.assembly import Assembly, Factor
 
 
 class TangentFactor(Protocol):
-    """Factorisation that solves linear systems with the tangent."""
+    """Factorisation with which linear systems with the tangent are solved."""
 
     def solve(self, right: Array) -> Array:
-        """Solve for the displacements (U1, U2, W) at the nodes; both arrays have the shape (n_node, 3)."""
+        """Solve for the displacements at the nodes.
+
+        Args:
+            right: Forces along (U1, U2, W) at the nodes, shape (n_node, 3).
+
+        Returns:
+            Displacements (U1, U2, W) at the nodes, shape (n_node, 3).
+        """
 
 
 @dataclass(frozen=True)
 class _AirFactor:
-    """Factorisation of K + c v v'.
+    """Factorisation of the tangent K + c v v' of a film with trapped air.
 
     Attributes:
-        film: Factorisation of K.
-        weights: Integration weights v of the volume, shape (n_node,).
-        response: Displacements y = K^-1 v by a uniform pressure, shape (n_node, 3).
-        pressure_per_volume: c / (1 + c v . y), the pressure of the air for a unit volume without the air.
+        film: Factorisation of the matrix K of the film.
+        weights: Integration weights v of the displaced volume, shape (n_node,).
+        response: Displacements y = K^-1 v of the film under a uniform pressure, shape (n_node, 3).
+        pressure_per_volume: Factor c / (1 + c v . y). Multiplied by the volume that the film would displace without the
+            air, the factor results in the pressure of the air.
     """
 
     film: Factor
@@ -44,38 +52,39 @@ class _AirFactor:
     pressure_per_volume: float
 
     def solve(self, right: Array) -> Array:
-        """See `TangentFactor`."""
-        field = self.film.solve(right)
-        volume = float(self.weights @ field[:, 2])
-        return np.asarray(field - self.pressure_per_volume * volume * self.response)
+        """Solve for the displacements at the nodes; see `TangentFactor.solve`."""
+        field_without_air = self.film.solve(right)
+        volume = float(self.weights @ field_without_air[:, 2])
+        return np.asarray(field_without_air - self.pressure_per_volume * volume * self.response)
 
 
-def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, guard: float = 0.0) -> TangentFactor:
-    """Factorise the tangent at a field, including the stiffness of trapped air.
+def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, added_tension: float = 0.0) -> TangentFactor:
+    """Factorise the tangent of the film at a given field, including the stiffness of trapped air.
 
-    The tangent is K + c v v', where K is the matrix of the film, v contains the integration weights of the volume, and
-    c is the stiffness of the air. The formula of Sherman and Morrison uses only the factorisation of K.
+    The tangent is K + c v v', where K is the matrix of the film, v contains the integration weights of the displaced
+    volume, and c is the stiffness of the air. The formula of Sherman and Morrison needs only the factorisation of K.
 
     Args:
-        elastic: The discrete film.
-        assembly: Linear solver for its mesh.
-        field: Scaled displacements, shape (n_node, 3).
-        guard: Additional tension; see `ElasticFilm.tangent`.
+        elastic: Discrete model of the film.
+        assembly: Linear solver for the mesh of the film.
+        field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
+        added_tension: Tension that is added to the pretension, in units of E_young A^2.
 
     Returns:
         Factorisation of the tangent.
     """
-    film_factor = assembly.factor(elastic.tangent(field, guard))
-    if elastic.back is None or elastic.groups.compression == 0.0:  # no trapped air
+    film_factor = assembly.factor(elastic.tangent(field, added_tension))
+    if elastic.back is None or elastic.groups.compression == 0.0:  # there is no trapped air
         return film_factor
     if assembly.odd:  # odd fields do not compress the air
         return film_factor
 
-    # The correction of a solution x is -c / (1 + c v . y) (v . x) y, with y = K^-1 v.
-    weights = elastic.back.weights
+    # The air changes a solution x by -c / (1 + c v . y) (v . x) y, where y = K^-1 v is the response of the film to a
+    # uniform pressure.
+    weights = elastic.back.weights  # v
     uniform_pressure = np.zeros_like(field)
     uniform_pressure[:, 2] = weights
-    response = film_factor.solve(uniform_pressure)
+    response = film_factor.solve(uniform_pressure)  # y
     air_stiffness = elastic.back.stiffness(field[:, 2])
     pressure_per_volume = air_stiffness / (1.0 + air_stiffness * float(weights @ response[:, 2]))
     return _AirFactor(film_factor, weights, response, pressure_per_volume)

@@ -28,7 +28,7 @@ class Echo:
     def answer(self, method, path, headers, body, _client=None):
         return response_of(200, b"text/plain", repr((method, path, sorted(headers), body)).encode())
 
-    def refused(self, _response, _client=None):
+    def count_refusal(self, _response, _client=None):
         pass
 
 

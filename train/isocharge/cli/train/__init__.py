@@ -1,1 +1,1 @@
-"""`isocharge train ...`: one file a command."""
+"""Commands of `isocharge train`, one in each file."""

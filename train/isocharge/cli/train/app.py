@@ -1,4 +1,4 @@
-"""Commands of `isocharge train`, each in its own module."""
+"""Command group `isocharge train`, which imports the module of a command when the command is called."""
 
 from isocharge.cli.shared.lazy import LazyCommand, lazy_group
 

@@ -106,19 +106,20 @@ def calibrate_command(
     """Calibrate a film: estimate its parameters from measured presses, and write a model of this film.
 
     Three presses are useful, and eight are recommended. The position of each press must be known, or its force, or
-    both. --next proposes presses, even before the first press. The command names the parameters that the presses do not
-    determine.
+    both. The option --next proposes presses, even before the first press. The command names the parameters that the
+    presses do not determine.
 
     `isocharge train press` guides presses at a port, and writes their file.
 
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
-    # Without presses, an earlier calibration is moved to another temperature: its parameters are computed for it.
+    # With --from and --temperature but without presses, the parameters of the earlier calibration are computed for the
+    # other temperature. The calibration is then said to be moved to this temperature.
     is_moved = file is None and earlier is not None and temperature_C is not None
     _check_usage(file, output, next_count, temperature_C, is_moved=is_moved)
     _check_side_forces(file, friction, side_force, is_moved=is_moved)
 
-    # The problem describes the films that the sensor may be. An earlier calibration restricts them.
+    # The problem describes the films that the sensor may have. An earlier calibration restricts these films.
     problem = CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models)
     problem = replace(problem, stress_limit=stress_limit, friction=friction, side_force=side_force)
     result: CalibrationResult | None = None  # None if only presses are proposed
@@ -127,7 +128,7 @@ def calibrate_command(
         if file is not None:
             presses = read_press_file(file, problem.electrodes, position_std_mm, force_std)
             presses = _with_temperature(presses, temperature_C)
-        if is_moved and earlier is not None and temperature_C is not None:  # the last two only for type checkers
+        if is_moved and earlier is not None and temperature_C is not None:  # `is_moved` implies both other conditions
             result = read_moved(earlier, problem, temperature_C)
         elif earlier is not None:
             knows_temperature = presses is not None and presses.knows_temperature
@@ -150,7 +151,7 @@ def calibrate_into(presses: MeasuredPresses, problem: CalibrationProblem, output
 
     Args:
         presses: The measured presses.
-        problem: Films that the sensor may be.
+        problem: Description of the films that the sensor may have.
         output: Folder to write.
         json: Whether to print one JSON object instead of text.
     """
@@ -161,11 +162,11 @@ def calibrate_into(presses: MeasuredPresses, problem: CalibrationProblem, output
 
 
 def _fit(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
-    """Calibrate the film by presses, and print the cautions of the calibration.
+    """Calibrate a film with measured presses, and print the cautions of the calibration.
 
     Args:
         presses: The measured presses.
-        problem: Description of the films that the sensor may be.
+        problem: Description of the films that the sensor may have.
     """
     say(f"fitting the film to {len(presses)} presses")
     result = calibrate(presses, problem)
@@ -177,7 +178,7 @@ def _fit(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationRe
 def _print_result(result: CalibrationResult | None, proposed: list[ProposedPress], *, json: bool) -> None:
     """Print the result of a calibration, if there is one, and the proposed presses.
 
-    For each proposed press, the errors of position and force are printed that would remain after this press.
+    For each proposed press, the function prints the errors of position and force that would remain after this press.
 
     Args:
         result: Result of the calibration; None if only presses are proposed.
@@ -199,7 +200,7 @@ def _print_result(result: CalibrationResult | None, proposed: list[ProposedPress
 
 
 def _with_temperature(presses: MeasuredPresses, temperature_C: float | None) -> MeasuredPresses:
-    """Return the presses with one temperature for all, unless the presses already have temperatures."""
+    """Set the temperature of all presses, unless the presses already have temperatures or no temperature is given."""
     if temperature_C is None or presses.knows_temperature:
         return presses
     return replace(presses, temperature_C=np.full(len(presses), temperature_C))
@@ -215,7 +216,7 @@ def _write(result: CalibrationResult, folder: Path) -> None:
 def _check_usage(
     file: Path | None, output: Path | None, next_count: int, temperature_C: float | None, *, is_moved: bool
 ) -> None:
-    """Refuse arguments that contradict each other.
+    """Raise an error if arguments of the command contradict each other.
 
     Args:
         file: File of presses.
@@ -223,10 +224,14 @@ def _check_usage(
         next_count: Number of presses to propose.
         temperature_C: Temperature, degrees Celsius.
         is_moved: Whether an earlier calibration is moved to this temperature, without presses.
+
+    Raises:
+        InputError: If the arguments contradict each other.
     """
     is_nothing_calibrated = file is None and not is_moved
     is_out_of_range = temperature_C is not None and not MIN_TEMPERATURE_C <= temperature_C <= MAX_TEMPERATURE_C
     temperature_range = f"{MIN_TEMPERATURE_C:g} to {MAX_TEMPERATURE_C:g}"
+    # The first message whose condition is true becomes the error.
     refuse(
         {
             f"--temperature: expected {temperature_range} degrees Celsius, got {temperature_C}": is_out_of_range,
@@ -243,14 +248,18 @@ def _check_usage(
 
 
 def _check_side_forces(file: Path | None, friction: float, side_force: float, *, is_moved: bool) -> None:
-    """Refuse an option for side forces if the command has neither presses nor a model to which the option could apply.
+    """Raise an error if an option for side forces is given without presses or a model to which it could apply.
 
     Args:
         file: File of presses.
         friction: Expected coefficient of friction of the presses.
         side_force: Largest side force of later contacts over their force.
         is_moved: Whether an earlier calibration is moved to another temperature, without presses.
+
+    Raises:
+        InputError: If the friction is given without presses, or the side force without presses and without a model.
     """
+    # The first message whose condition is true becomes the error.
     refuse(
         {
             f"--friction {friction:g}: expected PRESSES.csv that were made with this friction, got none": (

@@ -49,7 +49,7 @@ def distil_command(
             f'--int8: expected no --config beside it, got {config}; write weights = "int8" under [network] in this '
             "file instead"
         )
-    model_folder = find_model(model, models)  # the teacher
+    model_folder = find_model(model, models)  # MODEL, which is the teacher of the student
     if config is not None:
         fit_config = load_config(config)
     elif int8:

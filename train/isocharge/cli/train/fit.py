@@ -54,7 +54,7 @@ DEFAULT_PROBE = "circle:1.0"
 """Notation of the probe if `--probe` is not given."""
 
 DEFAULT_RADIUS_TEXT = f"{DEFAULT_RADIUS}"
-"""Radius of the working area if `--radius` is not given, mm, as text."""
+"""Value of `--radius` if the option is not given: the radius of the working area, mm, as text."""
 
 
 def fit_command(
@@ -90,7 +90,7 @@ def fit_command(
         typer.Option(
             "--films",
             help="With --sensor: train one network for all films that the sensor may have, which `isocharge train "
-            "calibrate` uses. This takes about 20 minutes on 2 cores. (default: only the film as described)",
+            "calibrate` uses. This takes about ten minutes on 2 cores. (default: only the film as described)",
         ),
     ] = False,
     position_std_mm: PositionStdOption = 0.1,
@@ -104,17 +104,18 @@ def fit_command(
     """Train a network on charges, measure its errors, and write a model folder: ONNX file, card, golden vectors.
 
     The presses come from DATASET. With --sensor and no DATASET, presses are simulated first. The option --probe states
-    their probes, and --radius their largest distance from the centre.
+    the probes of the simulated presses, and --radius states their largest distance from the centre.
 
     With measured presses and --sensor, the film is calibrated, as `isocharge train calibrate` does. If there is no
-    network for all films of this sensor, the presses instead correct the simulated charges. A fifth of the presses is
-    then held out to measure the errors. With measured presses and no --sensor, a network is trained on the presses
-    alone. The sensor can then be any sensor with three to eight channels, and every other column of the file is a
-    channel. The errors are measured by cross-validation, in which all presses at a place are left out together.
+    network for all films of this sensor, the presses correct the simulated charges instead. In this case, a fifth of
+    the presses is held out to measure the errors. With measured presses and no --sensor, a network is trained on the
+    presses alone. Without --sensor, the sensor can be any sensor with three to eight channels, and every other column
+    of the file is a channel. The errors are measured by cross-validation, in which all presses at a place are left out
+    together.
 
     With --films, the network is trained on many films. The pretension, stiffness, piezoelectric coefficients, gains and
-    electrode positions of these films are drawn at random. The model folder then also contains films.npz, the network
-    for all these films.
+    electrode positions of these films are drawn at random. With --films, the model folder also contains films.npz,
+    which is the network for all these films.
 
     A run that was stopped leaves models/NAME/VERSION.part. The same command continues a stopped run and makes the same
     model.
@@ -180,7 +181,7 @@ def _release_films_model(film_prior: FilmPrior, films_config: FilmsConfig, optio
     warn_of_stress(film_prior.sensor.film, [film_prior.probe], max_force)
 
     def train(run: ResumableRun) -> FilmsModel:
-        """Train the network on all cores of this machine."""
+        """Train the network on all cores of this machine, and save the state in the run."""
         with local_workers(worker_count(None)) as executor:
             return fit_films(film_prior, films_config, executor=executor, run=run)
 
@@ -229,7 +230,7 @@ def _release_data_model(data: TrainingData, fit_config: FitConfig, options: Rele
 
 
 def _read_or_simulate_data(dataset: Path | None, sensor: str | None, notations: list[str], radius: str) -> TrainingData:
-    """Return training data from a dataset folder, or from presses that are simulated on a sensor.
+    """Return training data that are read from a dataset folder, or simulated on a sensor.
 
     Args:
         dataset: Dataset folder; None to simulate presses.
@@ -329,7 +330,7 @@ def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | N
 
 
 def refuse_training_options(config: Path | None, version: int, radius: str) -> None:
-    """Refuse options for the training of a network if presses only calibrate the film.
+    """Raise an error if an option for the training of a network is given, although the presses only calibrate a film.
 
     Args:
         config: File with training settings; None if the option was not given.

@@ -33,14 +33,14 @@ from isocharge.train.calibration.session import PressSession
 
 @dataclass(frozen=True)
 class SensorPort:
-    """Port of a sensor. The command-line options describe it.
+    """Port of a sensor, as the options of the command describe it.
 
     Attributes:
         url: Device path or pyserial URL of the port, or a file of bytes.
         device: Device file of the board; None for the default board.
         baud: Speed of the port, bits per second.
-        reconnects: Whether to wait for a port that is lost.
-        keyboard: File descriptor of the keyboard; None if nobody is asked.
+        reconnects: Whether to wait until a lost port is available again.
+        keyboard: File descriptor of the keyboard; None if no questions are asked.
     """
 
     url: str
@@ -134,19 +134,20 @@ def press_command(
     if earlier is not None:
         problem = replace(problem, earlier=read_earlier(earlier, problem))
 
-    # A machine makes the presses of a list. Otherwise a person makes them, who is asked about each press.
+    # A machine makes the presses of a list. Without a list, a person makes the presses, and is asked about each press
+    # unless --yes is given.
     contacts = None if press_list is None else read_press_list(press_list)
-    is_asked = contacts is None and not yes
+    asks_person = contacts is None and not yes
     sensor_port = SensorPort(
         url=port,
         device=device,
         baud=baud,
         reconnects=contacts is None,  # a machine goes on while the port is lost, so its session must end
-        keyboard=_keyboard() if is_asked else None,
+        keyboard=_keyboard_descriptor() if asks_person else None,
     )
     on_taken: OnTaken = _ignore_press
-    if json:
-        on_taken = _print_proposing if contacts is None else _print_press
+    if json:  # only a person needs the next proposal
+        on_taken = _print_press_and_proposal if contacts is None else _print_press
 
     stds = {"position_std_mm": position_std_mm, "force_std": force_std}
     with open_press_file(output, problem.sensor, problem.probe, fresh=fresh) as press_file:
@@ -157,7 +158,7 @@ def press_command(
             with _open_events(sensor_port, problem) as events:
                 dialogue = Dialogue(session, events, Screen(problem.electrodes), on_taken)
                 if contacts is None:
-                    dialogue.guide_person(asks=is_asked)
+                    dialogue.guide_person(asks=asks_person)
                 else:
                     dialogue.follow_machine(contacts)
         finally:
@@ -173,13 +174,13 @@ def press_command(
 def _open_session(
     press_file: PressFile, problem: CalibrationProblem, until: float, stds: dict[str, float]
 ) -> PressSession:
-    """Return a session that begins with the presses that are already in the file.
+    """Create a session that begins with the presses that are already in the file, and print how many there are.
 
     Args:
         press_file: File of the presses.
-        problem: The calibration.
-        until: Position error at which the session ends, mm.
-        stds: Standard deviations of the stated positions and forces.
+        problem: The calibration problem for which the presses are made.
+        until: Position error left by the film at which the session ends, as a share of the error by noise alone.
+        stds: Standard deviations of the stated positions and forces, by the names of the arguments of `PressSession`.
     """
     presses = press_file.read(position_std_mm=stds["position_std_mm"], force_std=stds["force_std"])
     if presses is not None:
@@ -188,9 +189,15 @@ def _open_session(
 
 
 def _check_list(contacts: Array, session: PressSession, name: str) -> None:
-    """Raise PressError if the list of a machine contains a press that a calibration would refuse.
+    """Raise an error if the list of a machine contains a press that a calibration would refuse.
 
-    The message names the row.
+    Args:
+        contacts: Contacts (x, y, F) of the list, shape (n, 3), mm and N.
+        session: Session that checks the presses.
+        name: Name of the list, for the message.
+
+    Raises:
+        PressError: If a press would be refused. The message states its number in the list.
     """
     for number, contact in enumerate(contacts, start=1):
         with error_prefix(f"{name}, press {number}: ", PressError):
@@ -199,13 +206,16 @@ def _check_list(contacts: Array, session: PressSession, name: str) -> None:
 
 @contextmanager
 def _open_events(port: SensorPort, problem: CalibrationProblem) -> Iterator[PressEvents]:
-    """Open the port of the board, and yield the source of its readings and of the typed lines.
+    """Provide the events of the port and of the keyboard as a context manager.
 
-    The common mode of the device file is not used, because its removal needs a calibrated model.
+    The port is open and the keyboard is read within the `with` block.
+
+    The setting `common_mode` of the device file is not used, because the removal of the common mode needs a calibrated
+    model.
 
     Args:
         port: Port, device file and keyboard.
-        problem: The calibration, which names the electrodes.
+        problem: The calibration problem, which contains the names of the electrodes.
     """
     board = load_device(port.device)
     if board.common_mode is not None:
@@ -217,15 +227,19 @@ def _open_events(port: SensorPort, problem: CalibrationProblem) -> Iterator[Pres
     stream = ReadingStream(problem.electrodes, board, reader=f"sensor {problem.sensor.name}")
     watch = PressWatch(problem.electrodes)
     with (
-        no_frames_advice_added(port.url, port.device),  # outermost, because it changes the errors of the others
+        no_frames_advice_added(port.url, port.device),  # first, because it changes the errors of the next two
         open_source(port.url, baud=port.baud, reconnect=port.reconnects, request=board.request) as source,
         PressEvents(source, stream, watch, port.keyboard) as events,
     ):
         yield events
 
 
-def _keyboard() -> int:
-    """Return the file descriptor of the standard input."""
+def _keyboard_descriptor() -> int:
+    """Return the file descriptor of the standard input.
+
+    Raises:
+        InputError: If the standard input is closed or has no file descriptor.
+    """
     try:
         return sys.stdin.fileno()
     except (OSError, ValueError, AttributeError) as error:
@@ -236,6 +250,7 @@ def _keyboard() -> int:
 
 
 def _say_what_is_written(session: PressSession, output: Path) -> None:
+    """Print how many presses the file has, unless it has none."""
     count = len(session)
     if count:
         noun = "press" if count == 1 else "presses"
@@ -243,23 +258,29 @@ def _say_what_is_written(session: PressSession, output: Path) -> None:
 
 
 def _ignore_press(session: PressSession, press: SteadyPress) -> None:
-    pass
+    """Do nothing after a press, because the results are not printed."""
 
 
 def _print_press(session: PressSession, press: SteadyPress) -> None:
-    """Print one line of JSON: the last press, and the accuracy with which the film is known after this press."""
+    """Print one line of JSON with the last press, and with the accuracy with which the film is then known."""
     show_json(_press_table(session, press) | {"next": None})
 
 
-def _print_proposing(session: PressSession, press: SteadyPress) -> None:
-    """Print one line of JSON: the last press, and the press that is proposed next."""
+def _print_press_and_proposal(session: PressSession, press: SteadyPress) -> None:
+    """Print one line of JSON with the last press, with the accuracy, and with the press that is proposed next."""
     proposed = None if session.enough else vars(session.proposed)
     show_json(_press_table(session, press) | {"next": proposed})
 
 
 def _press_table(session: PressSession, press: SteadyPress) -> dict[str, object]:
-    """Return values for JSON: the last press of a session, and the accuracy with which the film is known after this
-    press."""
+    """Return the values of a line of JSON about the last press of a session.
+
+    Further values state the accuracy with which the film is known after this press.
+
+    Args:
+        session: The session, which contains the press.
+        press: The steady press, with its charges, duration and flags.
+    """
     electrodes = session.presses.electrodes
     result = session.result
     return {

@@ -1,7 +1,7 @@
-"""Dialogue of a press session: propose a press, record it when it is steady, and ask whether it was made at the
-proposed place.
+"""Dialogue of a press session, which proposes presses, records steady presses, and asks where they were made.
 
-If a machine makes the presses of a list, no questions are asked, and the presses are recorded in the order of the list.
+If a machine makes the presses of a list, nothing is proposed or asked, and the presses are recorded in the order of the
+list.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ LINE_INTERVAL_s = 1.0
 """Time between two lines about a press that has not settled yet, s."""
 
 SAME_CONTACT_TOLERANCE = 1e-9
-"""Difference up to which a press of the session is a row of a machine's list, mm and N."""
+"""Largest difference between a press of the session and the same press in the list of a machine, mm and N."""
 
 PHASE_TEXTS = {
     Phase.taring: "measuring the tare: leave the film alone",
@@ -34,12 +34,14 @@ QUESTION = '   Was it there, and as hard? Enter: yes; or type "x y force" (? is 
 KEYS = "   (type s to skip this place, u to undo the last press, q to quit)"
 
 OnTaken = Callable[[PressSession, SteadyPress], None]
-"""Function that is called after each press that the session has taken."""
+"""Function that is called after the session has recorded a press. Its arguments are the session and the press."""
 
 
 class Screen:
-    """Messages on stderr for the person who presses: sentences, and the charges about once per second while a press
-    settles."""
+    """Messages on stderr for the person who presses.
+
+    The messages are sentences and, while a press settles, the charges about once per second.
+    """
 
     def __init__(self, electrodes: tuple[str, ...]) -> None:
         """Set up the screen.
@@ -52,15 +54,15 @@ class Screen:
         self._last_line_s = 0.0
 
     def say(self, sentence: str) -> None:
-        """Print a sentence."""
+        """Print a sentence. After this call, `show_phase` prints its next line even if the phase has not changed."""
         self._last_phase = None
         say(sentence)
 
     def show_phase(self, watched: WatchResult) -> None:
         """Print the instruction of the present phase, and the charges while a press settles.
 
-        Within one phase, at least `LINE_INTERVAL_s` pass between two lines. Phases without an instruction, such as that
-        of a steady press, print nothing.
+        Within one phase, the time between two lines is at least `LINE_INTERVAL_s`. Nothing is printed in phases without
+        an instruction, such as that of a steady press.
 
         Args:
             watched: Result of the press watch for the last reading: phase, time for which the press is held, charges.
@@ -79,7 +81,7 @@ class Screen:
             line += f", {watched.held_s:.1f} s: {self._charge_text(watched.charge_pC)}"
         if watched.reason:
             line += f" ({watched.reason})"
-        say(line)  # not `self.say`, which would begin a new phase
+        say(line)  # not `self.say`, after which the same phase would be printed again too soon
 
     def show_steady(self, press: SteadyPress) -> None:
         """Print the charges of a steady press."""
@@ -87,7 +89,7 @@ class Screen:
         self.say(f"   steady after {press.held_s:.1f} s: {self._charge_text(press.charge_pC)}{flags}")
 
     def _charge_text(self, charge_pC: Array) -> str:
-        """Return charges as "A 812.3, B 401.0 pC"."""
+        """Return charges as a text such as "A 812.3, B 401.0 pC"."""
         charges = [f"{name} {charge:.1f}" for name, charge in zip(self._electrodes, charge_pC, strict=True)]
         return f"{', '.join(charges)} pC"
 
@@ -99,10 +101,10 @@ class Dialogue:
         """Set up the dialogue.
 
         Args:
-            session: Session that proposes presses and takes them.
-            events: Events of port and keyboard.
+            session: Session that proposes and records presses.
+            events: Readings of the port, and lines of the keyboard.
             screen: Messages for the person.
-            on_taken: Function that is called after each press.
+            on_taken: Function that is called after each press that the session has recorded.
         """
         self._session = session
         self._events = events
@@ -113,8 +115,8 @@ class Dialogue:
         """Propose and record presses until the film is known accurately enough, or the person quits.
 
         Args:
-            asks: Whether to ask after each press where it was made. Otherwise each press counts as made where it was
-                proposed.
+            asks: Whether to ask after each press where it was made. If not, each press counts as made at the proposed
+                place with the proposed force.
         """
         if asks:
             self._screen.say(KEYS)
@@ -126,11 +128,11 @@ class Dialogue:
         self._screen.say("The film is known well enough. With --until 0 the same command takes more presses.")
 
     def follow_machine(self, contacts: Array) -> None:
-        """Take the presses that a machine makes.
+        """Record the presses that a machine makes, in the order of its list.
 
         Args:
-            contacts: Presses (x, y, F) in their order, shape (n, 3), mm and N, NaN where unknown. The rows up to the
-                last press of the session were made before, and are not expected again.
+            contacts: Presses (x, y, F) of the list, shape (n, 3), mm and N; unknown values are NaN. The rows up to the
+                last press of the session were pressed earlier, and are not expected again.
 
         Raises:
             PortLost: If the port is lost, because it is then unknown which press comes next.
@@ -138,7 +140,7 @@ class Dialogue:
         """
         first_row = _count_rows_made(self._session, contacts)
         try:
-            # A press before the tare would be lost. Each later press would then be taken for the one before it.
+            # A press before the tare would be lost, and each later press would be assigned to the wrong row.
             self._wait_for(Phase.waiting)
             self._screen.say("The tare is measured. Let the machine begin.")
             for row_number, contact in enumerate(contacts[first_row:], start=first_row + 1):
@@ -149,9 +151,9 @@ class Dialogue:
             ) from end
 
     def _follow_press(self, row_number: int, contact: Array) -> None:
-        """Wait for the press of one row of a machine's list, and record it.
+        """Wait for the press of one row of the list of a machine, and record the press.
 
-        A refused press is omitted, because the machine has already moved to the next row.
+        A refused press is left out, because the machine has already moved on to the next row.
 
         Args:
             row_number: Number of the row in the list, from 1.
@@ -176,7 +178,7 @@ class Dialogue:
     def _wait_for(self, *phases: Phase) -> WatchResult:
         """Wait for the next reading in one of the given phases.
 
-        Earlier readings only update the displayed phase, and typed lines are ignored.
+        Readings in other phases are only displayed, and typed lines are ignored.
         """
         while True:
             event = self._events.next()
@@ -187,17 +189,19 @@ class Dialogue:
             self._screen.show_phase(event)
 
     def _guide_press(self, *, asks: bool) -> None:
-        """Propose a press, and return when it has been recorded or when another press must be proposed.
+        """Propose a press, and wait until it has been recorded or until another press must be proposed.
 
         Args:
-            asks: Whether to ask where a steady press was made. Otherwise it counts as made where it was proposed.
+            asks: Whether to ask where a steady press was made. If not, the press counts as made at the proposed place
+                with the proposed force.
         """
         proposed = self._session.proposed
         steady_press: SteadyPress | None = None  # the press about which a question is open
         self._screen.say(f"{len(self._session) + 1}. Press {describe_press(proposed.contact)} and hold.")
         self._events.arm()  # only presses from now on count
 
-        # Undoing an earlier press changes the proposal, which ends the loop. An open question must be answered first.
+        # If an earlier press is undone, the proposal changes, which ends the loop. If a question about a steady press
+        # is open, the loop continues until the question is answered.
         while steady_press is not None or self._session.proposed is proposed:
             event = self._events.next()
             if isinstance(event, str):  # a typed line: an answer or a command
@@ -220,15 +224,15 @@ class Dialogue:
                 self._screen.show_phase(event)
 
     def _handle_line(self, line: str, press: SteadyPress | None, proposed: Array) -> bool:
-        """Do what a person typed.
+        """Carry out the command that a person typed, or print why it cannot be carried out.
 
         Args:
             line: The typed line.
-            press: Steady press that the question is about; None while the press is still expected.
+            press: Steady press about which a question is open; None while no press is steady.
             proposed: The proposed press (x, y, F), shape (3,), mm and N.
 
         Returns:
-            Whether the proposal is settled, so that the next press is to be proposed.
+            Whether the proposal is settled. If so, the next press must be proposed.
         """
         try:
             return self._act_on(read_answer(line), press, proposed)
@@ -237,21 +241,21 @@ class Dialogue:
             return False
 
     def _act_on(self, answer: Answer, press: SteadyPress | None, proposed: Array) -> bool:
-        """Carry out the command of an answer: quit, skip, take a press or remove one.
+        """Carry out the command of an answer: quit, skip the proposal, record the steady press, or remove a press.
 
-        A press can only be taken if it is steady. The command that removes the last press refers to the steady press,
-        if there is one.
+        A press can only be recorded if it is steady. If there is a steady press, the command that removes the last
+        press discards the steady press.
 
         Args:
-            answer: Answer of the user.
-            press: The steady press about which the user was asked; None before the press.
-            proposed: Contact (x, y, F) that was proposed, shape (3,), mm and N.
+            answer: The command, which was read from the typed line.
+            press: Steady press about which a question is open; None while no press is steady.
+            proposed: The proposed press (x, y, F), shape (3,), mm and N.
 
         Returns:
-            Whether the proposed press is settled, so that the next press is to be proposed.
+            Whether the proposal is settled. If so, the next press must be proposed.
 
         Raises:
-            SessionEnd: If the user quits.
+            SessionEnd: If the command is to quit.
         """
         if answer.reply == "quit":
             raise SessionEnd
@@ -275,7 +279,7 @@ class Dialogue:
         return False  # a question about a steady press remains open; otherwise the proposed press may have changed
 
     def _take(self, press: SteadyPress, contact: Array) -> bool:
-        """Add a press to the session, and return whether the session accepts it.
+        """Record a press in the session, and return whether the session accepts it.
 
         If the session refuses the press, the reason is printed.
 
@@ -293,15 +297,16 @@ class Dialogue:
         return True
 
     def _say_summary(self) -> None:
+        """Print the sentences about the accuracy with which the film is known."""
         for sentence in self._session.summary:
             self._screen.say(f"   {sentence}")
 
 
 def _count_rows_made(session: PressSession, contacts: Array) -> int:
-    """Return the number of rows in a list of contacts up to and including the last press of the session.
+    """Return the number of rows in the list of a machine up to and including the last press of the session.
 
     The number is 0 if the session has no press, or if its last press is not in the list. If several rows are equal to
-    the last press, the last of them counts.
+    the last press, the last of these rows counts.
 
     Args:
         session: The session.

@@ -10,11 +10,11 @@ from isocharge.serve import Chunk, ReadingStream
 from isocharge.serve.live.steady_press import PressWatch, WatchResult
 
 JOIN_TIMEOUT_s = 1.0
-"""Time to wait for the thread that reads the port, s. A silent port keeps its thread busy for longer."""
+"""Longest time to wait for the end of the thread that reads the port, s. With a silent port, the thread ends later."""
 
 
 class SessionEnd(Exception):
-    """The session ends: the person ended it, or the input or the port has ended."""
+    """End of a press session, because the person quits, or because the input or the port has ended."""
 
 
 class PressEvents:
@@ -22,8 +22,8 @@ class PressEvents:
 
     The object is a context manager that starts and stops the reading threads.
 
-    The port is also read while a person answers a question and while a fit runs. No reading is lost, so the watch also
-    detects a probe that is lifted while a question is answered.
+    The port is also read while a person answers a question and while a fit runs, so that no reading is lost. Therefore,
+    the watch also detects that a probe is lifted while a question is open.
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class PressEvents:
         """Initialise the events. Reading starts when the context is entered.
 
         Args:
-            chunks: Bytes of an open port.
+            chunks: Iterable over the bytes of an open port.
             stream: Decoder of the bytes.
             watch: Detector of steady presses.
             keyboard: File descriptor of the keyboard; None for no keyboard.
@@ -54,16 +54,18 @@ class PressEvents:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Stop reading. A thread that still waits for a silent port or keyboard ends when the process ends."""
+        """Stop the threads. A thread that waits for a silent port or for the keyboard ends only with the process."""
         self._stop.set()
         self._port_thread.join(timeout=JOIN_TIMEOUT_s)
 
     def arm(self) -> None:
-        """Discard the readings so far, and detect only presses that begin from now on."""
+        """Discard all earlier readings, and detect only presses that begin after this call."""
         self._arm_count += 1
 
     def next(self) -> WatchResult | str:
-        """Wait for the next reading or typed line. Readings from before the last call of `arm` are discarded.
+        """Wait for the next reading or typed line.
+
+        Readings from before the last call of `arm` are discarded.
 
         Returns:
             Result of the watch for a reading, or the typed line.
@@ -84,9 +86,9 @@ class PressEvents:
     def _read_port(self) -> None:
         """Read the port until its end, and put the events of the readings into the queue.
 
-        The watch finds steady presses in the readings. A call of `arm` in another thread makes the watch begin again.
-        Each event contains the number of earlier calls of `arm`, so that events from before the last call can be
-        discarded. The method runs in its own thread.
+        The press watch finds steady presses in the readings. After a call of `arm` in another thread, the press watch
+        begins again. Each event is stored with the number of earlier calls of `arm`. The method `next` can therefore
+        discard the events from before the last call. The method runs in its own thread.
         """
         arm_count = self._arm_count  # number of calls for which the watch is armed
         try:
@@ -105,6 +107,13 @@ class PressEvents:
             self._queue.put((arm_count, error))
 
     def _read_keyboard(self, keyboard: int) -> None:
+        """Read lines from the keyboard until its end, and put them into the queue.
+
+        The method runs in its own thread.
+
+        Args:
+            keyboard: File descriptor of the keyboard.
+        """
         # The file is not buffered, because a buffer would hold a lock when the program ends.
         for line in FileIO(keyboard, closefd=False):
             self._queue.put((self._arm_count, line.decode(errors="replace")))

@@ -65,8 +65,8 @@ def report_command(
     """Compare a model with other methods: error (mm, % of force) against time (us), throughput and memory (bytes).
 
     All methods predict the same presses with noise. If DATASET was measured, the methods are tested on a fifth of its
-    presses, to which no method was fitted. No noise is added, and everything that needs a simulation is left out. The
-    option --probe states the probe that made the presses of PRESSES.csv.
+    presses, to which no method was fitted. In this case, no noise is added to the charges, and all results that need a
+    simulation are left out. The option --probe states the probe that made the presses of PRESSES.csv.
 
     The report takes some minutes for a dataset of 24,000 presses. Durations are measured, so do not run other programs
     at the same time. If the report is interrupted, its finished solves and limits remain in DIR.part, and the same

@@ -18,7 +18,7 @@ Trained = TypeVar("Trained")
 """Result of a training, from which a model is released."""
 
 TrainedToRelease = TypeVar("TrainedToRelease", contravariant=True)
-"""Result of a training that a `WriteRelease` accepts."""
+"""Result of a training from which a `WriteRelease` can write a release."""
 
 ModelFolderOption = Annotated[
     Path,
@@ -108,7 +108,7 @@ def train_and_release(
 
 
 def _errors_sentence(metadata: ModelMetadata) -> str:
-    """Return text that states the errors of a model."""
+    """Return a sentence that states the errors of a model."""
     errors = metadata.errors
     return (
         f"{_measured_presses_words(metadata)}position error {errors['position_median_mm']:g} mm median, "
@@ -118,7 +118,7 @@ def _errors_sentence(metadata: ModelMetadata) -> str:
 
 
 def _measured_presses_words(metadata: ModelMetadata) -> str:
-    """Return the part of a sentence that describes the presses on which the errors were measured.
+    """Return the words that describe the measured presses on which the errors of a model were measured.
 
     The text is empty if the presses were simulated.
 

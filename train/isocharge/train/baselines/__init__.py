@@ -1,6 +1,7 @@
-"""Other methods to estimate a contact from charges, as regressors of scikit-learn, for the comparison in a report.
+"""Methods that a report compares with a model: regressors of scikit-learn that estimate contacts from charges.
 
-The charges have the shape (n, n_electrode), pC. The contacts (x, y, F) have the shape (n, 3), mm and N.
+The inputs of a method are charges, shape (n, n_electrode), pC. The outputs are contacts (x, y, F), shape (n, 3), mm and
+N.
 
 Example:
     from isocharge.train.baselines.compared_methods import compared_methods

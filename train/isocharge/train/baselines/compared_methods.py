@@ -1,4 +1,4 @@
-"""The methods that a report compares: regressors with the interface of scikit-learn, from charges to contacts."""
+"""Methods that a report compares: regressors with the interface of scikit-learn that estimate contacts from charges."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,7 +35,7 @@ VALIDATION_SEED = 999
 
 
 class GivenMethod(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """A method that is not fitted to presses."""
+    """Base class of methods that are not fitted to presses."""
 
     def fit(self, charge: Array, contact: Array) -> Self:
         """Return the unchanged method. The presses are not used."""
@@ -44,7 +44,7 @@ class GivenMethod(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
 
 class Regressor(Protocol):
-    """Interface of the methods. A method also derives from scikit-learn's `BaseEstimator`, so that it can be cloned."""
+    """Interface of the methods, which also derive from `BaseEstimator` of scikit-learn, so that they can be cloned."""
 
     def fit(self, charge: Array, contact: Array) -> Any:
         """Fit the method to presses.
@@ -58,7 +58,7 @@ class Regressor(Protocol):
         """
 
     def predict(self, charge: Array) -> Array:
-        """Estimate contacts, shape (n, 3), mm and N; NaN where the method has no answer."""
+        """Estimate contacts (x, y, F), shape (n, 3), mm and N. A press without an estimate has the contact NaN."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,13 @@ class FittingTask:
     """Training presses, validation presses and conditions for the fits of all methods.
 
     Attributes:
-        train: Presses for training, measured or without noise.
+        train: Presses for training. Simulated presses have no noise.
         validation: Presses at other positions, for the choice of parameters.
-        domain: Contacts that can occur: uniform over a disk, log-uniform in force.
-        noise: Noise of the charges in use.
-        seed: Seed of noise and subsets.
-        quick: Whether to use only the first candidate of the parameters and one copy with noise, for a trial.
+        domain: Contacts that can occur. Their positions are uniformly distributed over a disk, and their forces are
+            log-uniform.
+        noise: Noise of the charges when the methods are used.
+        seed: Seed of the noise and of random subsets.
+        quick: Whether to use only the first candidate of the parameters and only one copy with noise, for a trial run.
     """
 
     train: LabelledPresses
@@ -82,18 +83,24 @@ class FittingTask:
     quick: bool = False
 
     def presses(self, copies: int) -> LabelledPresses:
-        """Return copies of the training presses with different noise; a quick task has only one copy.
+        """Return one or more copies of the training presses, each with different noise in its charges.
 
         Args:
-            copies: Number of copies; 0 for the presses without noise. Measured presses are returned as they are.
+            copies: Number of copies; 0 for the presses without noise. A quick task has at most one copy.
+
+        Returns:
+            The presses of all copies, one copy after the other. Measured presses are returned unchanged, because their
+            charges already have noise.
         """
         if self.train.measured or copies == 0:
             return self.train
-        count = 1 if self.quick else copies
-        first_seed = self.seed + FIRST_COPY_SEED
-        contact = np.tile(self.train.contact, (count, 1))
-        charge = np.concatenate([self.train.noisy(self.noise, first_seed + copy) for copy in range(count)])
-        return LabelledPresses(contact, charge)
+        n_copies = 1 if self.quick else copies
+        charges_of_copies = []
+        for copy_index in range(n_copies):
+            noise_seed = self.seed + FIRST_COPY_SEED + copy_index
+            charges_of_copies.append(self.train.noisy(self.noise, noise_seed))
+        contact = np.tile(self.train.contact, (n_copies, 1))  # the contacts of all copies are the same
+        return LabelledPresses(contact, np.concatenate(charges_of_copies))
 
     @cached_property
     def validation_charge(self) -> Array:
@@ -111,12 +118,14 @@ class ComparedMethod:
         name: Name in tables and pictures.
         kind: Kind of the method, which determines the colour in pictures.
         computed_by: Library that computes the method.
-        regressor: The method; not fitted before `fit`.
-        copies: Number of noisy copies of the presses to which the method is fitted; 0 for presses without noise.
+        regressor: Regressor that computes the method. It is fitted only in the result of `fit`.
+        copies: Number of copies of the presses, each with noise, to which the method is fitted; 0 for presses without
+            noise.
         candidates: Candidate values of the parameters of the method, by the name of the parameter. The values with the
             smallest error on the validation presses are used.
-        given_force: Whether the method gets the true force in addition to the charges. No sensor measures this force.
-        choice: The chosen parameters in words, and how they were chosen; empty before `fit`.
+        given_force: Whether the inputs of the method contain the true force, which no sensor measures, besides the
+            charges.
+        choice: Text about the chosen parameters and how they were chosen; empty before `fit` is called.
     """
 
     name: str
@@ -136,62 +145,93 @@ class ComparedMethod:
             force: True forces, shape (n,), N.
 
         Returns:
-            The charges; with the force as an additional last column if `given_force` is set.
+            The charges, shape (n, n_electrode). If `given_force` is set, the force is an additional last column.
         """
         return np.column_stack([charge, force]) if self.given_force else charge
 
     def fit(self, task: FittingTask) -> "ComparedMethod":
-        """Fit the method with each candidate, and return the fit with the smallest error on the validation presses.
+        """Fit the method with each set of candidate parameters, and return the one with the smallest validation error.
+
+        The validation error is the root mean square of the position errors on the validation presses.
 
         Args:
             task: Presses for the fit and for the validation.
 
         Returns:
-            The fitted method, with a text about the chosen parameters.
+            A copy of this method with the fitted regressor and with a text about the chosen parameters (`choice`).
 
         Raises:
             DatasetError: If the method cannot be fitted to these presses.
         """
         presses = task.presses(self.copies)
         true_contact = task.validation.contact
-        validation_inputs = self.inputs(task.validation_charge, true_contact[:, 2])  # with the true force if it is used
+        true_force = true_contact[:, 2]
+        validation_inputs = self.inputs(task.validation_charge, true_force)
+
+        # All combinations of the candidates. Without candidates, this is one set without parameters.
         parameter_sets = list(ParameterGrid(dict(self.candidates)))
         if task.quick:
             parameter_sets = parameter_sets[:1]
 
-        regressors = []
+        fitted_regressors = []
         errors_mm = []
         for parameters in parameter_sets:
-            regressor = clone(self.regressor).set_params(**parameters)
+            regressor = clone(self.regressor)
+            regressor.set_params(**parameters)
             regressor.fit(presses.charge, presses.contact)
+            fitted_regressors.append(regressor)
             estimate = regressor.predict(validation_inputs)
-            regressors.append(regressor)
             errors_mm.append(rms(position_error(estimate, true_contact)))
         best_index = int(np.argmin(errors_mm))
 
-        # The text that describes the chosen parameters
-        descriptions = [describe_parameter(name, value) for name, value in parameter_sets[best_index].items()]
+        choice = self.choice
+        if not choice:
+            choice = self._describe_choice(
+                parameter_sets[best_index],
+                n_compared=len(parameter_sets),
+                validation_error_mm=errors_mm[best_index],
+                n_presses=len(presses),
+            )
+        return replace(self, regressor=fitted_regressors[best_index], choice=choice)
+
+    def _describe_choice(
+        self, parameters: Mapping[str, Any], *, n_compared: int, validation_error_mm: float, n_presses: int
+    ) -> str:
+        """Return a text about the chosen parameters and the presses of the fit.
+
+        Args:
+            parameters: The chosen parameters, by name.
+            n_compared: Number of sets of parameters that were compared.
+            validation_error_mm: Root mean square of the position errors with the chosen parameters, mm.
+            n_presses: Number of presses to which the method was fitted.
+        """
+        descriptions = [describe_parameter(name, value) for name, value in parameters.items()]
         noise_word = "noisy" if self.copies else "clean"
-        descriptions.append(f"{len(presses)} {noise_word} presses")
-        if len(parameter_sets) > 1:
-            best_error_mm = errors_mm[best_index]
-            descriptions.append(f"best of {len(parameter_sets)} by validation ({best_error_mm:.3f} mm rms)")
-        return replace(self, regressor=regressors[best_index], choice=self.choice or ", ".join(descriptions))
+        descriptions.append(f"{n_presses} {noise_word} presses")
+        if n_compared > 1:
+            descriptions.append(f"best of {n_compared} by validation ({validation_error_mm:.3f} mm rms)")
+        return ", ".join(descriptions)
 
 
 def describe_parameter(name: str, value: object) -> str:
     """Return a text that describes a parameter of a pipeline.
 
+    A mapping of factors is described without the name of the parameter. A number is described with the last part of the
+    name.
+
     Args:
         name: Name of the parameter, after the names of the steps: "step__parameter".
-        value: Value of the parameter. A mapping contains factors by the names of axes.
+        value: Value of the parameter. A mapping contains the factor of each axis, by the name of the axis.
 
     Example:
+        >>> describe_parameter("regressor__scales__kw_args", {"force": 0.1, "rest": 0.03})
+        'force axis x 0.1, rest axis x 0.03'
         >>> describe_parameter("regressor__neighbours", 8)
         'neighbours 8'
     """
     if isinstance(value, Mapping):
-        return ", ".join(f"{axis} axis x {factor:g}" for axis, factor in value.items())
+        axis_texts = [f"{axis} axis x {factor:g}" for axis, factor in value.items()]
+        return ", ".join(axis_texts)
     if isinstance(value, int | float):
         _, _, short_name = name.rpartition("__")
         return f"{short_name} {value:g}"
@@ -217,79 +257,106 @@ POLYNOMIAL_DEGREES = (4, 6, 8, 10, 12)
 """Candidates for the degree of the polynomial."""
 
 MAX_MONOMIALS = 500
-"""Largest number of monomials of the polynomial. More monomials take longer and do not reduce the error under noise."""
+"""Largest number of monomials of the polynomial. More monomials would not reduce the error under noise."""
 
 SKLEARN = "scikit-learn"
 """Name in tables of the library that computes most methods."""
 
 KD_TREE = "SciPy KD-tree"
-"""Name in tables of the library part that finds nearest neighbours."""
+"""Name in tables of the part of a library that finds nearest neighbours."""
 
 NUMPY = "NumPy"
-"""Name in tables of the library that computes methods without another library."""
+"""Name in tables of the library that computes the methods that are written with arrays alone."""
 
 
 def compared_methods(task: FittingTask, charge_map: ChargeMap | None = None) -> list[ComparedMethod]:
     """Return all compared methods except the networks.
 
     Args:
-        task: Presses and conditions.
-        charge_map: Map for the methods that need one; None to leave these methods out.
+        task: Presses and conditions of the fits.
+        charge_map: Map from contacts to charges for triangulation; None to leave triangulation out.
     """
     domain = task.domain
+    linear_band = ComparedMethod(
+        name=LINEAR_BAND,
+        kind="paper",
+        computed_by=KD_TREE,
+        regressor=LinearBand(domain.radius),
+        candidates={"degree": (6, 10, 14)},
+    )
+    nearest_entry = ComparedMethod(
+        name="lookup table, nearest entry",
+        kind="paper",
+        computed_by=SKLEARN,
+        regressor=on_logarithms(domain, entry=KNeighborsRegressor(1)),
+    )
+    gauss_newton = ComparedMethod(
+        name=GAUSS_NEWTON,
+        kind="fitted map",
+        computed_by=NUMPY,
+        regressor=GaussNewton(domain, task.noise, seed=task.seed),
+    )
     return [
         *_triangulations(charge_map),
-        ComparedMethod(LINEAR_BAND, "paper", KD_TREE, LinearBand(domain.radius), candidates={"degree": (6, 10, 14)}),
-        ComparedMethod(
-            "lookup table, nearest entry", "paper", SKLEARN, on_logarithms(domain, entry=KNeighborsRegressor(1))
-        ),
+        linear_band,
+        nearest_entry,
         _interpolated_table(task),
         _nearest_neighbours(task),
         polynomial_ridge(task),
         _gradient_boosting(task),
         _gaussian_process(task),
-        ComparedMethod(GAUSS_NEWTON, "fitted map", NUMPY, GaussNewton(domain, task.noise, seed=task.seed)),
+        gauss_newton,
     ]
 
 
 def polynomial_ridge(task: FittingTask) -> ComparedMethod:
-    """Return ridge regression on all monomials up to a degree.
+    """Return ridge regression on all monomials of the logarithms of the charges up to a certain degree.
 
-    The logarithms are clipped to the range of the training presses, because a polynomial of high degree grows fast
-    beyond it. The two largest degrees of `POLYNOMIAL_DEGREES` with at most `MAX_MONOMIALS` monomials are compared.
+    The candidates for the degree are the two largest of `POLYNOMIAL_DEGREES` with at most `MAX_MONOMIALS` monomials.
+    There are also two candidates for the penalty on the coefficients.
 
     Args:
         task: Presses for the fit.
     """
-    n_electrode = task.train.charge.shape[1]
-    copies = 5
     # A polynomial of n variables up to the degree d has "n + d choose d" monomials.
+    n_electrode = task.train.charge.shape[1]
     allowed_degrees = [
         degree
         for degree in range(1, max(POLYNOMIAL_DEGREES) + 1)
         if comb(n_electrode + degree, degree) <= MAX_MONOMIALS
     ]
-    degrees = [degree for degree in POLYNOMIAL_DEGREES if degree in allowed_degrees][-2:]
-    if not degrees:
+    allowed_candidates = [degree for degree in POLYNOMIAL_DEGREES if degree in allowed_degrees]
+    degrees = allowed_candidates[-2:]
+    if not degrees:  # with many electrodes, even the smallest of `POLYNOMIAL_DEGREES` has too many monomials
         degrees = [max(allowed_degrees)]
 
-    regressor = on_logarithms(
-        task.domain,
-        box=MinMaxScaler((-1.0, 1.0), clip=True),
-        monomials=PolynomialFeatures(),
-        ridge=Ridge(solver="cholesky"),
-    )
-    # The penalty is proportional to the number of presses, as the sum of the squared errors is.
+    # The logarithms are scaled to [-1, 1] and clipped to the range of the training presses, because a polynomial of
+    # high degree grows fast beyond it.
+    scaler = MinMaxScaler((-1.0, 1.0), clip=True)
+    regressor = on_logarithms(task.domain, box=scaler, monomials=PolynomialFeatures(), ridge=Ridge(solver="cholesky"))
+
+    # The penalty is proportional to the number of presses in all noisy copies, as the sum of the squared errors is.
+    copies = 5
     penalties = [penalty_per_press * copies * len(task.train) for penalty_per_press in (1e-11, 1e-8)]
     candidates: dict[str, Sequence[Any]] = {
         "regressor__monomials__degree": degrees,
         "regressor__ridge__alpha": penalties,
     }
-    return ComparedMethod(POLYNOMIAL, "learnt", SKLEARN, regressor, copies=copies, candidates=candidates)
+    return ComparedMethod(
+        name=POLYNOMIAL,
+        kind="learnt",
+        computed_by=SKLEARN,
+        regressor=regressor,
+        copies=copies,
+        candidates=candidates,
+    )
 
 
 def _triangulations(charge_map: ChargeMap | None) -> list[ComparedMethod]:
-    """Return triangulation without and with the true force. The result is empty if there is no charge map.
+    """Return two methods: triangulation without the true force, and triangulation with the true force.
+
+    Triangulation intersects the contours of the charges. Without a charge map, there are no contours, and the list is
+    empty.
 
     Args:
         charge_map: Simulated map from contacts to charges; None if there is none.
@@ -297,61 +364,98 @@ def _triangulations(charge_map: ChargeMap | None) -> list[ComparedMethod]:
     if charge_map is None:
         return []
     choice = "contours of the simulated charges"
-    without_force = Triangulate(charge_map)
-    with_force = Triangulate(charge_map, given_force=True)
-    return [
-        ComparedMethod("triangulation", "paper", NUMPY, without_force, choice=choice),
-        ComparedMethod("triangulation, force given", "paper", NUMPY, with_force, given_force=True, choice=choice),
-    ]
+    without_force = ComparedMethod(
+        name="triangulation",
+        kind="paper",
+        computed_by=NUMPY,
+        regressor=Triangulate(charge_map),
+        choice=choice,
+    )
+    with_force = ComparedMethod(
+        name="triangulation, force given",
+        kind="paper",
+        computed_by=NUMPY,
+        regressor=Triangulate(charge_map, given_force=True),
+        given_force=True,
+        choice=choice,
+    )
+    return [without_force, with_force]
 
 
 def _scaled_axes() -> FunctionTransformer:
-    """Return the transformer that scales the principal axes before distances are computed."""
+    """Return a transformer that scales the principal axes before distances are computed."""
     return FunctionTransformer(scale_axes, kw_args=AXIS_SCALES[0])
 
 
 def _axis_scale_candidates(task: FittingTask) -> dict[str, Sequence[Any]]:
-    """Return the candidates for the factors of the principal axes; a quick task has only one candidate."""
+    """Return the candidates for the factors of the principal axes, by the name of the parameter."""
     candidates = AXIS_SCALES[1:2] if task.quick else AXIS_SCALES
     return {"regressor__scales__kw_args": candidates}
 
 
 def _interpolated_table(task: FittingTask) -> ComparedMethod:
-    """Return the lookup table with affine maps."""
+    """Return the lookup table whose entries have affine maps, as a method with candidates for its parameters.
+
+    Args:
+        task: Presses and conditions for the fit.
+    """
     regressor = on_logarithms(task.domain, scales=_scaled_axes(), table=AffineTable())
     candidates = _axis_scale_candidates(task) | {"regressor__table__neighbours": (64, 128)}
-    return ComparedMethod(TABLE, "paper", KD_TREE, regressor, copies=5, candidates=candidates)
+    return ComparedMethod(
+        name=TABLE, kind="paper", computed_by=KD_TREE, regressor=regressor, copies=5, candidates=candidates
+    )
 
 
 def _nearest_neighbours(task: FittingTask) -> ComparedMethod:
     """Return a regressor that adds the mean residual of the nearest neighbours to a linear regression.
 
+    The neighbours are the presses whose charges are most similar. The candidates are several numbers of neighbours, and
+    several scales of the axes along which the distances of charges are measured.
+
     Args:
         task: Presses and conditions for the fit.
     """
-    neighbours = ResidualRegressor(KNeighborsRegressor())
-    regressor = on_logarithms(task.domain, scales=_scaled_axes(), near=neighbours)
-    counts = [count for count in (16, 32, 64) if count <= len(task.train)]
-    candidates = _axis_scale_candidates(task) | {"regressor__near__regressor__n_neighbors": counts}
-    return ComparedMethod("k-nearest neighbours", "learnt", SKLEARN, regressor, copies=5, candidates=candidates)
+    regressor = on_logarithms(task.domain, scales=_scaled_axes(), near=ResidualRegressor(KNeighborsRegressor()))
+    neighbour_counts = [count for count in (16, 32, 64) if count <= len(task.train)]  # not more than there are presses
+    candidates = _axis_scale_candidates(task) | {"regressor__near__regressor__n_neighbors": neighbour_counts}
+    return ComparedMethod(
+        name="k-nearest neighbours",
+        kind="learnt",
+        computed_by=SKLEARN,
+        regressor=regressor,
+        copies=5,
+        candidates=candidates,
+    )
 
 
 def _gradient_boosting(task: FittingTask) -> ComparedMethod:
     """Return gradient boosting of regression trees on the residuals of a linear regression.
 
     Args:
-        task: Conditions of the fit: the domain, the seed, and whether fewer trees suffice.
+        task: Conditions of the fit: the domain and the seed. A quick task has fewer trees.
     """
-    iterations = 30 if task.quick else 250
-    trees = HistGradientBoostingRegressor(max_iter=iterations, early_stopping=False, random_state=task.seed)
-    regressor = on_logarithms(task.domain, trees=ResidualRegressor(MultiOutputRegressor(trees)))
+    n_trees = 30 if task.quick else 250
+    trees = HistGradientBoostingRegressor(max_iter=n_trees, early_stopping=False, random_state=task.seed)
+    trees_for_each_target = MultiOutputRegressor(trees)  # the targets are x, y and the logarithm of the force
+    regressor = on_logarithms(task.domain, trees=ResidualRegressor(trees_for_each_target))
     candidates = {"regressor__trees__regressor__estimator__max_leaf_nodes": (31, 63)}
-    return ComparedMethod(BOOSTING, "learnt", SKLEARN, regressor, copies=3, candidates=candidates)
+    return ComparedMethod(
+        name=BOOSTING,
+        kind="learnt",
+        computed_by=SKLEARN,
+        regressor=regressor,
+        copies=3,
+        candidates=candidates,
+    )
 
 
 def _gaussian_process(task: FittingTask) -> ComparedMethod:
-    """Return a Gaussian process on a subset of the presses."""
+    """Return a Gaussian process on a subset of the presses.
+
+    Args:
+        task: Conditions of the fit: the domain and the seed. A quick task has a smaller subset.
+    """
     points, kernel_points = (300, 150) if task.quick else (2000, 500)
     process = SubsetProcess(points, kernel_points, task.seed)
     regressor = on_logarithms(task.domain, process=process)
-    return ComparedMethod("Gaussian process", "learnt", SKLEARN, regressor, copies=1)
+    return ComparedMethod(name="Gaussian process", kind="learnt", computed_by=SKLEARN, regressor=regressor, copies=1)

@@ -1,9 +1,10 @@
 """Maximum a posteriori estimate of a contact by the Gauss-Newton method on a charge map.
 
-The residuals are (Q - Q(c)) / sigma(Q). Here Q are the measured charges, Q(c) are the charges of a contact c, and sigma
-is the standard deviation of the noise. The prior is uniform over the disk and over the logarithm of the force, so it
-only constrains the contact. The search starts at the press with the nearest charges. If the residuals of the solution
-are too large, it starts again at the press with the next nearest charges.
+The residuals are (Q - Q(c)) / sigma(Q), where Q are the measured charges, Q(c) are the charges of a contact c, and
+sigma is the standard deviation of the noise. The prior is uniform over the disk and in the logarithm of the force. The
+only effect of this prior is that the contact is restricted to the domain. A search starts at the press with the nearest
+charges. If the residuals of the result are too large, the search starts again at the press with the next nearest
+charges.
 """
 
 import numpy as np
@@ -18,22 +19,22 @@ from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.presses import LabelledPresses, split_by_position
 
 N_STARTS = 600
-"""Number of presses among which the start of a search is chosen."""
+"""Number of presses among which the start of each search is chosen."""
 
 MAX_ATTEMPTS = 3
 """Largest number of searches for one press."""
 
 RESTART_THRESHOLD = 12.0
-"""Sum of squared residuals above which another start is tried.
+"""Sum of squared residuals above which a search is repeated from another start.
 
 With three or four charges, noise alone rarely causes a larger sum.
 """
 
 BATCH = 512
-"""Number of presses that are searched at once. The polynomials of a batch fit into the processor's cache."""
+"""Number of presses whose contacts are searched for at once. The polynomials of a batch fit into the cache."""
 
 VALIDATION_FRACTION = 0.1
-"""Fraction of the positions by which the degree of the charge series is chosen."""
+"""Fraction of the positions whose presses are used to choose the degree of the charge series."""
 
 
 class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
@@ -43,7 +44,7 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         domain: Contacts that can occur.
         noise: Noise whose standard deviation is the unit of the residuals.
         charge_map: Map from contacts to charges; None to fit a `ChargeField` to the presses.
-        seed: Seed of the starts.
+        seed: Seed of the random choice of the starts.
     """
 
     def __init__(self, domain: Domain, noise: NoiseModel, charge_map: ChargeMap | None = None, seed: int = 0) -> None:
@@ -53,7 +54,7 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         self.seed = seed
 
     def fit(self, charge: Array, contact: Array) -> "GaussNewton":
-        """Fit the charge map unless one is given, and choose the starts of the searches.
+        """Fit a charge map unless a charge map is given, and choose the starts of the searches.
 
         Args:
             charge: Charges without noise, shape (n, n_electrode), pC.
@@ -66,17 +67,19 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         if self.charge_map is not None:
             self.map_ = self.charge_map
         else:
+            # Fit a series of polynomials, whose degree is chosen on the validation presses.
             n_electrode = charge.shape[1]
-            names = tuple(str(electrode_index) for electrode_index in range(n_electrode))
+            electrode_names = tuple(str(electrode_index) for electrode_index in range(n_electrode))
             train, validation = split_by_position(presses, VALIDATION_FRACTION, self.seed)
-            self.map_ = ChargeField.fit(self.domain, names, train, validation)
+            self.map_ = ChargeField.fit(self.domain, electrode_names, train, validation)
 
-        # A search begins at the chosen press whose charges are most similar, which the tree finds.
+        # Choose some presses at random as starts of the searches. A search begins at the start whose charges are most
+        # similar to the measured charges. The tree finds this start by the whitened logarithms of the charges.
         shuffled_rows = np.random.default_rng(self.seed).permutation(len(presses))
         start_rows = shuffled_rows[:N_STARTS]
-        self.features_ = whitening().fit(charge)
-        self.starts_ = contact[start_rows]
-        self.tree_ = cKDTree(self.features_.transform(charge[start_rows]))
+        self.start_contacts_ = contact[start_rows]
+        self.whitening_ = whitening().fit(charge)
+        self.start_tree_ = cKDTree(self.whitening_.transform(charge[start_rows]))
         return self
 
     def predict(self, charge: Array) -> Array:
@@ -85,32 +88,37 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         return np.concatenate(batches)
 
     def _search(self, charge: Array) -> Array:
-        """Estimate the contacts of one batch.
+        """Estimate the contacts of one batch of presses.
 
-        The search is repeated from the next start for presses whose sum of squared residuals is still too large.
+        The residuals of a press are (Q - Q(c)) / sigma, with its charges Q, the charges Q(c) of the estimated contact
+        c, and the standard deviations sigma of the noise. If the sum of the squared residuals of a press is above
+        `RESTART_THRESHOLD`, the search is repeated from another start.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
-            Contacts (x, y, F), shape (n, 3), mm and N. Each is the best result of the searches from several starts.
+            Contacts (x, y, F), shape (n, 3), mm and N. Each contact is the result with the smallest sum of squared
+            residuals.
         """
         sigma = self.noise.sigma(charge)
-        features = self.features_.transform(charge)
-        contact = np.empty((len(charge), 3))
-        square_sum = np.full(len(charge), np.inf)
+        features = self.whitening_.transform(charge)
+        best_contact = np.empty((len(charge), 3))
+        smallest_square_sum = np.full(len(charge), np.inf)  # so that the first attempt searches all presses
         for attempt in range(1, MAX_ATTEMPTS + 1):
-            remaining = np.flatnonzero(square_sum > RESTART_THRESHOLD)
-            if not remaining.size:
+            remaining_rows = np.flatnonzero(smallest_square_sum > RESTART_THRESHOLD)
+            if not remaining_rows.size:
                 break
             # The first attempt begins at the nearest start, the second at the next nearest start, and so on. The query
             # for the neighbour with the rank `attempt` returns indices of shape (n, 1).
-            _, nearest = self.tree_.query(features[remaining], [attempt])
-            start = self.starts_[nearest[:, 0]]
-            solution, residual = explain(self.map_, charge[remaining], sigma[remaining], start)
-            solution_square_sum = (residual**2).sum(axis=1)
-            is_better = solution_square_sum < square_sum[remaining]
-            improved_rows = remaining[is_better]
-            contact[improved_rows] = solution[is_better]
-            square_sum[improved_rows] = solution_square_sum[is_better]
-        return contact
+            _, start_index = self.start_tree_.query(features[remaining_rows], [attempt])
+            start = self.start_contacts_[start_index[:, 0]]
+            contact, residual = explain(self.map_, charge[remaining_rows], sigma[remaining_rows], start)
+
+            # Keep the results that are better than those of the earlier attempts.
+            square_sum = (residual**2).sum(axis=1)
+            is_better = square_sum < smallest_square_sum[remaining_rows]
+            improved_rows = remaining_rows[is_better]
+            best_contact[improved_rows] = contact[is_better]
+            smallest_square_sum[improved_rows] = square_sum[is_better]
+        return best_contact

@@ -1,8 +1,8 @@
-"""Regressors of scikit-learn with common transformers of the charges and of the contacts.
+"""Regressors of scikit-learn that all use the same transformations of the charges and of the contacts.
 
 The inputs are whitened logarithms of the charges. The first principal axis is mostly the mean logarithm, which depends
 on the force. The next two axes are mostly logarithms of ratios, which depend on the position. With a fourth electrode,
-there is one more axis, which is mostly noise. The targets are x, y and ln F, scaled to [-1, 1].
+there is a fourth axis, which contains mostly noise. The targets are x, y and ln F, scaled to [-1, 1].
 """
 
 from typing import Any
@@ -24,14 +24,14 @@ from isocharge.train.data.channel_noise import BOTH_SIGNS, MIN_TRANSITION_RATIO,
 from isocharge.train.data.presses import LOWEST_CHARGE
 
 BATCH = 256
-"""Number of presses for which a Gaussian process computes the kernel at once."""
+"""Number of presses for which a Gaussian process computes the kernel at a time."""
 
 AXIS_SCALES = ({"force": 1.0, "rest": 1.0}, {"force": 0.1, "rest": 0.03}, {"force": 0.03, "rest": 0.03})
 """Candidates for the factors of `scale_axes`. The map is nearly linear along the axis of the force, so neighbours may
 be far apart along this axis."""
 
 N_POSITION_AND_FORCE_AXES = 3
-"""Number of principal axes that carry force and position."""
+"""Number of principal axes that depend mostly on the force and the position."""
 
 
 def on_logarithms(domain: Domain, **steps: Any) -> TransformedTargetRegressor:
@@ -56,10 +56,12 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Transformer that computes ln(max(Q, 1 pC)), or asinh(2 Q / usual size) if the charges have both signs."""
 
     def fit(self, charge: Array, target: object = None) -> "Logarithms":
-        """Compute the scale of the charges. If no electrode has charges of both signs, the scale is None.
+        """Determine whether the charges have both signs and, if they do, compute the scale of the transformation.
 
         The charges of an electrode have both signs if more than the fraction `BOTH_SIGNS` of them is not positive. A
-        smaller fraction can be due to noise alone.
+        smaller fraction can be due to noise alone. Charges of both signs are transformed to asinh(Q / scale), which is
+        linear for charges far below the scale and logarithmic for charges far above it. If no electrode has charges of
+        both signs, the scale is None, and the charges are transformed to logarithms.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
@@ -72,7 +74,9 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         is_not_positive = charge <= 0.0
         not_positive_fraction = is_not_positive.mean(axis=0)  # one value for each electrode
         has_both_signs = (not_positive_fraction > BOTH_SIGNS).any()
-        self.scale_ = MIN_TRANSITION_RATIO * usual_size(charge) if has_both_signs else None
+        self.scale_ = None
+        if has_both_signs:
+            self.scale_ = MIN_TRANSITION_RATIO * usual_size(charge)  # shape (n_electrode,), pC
         return self
 
     def transform(self, charge: Array) -> Array:
@@ -83,12 +87,12 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def scale_axes(values: Array, force: float, rest: float) -> Array:
-    """Multiply the principal axes of whitened logarithms by factors. The axes of the position remain as they are.
+    """Multiply the principal axes of whitened logarithms by factors. The two axes of the position are not changed.
 
     Args:
         values: Whitened logarithms, shape (n, n_electrode).
-        force: Factor of the first axis, which carries the force.
-        rest: Factor of the axes after the third, which carry mostly noise.
+        force: Factor of the first axis, which depends mostly on the force.
+        rest: Factor of the axes after the third axis, which contain mostly noise.
 
     Returns:
         Scaled values, shape (n, n_electrode).
@@ -103,37 +107,41 @@ class ResidualRegressor(BaseEstimator, RegressorMixin):  # type: ignore[misc]
     """Sum of a linear regression and a regressor that is fitted to its residuals.
 
     Args:
-        regressor: Regressor for the residuals, which are small because the map is nearly linear along the force.
+        regressor: Regressor for the residuals of the linear regression.
     """
 
     def __init__(self, regressor: Any) -> None:
         self.regressor = regressor
 
-    def fit(self, values: Array, target: Array) -> "ResidualRegressor":
-        """Fit the linear regression and then the regressor.
+    def fit(self, inputs: Array, target: Array) -> "ResidualRegressor":
+        """Fit the linear regression, and then fit the regressor to its residuals.
 
         Args:
-            values: Inputs, shape (n, n_input).
+            inputs: Inputs, shape (n, n_input).
             target: Targets, shape (n, n_target).
+
+        Returns:
+            This estimator.
         """
-        self.linear_ = LinearRegression().fit(values, target)
+        self.linear_ = LinearRegression().fit(inputs, target)
+        residual = target - self.linear_.predict(inputs)
         self.regressor_ = clone(self.regressor)
-        self.regressor_.fit(values, target - self.linear_.predict(values))
+        self.regressor_.fit(inputs, residual)
         return self
 
-    def predict(self, values: Array) -> Array:
+    def predict(self, inputs: Array) -> Array:
         """Estimate the targets, shape (n, n_target), of inputs of shape (n, n_input)."""
-        return np.asarray(self.linear_.predict(values) + self.regressor_.predict(values))
+        return np.asarray(self.linear_.predict(inputs) + self.regressor_.predict(inputs))
 
 
 class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
     """Gaussian process that is fitted to a random subset of the presses.
 
-    The cost of a Gaussian process grows with the cube of the number of presses.
+    A subset is used because the time of a fit grows with the third power of the number of presses.
 
     Args:
-        points: Number of presses of the process.
-        kernel_points: Number of presses to which the kernel is fitted, by marginal likelihood.
+        points: Number of presses to which the process is fitted.
+        kernel_points: Number of presses to which the parameters of the kernel are fitted, by marginal likelihood.
         seed: Seed of the subset.
     """
 
@@ -142,36 +150,41 @@ class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         self.kernel_points = kernel_points
         self.seed = seed
 
-    def fit(self, values: Array, target: Array) -> "SubsetProcess":
-        """Fit the kernel to a few points, and then the process with this kernel to more points.
+    def fit(self, inputs: Array, target: Array) -> "SubsetProcess":
+        """Fit the kernel to a few presses, and then fit the process with this kernel to more presses.
 
-        The points are chosen at random, because the time of a fit grows with the third power of their number.
+        The presses are chosen at random. The fit of the kernel evaluates the process many times, so it uses fewer
+        presses.
 
         Args:
-            values: Inputs, shape (n, n_input).
-            target: Targets, shape (n, n_target).
+            inputs: Inputs of the presses, shape (n, n_input).
+            target: Targets of the presses, shape (n, n_target).
 
         Returns:
             This estimator.
         """
-        rows = np.random.default_rng(self.seed).permutation(len(values))[: self.points]
+        shuffled_rows = np.random.default_rng(self.seed).permutation(len(inputs))
+        rows = shuffled_rows[: self.points]
         kernel_rows = rows[: self.kernel_points]
 
-        # Each part of the kernel has an initial value and bounds, between which the value is fitted.
-        n_input = values.shape[1]
+        # The covariance of two inputs is the variance times their correlation, which decreases with their distance. The
+        # noise is independent for each press. Each part has an initial value, and bounds within which it is fitted.
+        n_input = inputs.shape[1]
         variance = ConstantKernel(10.0, (1e-2, 1e5))
         correlation = RBF(np.full(n_input, 2.0), (0.1, 100.0))  # one length scale for each input
         noise = WhiteKernel(1e-3, (1e-8, 1.0))
         kernel = variance * correlation + noise
         with catch_warnings():
-            simplefilter("ignore", ConvergenceWarning)  # a length scale at its bound is acceptable
-            fitted = GaussianProcessRegressor(kernel, normalize_y=True).fit(values[kernel_rows], target[kernel_rows])
+            simplefilter("ignore", ConvergenceWarning)  # a fitted value at its bound is acceptable
+            kernel_process = GaussianProcessRegressor(kernel, normalize_y=True)
+            kernel_process.fit(inputs[kernel_rows], target[kernel_rows])
 
-        self.process_ = GaussianProcessRegressor(fitted.kernel_, optimizer=None, normalize_y=True)
-        self.process_.fit(values[rows], target[rows])
+        # Without an optimiser, the second process uses the fitted kernel as it is.
+        self.process_ = GaussianProcessRegressor(kernel_process.kernel_, optimizer=None, normalize_y=True)
+        self.process_.fit(inputs[rows], target[rows])
         return self
 
-    def predict(self, values: Array) -> Array:
+    def predict(self, inputs: Array) -> Array:
         """Compute the posterior mean, shape (n, n_target), of inputs of shape (n, n_input)."""
-        batches = [self.process_.predict(values[first : first + BATCH]) for first in range(0, len(values), BATCH)]
+        batches = [self.process_.predict(inputs[first : first + BATCH]) for first in range(0, len(inputs), BATCH)]
         return np.concatenate(batches)

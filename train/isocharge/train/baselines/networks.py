@@ -1,7 +1,7 @@
-"""Networks for the comparison of methods: networks of several sizes, trained as usual, and the released model.
+"""Networks for the comparison of methods: the released model, and networks of several sizes that are trained anew.
 
-The other methods of the comparison only estimate the contact, so these networks also run without standard deviations
-and misfit.
+The other methods of the comparison only estimate the contact. The networks are therefore also compared without their
+outputs for standard deviations and misfit.
 """
 
 from collections.abc import Callable
@@ -31,11 +31,11 @@ RELEASED = "released network"
 """Name of the released model in the comparison."""
 
 SMALL_MISFIT_WIDTH = 8
-"""Width of the hidden layers of a misfit perceptron that is not used."""
+"""Width of the hidden layers of a misfit perceptron whose output is not used."""
 
 
 class OnnxContact(GivenMethod):
-    """ONNX graph from `charge_pC` to `contact`, which ONNX Runtime runs with the same options as for `Predictor`.
+    """ONNX graph that computes `contact` from `charge_pC`, with the same options of ONNX Runtime as in `Predictor`.
 
     Args:
         graph: The ONNX file.
@@ -50,18 +50,20 @@ class OnnxContact(GivenMethod):
         return np.asarray(contact, dtype=float)
 
     def single(self, charge: Array) -> Callable[[], object]:
-        """Return a function that computes one press. The memory of the press is bound only once, as in `Predictor`.
+        """Return a function without arguments that computes the contact of one press, in order to time the computation.
+
+        Memory for the charges and the contact is bound to the session before the first call, as in `Predictor`.
 
         Args:
             charge: Charges of the press, shape (n_electrode,), pC.
         """
-        press = BoundPress(self._session, charge.size)
+        bound_press = BoundPress(self._session, charge.size)
         single_charge = charge.astype(np.float32)
-        contact = np.zeros(3, np.float32)
+        contact = np.zeros(3, np.float32)  # overwritten by every call
 
         def compute() -> object:
-            """Return the contact of the press, float32, shape (3,)."""
-            press.run_into(single_charge, contact)
+            """Return the contact (x, y, F) of the press, shape (3,), float32, mm and N."""
+            bound_press.run_into(single_charge, contact)
             return contact
 
         return compute
@@ -76,7 +78,7 @@ class OnnxContact(GivenMethod):
 
 
 class TrainedNetwork(OnnxContact):
-    """Perceptron of one size that is trained to estimate the contact only.
+    """Perceptron of one size that is trained for the comparison, and that estimates only the contact.
 
     Args:
         data: Sensor and domain. The presses in these data are replaced by the presses of `fit`.
@@ -103,26 +105,34 @@ class TrainedNetwork(OnnxContact):
         self.seed = seed
 
     def fit(self, charge: Array, contact: Array) -> Self:
-        """Train the network, and write the graph that computes its contacts.
+        """Train the network on presses, and write the ONNX graph that computes its contacts.
 
-        Only the contacts are compared, so the misfit perceptron is as small as possible and trained for one step.
+        A training always includes the misfit perceptron, whose output is not used here. This perceptron is therefore
+        small and trained for one step only.
 
         Args:
             charge: Charges without noise, shape (n, n_electrode), pC.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            This estimator.
         """
+        misfit_hidden = tuple(SMALL_MISFIT_WIDTH for _ in self.hidden)  # both perceptrons need equally many layers
+        sizes = NetworkConfig(hidden=self.hidden, misfit_hidden=misfit_hidden)
         training = TrainingConfig(
             steps=self.steps, misfit_steps=1, misfit_charges=1000, hold_out=0.05, seed=self.seed, noise=self.noise
         )
-        sizes = NetworkConfig(hidden=self.hidden, misfit_hidden=(SMALL_MISFIT_WIDTH,) * len(self.hidden))
         presses = LabelledPresses(contact, charge, self.data.presses.measured)
-        trained = train_network(replace(self.data, presses=presses), FitConfig(sizes, training))
-        self.graph = write_contact_graph(fold_contact_mean(trained.network))
+        data = replace(self.data, presses=presses)
+        trained = train_network(data, FitConfig(sizes, training))
+
+        network_without_stds = fold_contact_mean(trained.network)
+        self.graph = write_contact_graph(network_without_stds)
         return self
 
 
 class ReleasedModel(GivenMethod):
-    """Model folder, run by `Predictor`.
+    """Released model, which `Predictor` evaluates.
 
     Args:
         folder: Version folder of the model.
@@ -137,23 +147,26 @@ class ReleasedModel(GivenMethod):
         return contact
 
     def answer(self, charge: Array) -> tuple[Array, Array, Array]:
-        """Estimate contacts with all outputs.
+        """Estimate contacts, their standard deviations and the misfits of charges.
+
+        The misfit is the distance of the charges from the nearest single contact that the model covers, in standard
+        deviations of the noise.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
             Contacts (x, y, F), shape (n, 3), mm and N. Standard deviations of the contacts, shape (n, 3), mm and N.
-            Misfits, shape (n, 1).
+            Misfits, shape (n, 1), dimensionless. All are float64.
         """
         answers = self.predictor.predict_batch(charge)
         contact = np.stack([answers.x_mm, answers.y_mm, answers.force_N], axis=1)
         std = np.stack([answers.x_std_mm, answers.y_std_mm, answers.force_std_N], axis=1)
-        misfit = np.reshape(answers.misfit, (-1, 1))
+        misfit = np.reshape(answers.misfit, (-1, 1))  # one column
         return contact.astype(float), std.astype(float), misfit.astype(float)
 
     def single(self, charge: Array) -> Callable[[], object]:
-        """Return a function that computes one press with `Predictor.predict_into`.
+        """Return a function without arguments that computes the answer to one press with `Predictor.predict_into`.
 
         Args:
             charge: Charges of the press, shape (n_electrode,), pC.
@@ -173,7 +186,7 @@ class ReleasedModel(GivenMethod):
         return (self.folder / "model.onnx").read_bytes()
 
     def contact_only(self) -> OnnxContact:
-        """Return the part of the graph that computes the contact, which is all that the other methods estimate."""
+        """Return the part of the graph that computes the contact, because other methods do not estimate more."""
         extractor = Extractor(onnx.load_model_from_string(self.graph))
         part = extractor.extract_model([INPUT], ["contact"])
         return OnnxContact(part.SerializeToString())

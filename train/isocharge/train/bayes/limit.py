@@ -1,4 +1,4 @@
-"""The Bayes limit, which is the error of the posterior mean. No estimator has a smaller mean squared error.
+"""Bayes limit, which is the error of the posterior mean. No estimator has a smaller mean squared error.
 
 The limit depends on the film, the probe, the noise and the range of presses.
 
@@ -22,20 +22,20 @@ from isocharge.train.bayes.posterior import Posterior
 N_PRESSES = 4000
 """Number of presses of `bayes_limit`.
 
-The rms error then has a statistical error of 3 %. The ratio of the rms errors of two estimators on the same presses has
-a smaller statistical error.
+With this number, the statistical error of the rms error is a few percent. The ratio of the rms errors of two estimators
+on the same presses has a smaller statistical error.
 """
 
 
 @dataclass(frozen=True)
 class BayesProblem:
-    """The conditions on which the limit depends.
+    """Conditions on which the Bayes limit depends.
 
     Attributes:
         sensor: The sensor.
-        probe: Footprint of the probe, with its orientation.
-        radius: Radius of the working area, mm. The positions are uniform in it.
-        force_range: Smallest and largest force, N. The forces are log-uniform.
+        probe: Probe with its orientation.
+        radius: Radius of the working area, mm, over which the positions are uniformly distributed.
+        force_range: Smallest and largest force, N, between which the forces are log-uniform.
         noise: Noise of the charges.
     """
 
@@ -46,7 +46,11 @@ class BayesProblem:
     noise: NoiseModel = field(default_factory=lambda: noise_model("reference"))
 
     def forward_map(self, executor: Executor | None = None) -> ForwardMap:
-        """Simulate the map from contacts to charges, which takes about 5 s."""
+        """Simulate the map from contacts to charges.
+
+        Args:
+            executor: Executor for the solves; None for this process.
+        """
         return ForwardMap.build(self.sensor, self.probe, self.radius, self.force_range, executor=executor)
 
 
@@ -57,28 +61,33 @@ def bayes_estimate(
     charge_map: ForwardMap | ChargeSpline | None = None,
     executor: Executor | None = None,
 ) -> tuple[Array, Array]:
-    """Compute the posterior means of charges with noise, which takes about 15 ms for each press.
+    """Compute the posterior mean of the contact from the noisy charges of each press.
+
+    The prior of the contact is uniform over the disk of the problem and in the logarithm of the force. The computation
+    takes roughly ten milliseconds for each press.
 
     Args:
         problem: Sensor, probe, prior and noise.
         charge: Touch charges with noise, shape (n, n_electrode), pC.
-        charge_map: Map from contacts to charges; None to simulate it. Its range of forces must be that of the problem,
-            and its radius at least that of the problem.
+        charge_map: Map from contacts to charges; None to simulate this map. The range of forces of the map must be that
+            of the problem, and its radius must be at least that of the problem.
         executor: Executor for the solves and integrals; None for this process. The executor of a `ResumableRun` saves
             completed results.
 
     Returns:
-        Posterior means (x, y, F), mm and N, and standard deviations, shape (n, 3) each. The force is
-        E[1/F] / E[1/F^2], which has the smallest mean squared relative error.
+        Posterior means (x, y, F), shape (n, 3), and posterior standard deviations, shape (n, 3), mm and N. Instead of
+        the mean of the force, E[1/F] / E[1/F^2] is returned, which has the smallest mean squared relative error.
 
     Raises:
-        ChargeError: If there are no charges, or they are not finite or of another number of electrodes.
+        ChargeError: If there are no charges, if a charge is not finite, or if the number of electrodes is wrong.
         InputError: If the noise is zero, or if the map has another range of forces or a smaller radius.
     """
     used_map = charge_map or problem.forward_map(executor)
     map_forces = used_map.domain.force_range
-    if map_forces != problem.force_range:
+    if map_forces != problem.force_range:  # the posterior integrates over all forces of the map
         raise InputError(f"forces of the map: expected the problem's, {problem.force_range} N, got {map_forces} N")
+
+    # The integration evaluates the charges at many contacts, which is much faster with a spline of the map.
     spline = used_map if isinstance(used_map, ChargeSpline) else ChargeSpline.of(used_map)
     posterior = Posterior(spline, problem.noise, problem.radius)
     return posterior.mean_and_std(charge, executor)
@@ -92,21 +101,25 @@ def bayes_limit(
     charge_map: ForwardMap | ChargeSpline | None = None,
     executor: Executor | None = None,
 ) -> ContactErrorStatistics:
-    """Compute the limit of a problem on presses drawn from its prior, which takes about a minute.
+    """Compute the Bayes limit of a problem.
+
+    Presses are drawn from the prior of the problem, and noise is added to their charges. The limit is the error of the
+    posterior means of these charges.
 
     Args:
         problem: Sensor, probe, prior and noise.
         presses: Number of presses.
         seed: Seed of presses and noise.
-        charge_map: Map from contacts to charges; None to simulate it. See `bayes_estimate`.
+        charge_map: Map from contacts to charges; None to simulate this map. See `bayes_estimate`.
         executor: Executor for the solves and integrals; None for this process.
 
     Returns:
         Statistics of the errors of the posterior means.
     """
     used_map = charge_map or problem.forward_map(executor)
-    contact = Sweep(problem.radius, problem.force_range, presses, seed, sampling="random").contacts()
-    noise_rng = np.random.default_rng([seed, 1])
+    sweep = Sweep(problem.radius, problem.force_range, samples=presses, seed=seed, sampling="random")
+    contact = sweep.contacts()
+    noise_rng = np.random.default_rng([seed, 1])  # so that the noise does not depend on the contacts
     noisy_charge = problem.noise.add(used_map.charges(contact), noise_rng)
     estimate, _ = bayes_estimate(problem, noisy_charge, charge_map=used_map, executor=executor)
     return ContactErrorStatistics.of(estimate, contact)

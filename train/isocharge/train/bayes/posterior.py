@@ -1,17 +1,18 @@
-"""The posterior of a contact given charges with noise, by numerical integration.
+"""Posterior of a contact given charges with noise, which is computed by numerical integration.
 
-The mean of the posterior has the smallest mean squared error of all estimators. The prior is uniform over a disk and
-in the logarithm of the force. The charges are Gaussian about Q(c), with the standard deviation of the true charge, so
-the likelihood includes its normalisation:
+The mean of the posterior has the smallest mean squared error of all estimators. The prior is uniform over a disk and in
+the logarithm of the force. Given a contact (x, y, F), the charge Q_e of each electrode e has a normal distribution
+about its expected value q_e. The standard deviation sigma_e depends on the expected value, so the likelihood includes
+the normalisation of the distribution:
 
-    p(Q | x, y, ln F) = prod_e exp(-(Q_e - q_e)^2 / (2 sigma_e^2)) / sigma_e,   q = Q(x, y, F),   sigma_e = sigma(q_e).
+    p(Q | x, y, ln F) = prod_e exp(-(Q_e - q_e)^2 / (2 sigma_e^2)) / sigma_e,   sigma_e = sigma(q_e).
 
-The integral over the positions is a sum over square cells. A cell is dropped only if no contact in it can explain the
-charges. The method therefore works for posteriors of any shape, including those with several maxima. The other cells
-are divided into four until they are small compared with the width of the posterior. In each cell, the logarithm of the
-force is integrated by Gauss-Legendre quadrature over an interval around its best value. With cells of 1.25 standard
-deviations, the midpoint rule has a relative error of 1e-5 on a Gaussian (Trefethen and Weideman 2014). Only cells at
-the edge of the disk must be smaller.
+The integral over the positions is a sum over square cells. A cell is dropped only if no contact in the cell can explain
+the charges. The method therefore works for posteriors of any shape, including those with several maxima. Each other
+cell is divided into four cells until the cells are small compared with the width of the posterior. In each cell, the
+integral over the logarithm of the force is computed by Gauss-Legendre quadrature over an interval around the most
+likely force. With cells of 1.25 standard deviations, the midpoint rule has a relative error of 1e-5 for a normal
+distribution (Trefethen and Weideman 2014). Only cells at the edge of the disk must be smaller.
 """
 
 from collections.abc import Iterator
@@ -33,46 +34,48 @@ from isocharge.simulate.identifiability.force_profile import ForceProfile
 from isocharge.simulate.numerics.disk import onto_disk
 
 CHUNK = 64
-"""Number of presses that are integrated at once. The arrays then need at most about 100 MB."""
+"""Number of presses whose posteriors are integrated at once, which limits the memory."""
 
 CELLS_ACROSS = 32
-"""Number of first cells across the disk."""
+"""Number of cells across the disk before the first division."""
 
 EDGE_POINTS = 8
-"""Number of points across a cell at the edge of the disk; each point is either inside or outside."""
+"""Number of points across a cell at the edge of the disk. The points show which part of the cell is inside."""
 
 MAX_DIVISIONS = 10
-"""Largest number of times that a cell is divided into four. The smallest side is a thirty-thousandth of the disk."""
+"""Largest number of times that a cell is divided into four cells."""
 
 MAX_SIDE_STD = 1.25
 """Largest side of a cell, in standard deviations of the position along its most certain direction."""
 
 NEGLIGIBLE_CHI2 = 36.0
-"""Excess of a cell's chi-squared over the smallest one of its press above which the cell is dropped.
+"""Difference between the chi-squared of a cell and the smallest one of its press above which the cell is dropped.
 
-The density of such a cell is smaller by a factor of exp(-18).
+The density in such a cell is smaller than the largest density by a factor of at least exp(18).
 """
 
 EDGE_CHI2 = 9.0
-"""Excess of chi-squared below which a cell at the edge of the disk matters.
+"""Difference of chi-squared, as in `NEGLIGIBLE_CHI2`, up to which a cell at the edge of the disk is important.
 
-If a press has such a cell, the cells of this press are refined once more."""
+If a press has such a cell, all cells of this press are refined once more."""
 
 FORCE_HALF_WIDTH_STD = 5.0
-"""Half width of the integral over the logarithm of the force, in standard deviations."""
+"""Half width of the interval of the integral over the logarithm of the force, in standard deviations."""
 
 N_FORCE_NODES = 12
-"""Number of nodes of the integral over the force. Together with the half width the relative error is 1e-4."""
+"""Number of nodes of the integral over the logarithm of the force.
+
+With this number of nodes and `FORCE_HALF_WIDTH_STD`, the relative error of the integral is about 1e-4."""
 
 
 @dataclass(frozen=True)
 class Cells:
-    """Square cells of the plane of positions. Each cell belongs to one press.
+    """Square cells in the plane of the positions. Each cell belongs to one press.
 
     Attributes:
-        press: Number of the press, ascending, shape (n,).
-        root: Number of the first cell from which the cell was divided, shape (n,).
-        centre: Centres (x, y), shape (n, 2), mm.
+        press: Number of the press of each cell, in ascending order, shape (n,).
+        root: Number of the first cell of which each cell is a part, shape (n,).
+        centre: Centres (x, y) of the cells, shape (n, 2), mm.
         side: Side of all cells, mm.
     """
 
@@ -83,7 +86,7 @@ class Cells:
 
     @classmethod
     def roots(cls, radius: float) -> "Cells":
-        """Return the first cells of one press, which cover a disk with this radius, mm."""
+        """Return the first cells of one press, which cover a disk with the given radius, mm."""
         side = 2.0 * radius / CELLS_ACROSS
         centre = _grid(CELLS_ACROSS, side)
         centre = centre[_overlaps_disk(centre, side, radius)]
@@ -102,7 +105,7 @@ class Cells:
         return quarters[_overlaps_disk(quarters.centre, quarters.side, radius)]
 
     def finer(self, radius: float) -> Iterator["Cells"]:
-        """Yield finer cells for the last integration.
+        """Yield finer cells for the integration: first those inside the disk, and then those at its edge.
 
         A cell inside the disk is replaced by four cells, whose centres are the points of Gauss-Legendre quadrature. A
         cell on the edge of the disk is divided into sixteen cells.
@@ -139,22 +142,25 @@ class Cells:
             radius: Radius of the disk, mm.
 
         Returns:
-            Area of the part relative to the cell, shape (n,), and its centroid, shape (n, 2), mm. A part without any of
-            the points counts as half of a point.
+            Area of the part divided by the area of the cell, shape (n,). Centroid of the part, shape (n, 2), mm.
         """
+        # Values of the cells that lie inside completely. Those of the other cells are replaced below.
         fraction = np.ones(len(self))
         centroid = self.centre.copy()
 
         edge_cells = np.flatnonzero(self.on_edge(radius))
-        points = centroid[edge_cells, None] + _grid(EDGE_POINTS, self.side / EDGE_POINTS)  # shape (n, n_point, 2)
+        edge_centre = self.centre[edge_cells]
+        points = edge_centre[:, None] + _grid(EDGE_POINTS, self.side / EDGE_POINTS)  # shape (n, n_point, 2)
         is_inside = np.hypot(points[..., 0], points[..., 1]) <= radius
         n_inside = is_inside.sum(axis=1)
-        fraction[edge_cells] = np.maximum(n_inside, 0.5) / EDGE_POINTS**2  # of all points of the cell
+        n_point = EDGE_POINTS**2
+        # Without points inside, half a point is counted, because the logarithm of the area must be finite.
+        fraction[edge_cells] = np.maximum(n_inside, 0.5) / n_point
 
         # The centroid is the mean of the points inside or, without such points, the nearest point of the disk.
         point_sum = (points * is_inside[..., None]).sum(axis=1)
-        mean_point = point_sum / np.maximum(n_inside, 1)[:, None]
-        nearest_point = onto_disk(centroid[edge_cells], radius)
+        mean_point = point_sum / np.maximum(n_inside, 1)[:, None]  # avoids a division by zero
+        nearest_point = onto_disk(edge_centre, radius)
         centroid[edge_cells] = np.where(n_inside[:, None] > 0, mean_point, nearest_point)
         return fraction, centroid
 
@@ -166,17 +172,18 @@ def _grid(count: int, step: float) -> Array:
 
 
 def _overlaps_disk(centre: Array, side: float, radius: float) -> Booleans:
-    """Return which squares overlap the disk around the origin, shape (n,). Centres have the shape (n, 2), mm."""
+    """Return which squares with centres of shape (n, 2), mm, overlap the disk around the origin, shape (n,)."""
     nearest_point = np.maximum(np.abs(centre) - 0.5 * side, 0.0)  # of each square to the origin, up to signs
     return np.asarray(np.hypot(nearest_point[:, 0], nearest_point[:, 1]) < radius)
 
 
 class _RootCells(NamedTuple):
-    """The first cells of a press.
+    """First cells of a press, with properties of the charges in these cells.
 
     Attributes:
         cells: The n cells.
-        terms: Terms of the charges at the centres of the cells, shape (n, n_term, n_electrode).
+        terms: Terms at the centres of the cells whose sums, weighted by functions of the force, are the charges, shape
+            (n, n_term, n_electrode).
         largest_slope: Largest slope of each scaled charge in each cell, shape (n, n_electrode), 1/mm.
     """
 
@@ -187,7 +194,7 @@ class _RootCells(NamedTuple):
 
 @dataclass(frozen=True)
 class Posterior:
-    """The posterior of contacts.
+    """Posterior of the contact of a press, given its charges.
 
     Attributes:
         charges: Map from contacts to charges.
@@ -211,7 +218,7 @@ class Posterior:
 
         Args:
             charge: Charges with noise, shape (n, n_electrode), pC.
-            executor: Executor whose tasks integrate `CHUNK` presses each; None for this process.
+            executor: Executor, each of whose tasks integrates the posteriors of `CHUNK` presses; None for this process.
 
         Returns:
             Mean and standard deviation of (x, y, F), shape (n, 3) each, mm and N.
@@ -221,15 +228,14 @@ class Posterior:
         """
         charge = np.asarray(charge, dtype=float)
         n_electrode = len(self.charges.electrodes)
-        has_electrodes = charge.ndim == 2 and charge.shape[1] == n_electrode
-        is_valid = has_electrodes and len(charge) > 0 and bool(np.isfinite(charge).all())
-        if not is_valid:
+        has_right_shape = charge.ndim == 2 and charge.shape[1] == n_electrode and len(charge) > 0
+        if not (has_right_shape and np.isfinite(charge).all()):
             raise ChargeError(
                 f"expected finite charges of shape (n, {n_electrode}), n at least 1, got shape {charge.shape}"
             )
         chunks = [charge[start : start + CHUNK] for start in range(0, len(charge), CHUNK)]
-        moments_by_chunk = in_order(executor, self._integrate, chunks)
-        tracked_moments = list(track(moments_by_chunk, "integrating the posterior", len(chunks)))
+        moments_by_chunk = in_order(executor, self._integrate, chunks)  # iterator over arrays of shape (2, n, 3)
+        tracked_moments = list(track(moments_by_chunk, "integrating the posterior", len(chunks)))  # reports progress
         mean, std = np.concatenate(tracked_moments, axis=1)
         return mean, std
 
@@ -240,14 +246,18 @@ class Posterior:
 
     @cached_property
     def _roots(self) -> _RootCells:
-        """Cells of the coarsest division, with the charges at their centres and the largest slopes within each cell."""
+        """First cells of a press, with the terms of the charges at their centres and the largest slopes in them."""
         cells = Cells.roots(self.radius)
         # The slopes are computed at 3 x 3 points of each cell: at its centre, its corners and the centres of its sides.
-        points = (cells.centre[:, None] + _grid(3, 0.5 * cells.side)).reshape(-1, 2)
-        gradients = self.charges.scaled_gradients(onto_disk(points, self.radius))
-        # The largest slope among the terms of each point, and then among the points of each cell
-        point_slope = np.linalg.norm(gradients, axis=-1).max(axis=1)
-        largest_slope = point_slope.reshape(len(cells), 9, -1).max(axis=1)
+        n_point = 9
+        points = cells.centre[:, None] + _grid(3, 0.5 * cells.side)  # shape (n_cell, n_point, 2)
+        gradients = self.charges.scaled_gradients(onto_disk(points.reshape(-1, 2), self.radius))
+
+        # The gradients have the shape (n_cell * n_point, n_term, n_electrode, 2). The largest slope is determined first
+        # among the terms of each point, and then among the points of each cell.
+        slope = np.linalg.norm(gradients, axis=-1)
+        point_slope = slope.max(axis=1)
+        largest_slope = point_slope.reshape(len(cells), n_point, -1).max(axis=1)
         return _RootCells(cells, self._terms(cells), largest_slope)
 
     def _terms(self, cells: Cells) -> Array:
@@ -257,8 +267,8 @@ class Posterior:
     def _integrate(self, charge: Array) -> Array:
         """Compute the mean and the standard deviation of the posterior of each press.
 
-        The posterior is integrated over the position by cells of several sizes, and over the force by quadrature at the
-        centroid of each cell.
+        The integral over the position is a sum over square cells. Each cell is weighted by the area of its part in the
+        disk of the prior. The integral over the force is computed by quadrature at the centroid of each cell.
 
         Args:
             charge: Charges with noise, shape (n, n_electrode), pC.
@@ -266,31 +276,38 @@ class Posterior:
         Returns:
             Means and standard deviations of (x, y, F), shape (2, n, 3), mm and N.
         """
-        # Concatenate the cells of all sizes.
-        levels = list(self._integration_cells(charge))
-        side = np.concatenate([np.full(len(cells), cells.side) for cells in levels])
-        press_of_cell = np.concatenate([cells.press for cells in levels])
-        fractions, centroids = zip(*(cells.inside(self.radius) for cells in levels), strict=True)
+        # Each group contains cells of one size, with the press to which each cell belongs.
+        press_groups = []
+        area_groups = []
+        centroid_groups = []
+        for cells in self._integration_cells(charge):
+            fraction, centroid = cells.inside(self.radius)
+            press_groups.append(cells.press)
+            area_groups.append(fraction * np.square(cells.side))
+            centroid_groups.append(centroid)
 
-        # Sort the cells by press, as `_posterior_moments` needs them.
-        order = np.argsort(press_of_cell, kind="stable")
-        area = (np.concatenate(fractions) * side**2)[order]
-        position = np.concatenate(centroids)[order]
-        press = press_of_cell[order]
+        # Sort the cells by press, because `_posterior_moments` needs all cells of a press together.
+        unsorted_press = np.concatenate(press_groups)
+        order = np.argsort(unsorted_press, kind="stable")
+        press = unsorted_press[order]
+        area = np.concatenate(area_groups)[order]
+        position = np.concatenate(centroid_groups)[order]
 
         log_force, log_weight = self._integrate_force(position, charge[press])
         log_weight += np.log(area)[:, None]
         return _posterior_moments(press, position, log_force, log_weight)
 
     def _integration_cells(self, charge: Array) -> Iterator[Cells]:
-        """Yield cells that cover the posterior and are small compared with its width.
+        """Yield cells that cover the posterior of each press, and are small compared with the width of the posterior.
 
-        All cells of a press have the same side. If the cells of a press are small enough, they are yielded. Otherwise,
-        each of them is divided into four for the next round.
+        In each round, all cells have the same side, and the cells that cannot explain the charges of their press are
+        dropped. If the remaining cells of a press are small enough, these cells are yielded. If not, each of them is
+        divided into four cells for the next round.
 
         Args:
             charge: Charges with noise, shape (n_press, n_electrode), pC.
         """
+        # In the first round, each press has all root cells.
         n_press = len(charge)
         roots = self._roots
         press, root = np.indices((n_press, len(roots.cells))).reshape(2, -1)
@@ -309,36 +326,69 @@ class Posterior:
             lower_bound = np.maximum(np.sqrt(chi2) - half_diagonal * slope, 0.0) ** 2
             possible = np.flatnonzero(lower_bound - smallest_chi2[cells.press] <= NEGLIGIBLE_CHI2)
 
-            # The cells of a press are small enough if their side is small compared with the smallest standard deviation
-            # of the position in any of them.
-            largest_inverse_std = np.zeros(n_press)
-            inverse_std = self._inverse_std(cells[possible], terms[possible], log_force[possible])
-            np.maximum.at(largest_inverse_std, cells.press[possible], inverse_std)  # among the cells of each press
-            press_is_fine = largest_inverse_std * cells.side <= MAX_SIDE_STD
+            press_is_fine = self._has_fine_cells(cells[possible], terms[possible], log_force[possible], n_press)
             if division == MAX_DIVISIONS:
-                press_is_fine[:] = True
+                press_is_fine[:] = True  # the cells are not divided again, so they are accepted as they are
             is_fine = press_is_fine[cells.press]
+            yield from self._finished_cells(cells[is_fine], excess_chi2[is_fine], n_press)
 
-            # A posterior that reaches the edge of the disk needs finer cells.
-            touches_edge = np.zeros(n_press, dtype=bool)
-            is_near_edge = cells.on_edge(self.radius) & (excess_chi2 <= EDGE_CHI2)
-            touches_edge[cells.press[is_near_edge]] = True
-            finished = cells[is_fine & (excess_chi2 <= NEGLIGIBLE_CHI2)]
-            yield finished[~touches_edge[finished.press]]
-            yield from finished[touches_edge[finished.press]].finer(self.radius)
-
+            # Divide the cells of the other presses.
             cells = cells[possible][~is_fine[possible]].divided(self.radius)
             if not len(cells):
                 return
             terms = self._terms(cells)
+
+    def _has_fine_cells(self, cells: Cells, terms: Array, log_force: Array, n_press: int) -> Booleans:
+        """Return whether the cells of each press are small enough for the integration.
+
+        The cells of a press are small enough if their side is at most `MAX_SIDE_STD` times the smallest standard
+        deviation of the position in these cells.
+
+        Args:
+            cells: Cells that may contain the contacts of their presses.
+            terms: Terms of the charges at the centres, shape (n, n_term, n_electrode).
+            log_force: Logarithms of the best forces at the centres, shape (n,).
+            n_press: Number of presses.
+
+        Returns:
+            Whether the cells of each press are small enough, shape (n_press,).
+        """
+        inverse_std = self._inverse_std(cells, terms, log_force)
+        largest_inverse_std = np.zeros(n_press)
+        np.maximum.at(largest_inverse_std, cells.press, inverse_std)  # the largest value among the cells of each press
+        return np.asarray(largest_inverse_std * cells.side <= MAX_SIDE_STD)
+
+    def _finished_cells(self, cells: Cells, excess_chi2: Array, n_press: int) -> Iterator[Cells]:
+        """Yield the cells over which the integral is computed, for presses whose cells are small enough.
+
+        Improbable cells are dropped. The cells of a press are refined once more if its posterior reaches the edge of
+        the disk, where the prior ends.
+
+        Args:
+            cells: All cells of the presses whose cells are small enough, including cells that must be dropped.
+            excess_chi2: Chi-squared of each cell minus the smallest chi-squared of its press, shape (n,).
+            n_press: Number of all presses.
+        """
+        is_probable_on_edge = cells.on_edge(self.radius) & (excess_chi2 <= EDGE_CHI2)
+        press_reaches_edge = np.zeros(n_press, dtype=bool)
+        press_reaches_edge[cells.press[is_probable_on_edge]] = True
+
+        probable_cells = cells[excess_chi2 <= NEGLIGIBLE_CHI2]
+        must_be_finer = press_reaches_edge[probable_cells.press]
+        yield probable_cells[~must_be_finer]
+        yield from probable_cells[must_be_finer].finer(self.radius)
 
     def _chi2_and_slope(
         self, terms: Array, log_force: Array, charge: Array, largest_slope: Array
     ) -> tuple[Array, Array]:
         """Compute chi-squared at the centres of cells, and the largest slope of its square root in each cell.
 
+        Chi-squared is the sum over the electrodes of ((Q - q) / sigma)^2, with the charges Q, the expected charges q at
+        the centre of the cell, and their standard deviations sigma. The expected charges are sums of the terms,
+        weighted by functions of the force.
+
         Args:
-            terms: Terms of the charges, shape (n, n_term, n_electrode).
+            terms: Terms of the charges at the centres, shape (n, n_term, n_electrode).
             log_force: Logarithms of the best forces, shape (n,).
             charge: Charges with noise, shape (n, n_electrode), pC.
             largest_slope: Largest slopes of the scaled charges in the cells, shape (n, n_electrode), 1/mm.
@@ -346,19 +396,23 @@ class Posterior:
         Returns:
             Chi-squared, shape (n,), and the largest slope of its square root, shape (n,), 1/mm.
         """
-        force_weights = self.charges.force_weights(log_force)
+        force_weights = self.charges.force_weights(log_force)  # shape (n, n_term)
         expected = (force_weights[:, None, :] @ terms)[:, 0]  # shape (n, n_electrode)
         sigma = self.noise.sigma(expected)
         deviation = (charge - expected) / sigma
-        slope = largest_slope * force_weights.sum(axis=1)[:, None] / sigma
         chi2 = (deviation**2).sum(axis=1)
-        return chi2, np.linalg.norm(slope, axis=1)
+
+        # The largest slope applies to each term, so the weights of the terms are added. The square root of chi-squared
+        # is the norm of the deviations of all electrodes. Its slope is therefore at most the norm of their slopes.
+        deviation_slope = largest_slope * force_weights.sum(axis=1)[:, None] / sigma
+        return chi2, np.linalg.norm(deviation_slope, axis=1)
 
     def _inverse_std(self, cells: Cells, terms: Array, log_force: Array) -> Array:
         """Compute the inverse of the smallest standard deviation of the position if the force is unknown.
 
-        The result is the largest singular value of the matrix of derivatives of the charges, each divided by the noise
-        of its charge.
+        The derivatives of the charges are divided by the standard deviations of the noise. The part of the derivatives
+        that a change of the force can also cause is removed. The inverse of the standard deviation along the most
+        certain direction is the largest singular value of the remaining derivatives with respect to the position.
 
         Args:
             cells: Cells at whose centres the contact is assumed.
@@ -368,55 +422,65 @@ class Posterior:
         Returns:
             Inverse standard deviations, shape (n,), 1/mm.
         """
+        # Expected charges and their derivatives with respect to x and y. Both are sums over the terms k, whose weights
+        # depend on the force, for each cell n, electrode e and coordinate i.
         force_weights = self.charges.force_weights(log_force)
         gradients = self.charges.scaled_gradients(onto_disk(cells.centre, self.radius))
-        # Sums over the terms k of the dependence on the force, for each cell n, electrode e and coordinate i
         expected = np.einsum("nk,nke->ne", force_weights, terms)
         position_jacobian = np.einsum("nk,nkei->nei", force_weights, gradients)
+
+        # Derivatives with respect to (x, y, ln F), in units of the noise, shape (n, n_electrode, 3)
         force_jacobian = self._profile.slope(log_force, expected)[..., None]
         jacobian = np.concatenate([position_jacobian, force_jacobian], axis=2)
         whitened_jacobian = jacobian / self.noise.sigma(expected)[..., None]
-        largest_to_smallest = singular_values(whitened_jacobian)
-        return np.asarray(largest_to_smallest[:, 0])
+        inverse_stds = singular_values(whitened_jacobian)  # in descending order, shape (n, 2)
+        return np.asarray(inverse_stds[:, 0])
 
     def _integrate_force(self, position: Array, charge: Array) -> tuple[Array, Array]:
         """Return the nodes of the integral over the logarithm of the force, and their weights times the likelihood.
 
-        The integral at each position is computed by Gauss-Legendre quadrature.
+        The integral at each position is computed by Gauss-Legendre quadrature. The likelihood of the charges Q is the
+        product of exp(-(Q - q)^2 / (2 sigma^2)) / sigma over the electrodes, with the expected charge q and the
+        standard deviation sigma of its noise.
 
         Args:
             position: Positions, shape (n, 2), mm.
             charge: Charges with noise, shape (n, n_electrode), pC.
 
         Returns:
-            Logarithms of the forces, and logarithms of weight times likelihood, shape (n, N_FORCE_NODES) each.
+            Logarithms of the forces, and logarithms of weight times likelihood up to a constant, shape (n,
+            N_FORCE_NODES) each.
         """
-        # The interval of integration lies about the best force and is several standard deviations wide.
+        # The interval of integration lies about the best force, within the forces of the prior. Its half width is a
+        # multiple of the standard deviation of ln F, which is the inverse of the norm of d(Q / sigma) / d ln F.
         terms = self.charges.scaled_charges(position)
         best_log_force = self._profile.best(terms, charge, self.noise)
         best_charge = self._profile.charge(best_log_force, terms)
-        relative_slope = self._profile.slope(best_log_force, best_charge) / self.noise.sigma(best_charge)
-        half_width = FORCE_HALF_WIDTH_STD / np.linalg.norm(relative_slope, axis=1)
+        whitened_slope = self._profile.slope(best_log_force, best_charge) / self.noise.sigma(best_charge)
+        half_width = FORCE_HALF_WIDTH_STD / np.linalg.norm(whitened_slope, axis=1)
         min_log_force, max_log_force = self._profile.log_range
         lower = np.maximum(best_log_force - half_width, min_log_force)[:, None]
         upper = np.minimum(best_log_force + half_width, max_log_force)[:, None]
 
-        nodes, weights = np.polynomial.legendre.leggauss(N_FORCE_NODES)  # for the interval from -1 to 1
+        # Move the nodes from the interval [-1, 1] to [lower, upper]. The weights are proportional to its width.
+        nodes, weights = np.polynomial.legendre.leggauss(N_FORCE_NODES)
         log_force = 0.5 * (lower + upper) + 0.5 * (upper - lower) * nodes
+        log_weight = np.log(weights * (upper - lower))
 
         # Expected charges of electrode e at position n and node m, as a sum over the terms k
         expected = np.einsum("nmk,nke->enm", self.charges.force_weights(log_force), terms)
         variance = self.noise.variance(expected)
-        chi2 = ((charge.T[:, :, None] - expected) ** 2 / variance).sum(axis=0)
+        measured = charge.T[:, :, None]  # shape (n_electrode, n, 1)
+        chi2 = ((measured - expected) ** 2 / variance).sum(axis=0)
         log_likelihood = -0.5 * (chi2 + np.log(variance.prod(axis=0)))
-        return log_force, np.log(weights * (upper - lower)) + log_likelihood
+        return log_force, log_weight + log_likelihood
 
 
 def _posterior_moments(press: Integers, position: Array, log_force: Array, log_weight: Array) -> Array:
     """Compute the mean and the standard deviation of (x, y, F) for every press.
 
-    Both are computed from weighted sums over all positions of the press and over all forces at each position. The mean
-    of the force is E[1/F] / E[1/F^2].
+    Both are computed from weighted sums over all positions of the press and over all forces at each position. Instead
+    of the mean of the force, E[1/F] / E[1/F^2] is returned, which has the smallest mean squared relative error.
 
     Args:
         press: Number of the press of each position, ascending, shape (n_position,).
@@ -434,9 +498,8 @@ def _posterior_moments(press: Integers, position: Array, log_force: Array, log_w
     # The largest weight of each press is scaled to 1, so that the exponentials do not underflow.
     largest_log_weight = np.maximum.reduceat(log_weight.max(axis=1), first_row)
     weight = np.exp(log_weight - np.repeat(largest_log_weight, n_row)[:, None])
-    force = np.exp(log_force)
-    position_weight = weight.sum(axis=1)
-    total_weight = np.add.reduceat(position_weight, first_row)
+    position_weight = weight.sum(axis=1)  # over all forces, shape (n_position,)
+    total_weight = np.add.reduceat(position_weight, first_row)  # shape (n_press,)
 
     def expectation(weighted: Array) -> Array:
         """Return the weighted mean over the positions of each press, shape (n_press,).
@@ -446,11 +509,20 @@ def _posterior_moments(press: Integers, position: Array, log_force: Array, log_w
         """
         return np.asarray(np.add.reduceat(weighted, first_row, axis=0) / total_weight)
 
-    x, y = (expectation(position_weight * coordinate) for coordinate in position.T)
-    x_square, y_square = (expectation(position_weight * coordinate**2) for coordinate in position.T)
-    force_mean, force_square, inverse_force, inverse_square = (
-        expectation((weight * force**power).sum(axis=1)) for power in (1, 2, -1, -2)
-    )
-    mean = np.stack([x, y, inverse_force / inverse_square], axis=1)
-    variance = np.stack([x_square - x**2, y_square - y**2, force_square - force_mean**2], axis=1)
-    return np.stack([mean, np.sqrt(np.maximum(variance, 0.0))])
+    x, y = position.T
+    x_mean = expectation(position_weight * x)
+    y_mean = expectation(position_weight * y)
+    x_variance = expectation(position_weight * x**2) - x_mean**2
+    y_variance = expectation(position_weight * y**2) - y_mean**2
+
+    force = np.exp(log_force)
+    force_mean = expectation((weight * force).sum(axis=1))
+    force_variance = expectation((weight * force**2).sum(axis=1)) - force_mean**2
+    inverse_force_mean = expectation((weight * force**-1).sum(axis=1))
+    inverse_square_mean = expectation((weight * force**-2).sum(axis=1))
+    force_estimate = inverse_force_mean / inverse_square_mean
+
+    mean = np.stack([x_mean, y_mean, force_estimate], axis=1)
+    variance = np.stack([x_variance, y_variance, force_variance], axis=1)
+    std = np.sqrt(np.maximum(variance, 0.0))  # a small variance can be negative by rounding errors
+    return np.stack([mean, std])

@@ -1,1 +1,1 @@
-"""Calibration of a film: estimates of its parameters from a few presses, and a model of this film."""
+"""Calibration of a film: estimation of its parameters from a few presses, and a model of the calibrated film."""

@@ -1,4 +1,4 @@
-"""Most probable value of a normal distribution within bounds."""
+"""Most probable point of a multivariate normal distribution within bounds."""
 
 import numpy as np
 
@@ -9,27 +9,32 @@ BOUND_TOLERANCE = 1e-9
 
 
 def most_probable_within(bounds: tuple[Array, Array], mean: Array, covariance: Array) -> Array:
-    """Return the most probable unknowns of a normal distribution within bounds, shape (n_unknown,).
+    """Return the most probable point of a multivariate normal distribution within bounds.
 
-    The unknown that is farthest beyond its bound is moved onto the bound, and the others change by their correlation
-    with it. These steps are repeated until no unknown is beyond its bound.
+    The search begins at the mean. In each step, the unknown that is farthest beyond its bound is fixed at this bound.
+    The other unknowns are set to their conditional mean, given the fixed unknown. The steps are repeated until every
+    unknown lies within its bounds.
 
     Args:
         bounds: Lower and upper bounds, each of shape (n_unknown,).
         mean: Mean of the normal distribution, shape (n_unknown,).
         covariance: Covariance of the normal distribution, shape (n_unknown, n_unknown).
+
+    Returns:
+        Values of the unknowns, shape (n_unknown,).
     """
     unknowns = mean
-    for _ in range(len(mean)):  # each step fixes one unknown
+    for _ in range(len(mean)):  # each step fixes one unknown, so there are at most as many steps as unknowns
         excess = unknowns - np.clip(unknowns, *bounds)
         farthest = int(np.abs(excess).argmax())
         if abs(excess[farthest]) < BOUND_TOLERANCE:
             break
 
-        # Mean and covariance of all unknowns, given that the farthest unknown has the value of its bound
-        regression = covariance[:, farthest] / covariance[farthest, farthest]  # change of each unknown per unit change
+        # Conditional mean and covariance of all unknowns if the farthest unknown has the value of its bound. The
+        # regression is the change of each unknown per unit change of the farthest unknown, shape (n_unknown,).
+        regression = covariance[:, farthest] / covariance[farthest, farthest]
         unknowns = unknowns - excess[farthest] * regression
         covariance = covariance - np.outer(regression, covariance[farthest])
 
-    # The steps may end a little beyond a bound, because of the tolerance and of rounding errors.
+    # The last step may end slightly beyond a bound, because of the tolerance and of rounding errors.
     return np.clip(unknowns, *bounds)

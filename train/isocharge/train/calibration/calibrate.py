@@ -1,4 +1,4 @@
-"""Estimation of a film and of its remaining uncertainty from measured presses."""
+"""Estimation of the parameters of a film, and of their remaining uncertainty, from measured presses."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -41,7 +41,7 @@ UNCERTAIN_PROBABILITY = 0.01
 """Probability of the residuals below which the stated errors are increased by Birge's ratio."""
 
 STRAINED_PROBABILITY = 1e-7
-"""Probability of a film below which the presses are considered to be recorded wrongly.
+"""Probability of an estimated film below which the presses are refused, because they were probably recorded wrongly.
 
 It is the probability that a film differs at least as much from its description as the estimated film does."""
 
@@ -55,7 +55,7 @@ MAX_MISTAKE_PROBABILITY = 0.5
 """Largest probability of an unseen mistake that is assumed because other presses were left out."""
 
 FEW = 3
-"""Largest number of presses among which a wrong press cannot be recognised. The user is warned."""
+"""Largest number of presses among which a wrong press cannot be recognised, so that the user is warned."""
 
 BOUND_DISTANCE = 0.1
 """Distance from a bound within which a parameter counts as limited by the bound, in prior standard deviations."""
@@ -71,33 +71,34 @@ CLOSE_MM = 1.0
 
 
 def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
-    """Estimate the film on which presses were made.
+    """Estimate the parameters of the film on which presses were made.
 
-    The presses are checked, and the film is fitted to them. The result is refused if no film explains the presses. The
-    stated errors are then increased if the presses scatter too much, or if there are only a few presses.
+    First, the presses are checked, and the parameters of the film are fitted to the presses. An error is raised if no
+    film explains the presses. The stated errors of the estimate are increased if the presses scatter more than
+    expected, or if there are only a few presses.
 
     Args:
         presses: The presses in the order in which they were made, with position, force or both, and the standard
             deviations of these measurements. If the sensor has more than three electrodes, presses without position and
             force can show how the film has changed since an earlier calibration.
-        problem: The possible films.
+        problem: The calibration problem, which defines the possible films and their estimate before the presses.
 
     Raises:
-        PressError: If the records of the presses are impossible, or no film explains them. The message names the
-            reason if it is found.
+        PressError: If the records of the presses are impossible, or if no film explains the presses. The message names
+            the reason if it is found.
     """
-    presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)  # columns in the order of the sensor
-    presses, domain_cautions = _checked_presses(presses, problem)
+    ordered_presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)  # columns as in the sensor file
+    used_presses, domain_cautions = _checked_presses(ordered_presses, problem)
 
-    # The estimate holds at the mean temperature of the presses. The estimate of an earlier calibration is therefore
-    # converted to this temperature before the fit.
+    # The new estimate holds at the mean temperature of the presses. The estimate before the presses is therefore
+    # converted to this temperature.
     at_C = None
-    if presses.knows_temperature:
-        at_C = float(temperatures(presses).mean())
+    if used_presses.knows_temperature:
+        at_C = float(temperatures(used_presses).mean())
         problem = replace(problem, earlier=problem.before.at_temperature(at_C, problem.prior))
-    data = PressData.of(presses, problem.noise, problem.charges.domain)
+    data = PressData.of(used_presses, problem.noise, problem.charges.domain)
 
-    with threadpool_limits(1):  # many small matrices: a second thread only waits
+    with threadpool_limits(1):  # the matrices are small, so a second thread would only wait
         posterior = fit_film(problem.charges, data, problem.before, at_C)
         side_force_map = None
         if problem.friction > 0.0:
@@ -105,36 +106,38 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
         elif problem.side_force > 0.0:  # only later contacts have side forces, so the fit does not change
             side_force_map = solve_side_forces(problem.charges, posterior.parameters)
 
-    _refuse_unexplained(presses, problem, posterior)
+    # The refusal uses the residuals and stated errors of the fit. The stated errors are increased afterwards.
+    _refuse_unexplained(used_presses, problem, posterior)
     posterior, scatter_cautions = _scaled_by_scatter(posterior)
     posterior = _with_unseen_mistakes(posterior, problem.before)
-    cautions = (*domain_cautions, *scatter_cautions, *_cautions(presses, problem, posterior))
-    return CalibrationResult(problem, presses, posterior, cautions, side_force_map=side_force_map)
+    cautions = (*domain_cautions, *scatter_cautions, *_cautions(used_presses, problem, posterior))
+    return CalibrationResult(problem, used_presses, posterior, cautions, side_force_map=side_force_map)
 
 
 def _checked_presses(presses: MeasuredPresses, problem: CalibrationProblem) -> tuple[MeasuredPresses, list[str]]:
-    """Return the presses within the domain of the films, after all checks that need no fit.
+    """Check presses before a fit, and remove the presses outside the domain of the films.
 
     Args:
         presses: The presses, with the electrodes in the order of the problem.
-        problem: The possible films.
+        problem: The calibration problem, which defines the possible films.
 
     Returns:
-        The presses, and warnings about presses outside the domain.
+        The presses within the domain, and a list of warnings about the removed presses.
 
     Raises:
-        PressError: If the records of the presses are impossible, or a common mistake explains them far better than any
-            film.
+        PressError: If the records of the presses are impossible, or if the presses differ much from all films but agree
+            far better with a film after the correction of a common mistake.
     """
     check_places(presses, problem.prior.sensor.film.radius)
     check_channels(presses, problem.charges)
     _check_enough_measured(presses, problem)
     inside_presses, cautions = _within_domain(presses, problem)
 
-    # Presses that differ much from all films are refused only if a mistake explains them. Otherwise, the fit decides.
+    # Presses that differ much from all films are refused here only if a common mistake explains them. Otherwise, the
+    # presses are fitted, and the residuals of the fit decide.
     is_far_from_films = misfit(inside_presses, problem.charges) > MISLEADING_MISFIT
     if is_far_from_films and find_mistakes(inside_presses, problem.charges):
-        # A closed back can look like a mistake, so it is examined first.
+        # A closed back can look like a mistake. Therefore, this call comes first and raises a more specific error.
         refuse_closed_back(inside_presses, problem.charges)
         raise unexplained_error(inside_presses, problem.charges, FAR_FROM_ALL_FILMS)
     return inside_presses, cautions
@@ -145,17 +148,18 @@ def _fit_with_friction(
 ) -> tuple[FilmPosterior, SideForceMap]:
     """Estimate a film from presses with friction, and compute the effect of side forces on this film.
 
-    The effect of the friction on the charges depends on the film and on the coefficient of friction. Therefore, the
-    effect and the film are computed in turn until the parameters of the film hardly change.
+    The effect of friction on the charges depends on the parameters of the film and on the coefficient of friction.
+    Therefore, this effect and the parameters are computed in turn until the parameters hardly change, but at most
+    `MAX_FRICTION_ROUNDS` times.
 
     Args:
-        problem: The films, and the expected coefficient of friction.
-        data: The presses.
-        posterior: Estimate of the film if the presses have no friction.
+        problem: The calibration problem, with the expected coefficient of friction.
+        data: The measured presses.
+        posterior: Estimate of the film from a fit without friction.
         at_C: Temperature of the film, degrees Celsius; None if temperatures were not measured.
 
     Returns:
-        The estimate of the film, and the effects of side forces from which it was computed.
+        The estimate of the film, and the effect of side forces on the charges that was used for this estimate.
     """
     expected_friction = problem.friction
     estimated_friction = expected_friction
@@ -163,7 +167,7 @@ def _fit_with_friction(
         side_force_map = solve_side_forces(problem.charges, posterior.parameters)
         data_with_friction = with_friction(data, problem.charges, side_force_map, posterior.contact, estimated_friction)
 
-        # Each fit begins again from the estimates before the presses, of the film and of the friction.
+        # Each fit begins again with the estimates of the film and of the friction before the presses.
         previous = posterior
         posterior = fit_film(problem.charges, data_with_friction, problem.before, at_C, friction=expected_friction)
         estimated_friction = posterior.nuisances[FRICTION.name].value
@@ -174,17 +178,17 @@ def _fit_with_friction(
 
 
 def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tuple[MeasuredPresses, list[str]]:
-    """Return the presses within the positions and forces of the films, and a warning about the other presses.
+    """Select the presses within the domain of the films, and create a warning about the other presses.
 
     Args:
-        presses: The presses.
-        problem: The possible films, which have charges only within a domain.
+        presses: The measured presses.
+        problem: The calibration problem. The charges of its films are known only within a domain of contacts.
 
     Returns:
-        The presses within the domain, and the warning; an empty list if all presses lie within the domain.
+        The presses within the domain, and a list with the warning. The list is empty if no press lies outside.
 
     Raises:
-        PressError: If more than half of the presses lie outside.
+        PressError: If more than half of the presses lie outside the domain.
     """
     domain = problem.charges.domain
     is_outside = domain.is_outside(presses.contact)
@@ -192,29 +196,31 @@ def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tup
         return presses, []
     min_force, max_force = domain.force_range
     outside_rows = row_words(presses[is_outside].lines, presses.row_noun)
-    sentence = (
+    outside_sentence = (
         f"{outside_rows}: a calibration takes presses within {domain.radius:.3g} mm of the "
         f"centre and of {min_force:.2g} to {max_force:.2g} N"
     )
     is_mostly_outside = is_outside.mean() > 0.5
     if is_mostly_outside and len(presses) == 1:
-        raise PressError(sentence)  # a single press does not suggest a mistake in all records, such as a wrong unit
+        # A single press does not suggest a mistake in all records, such as a wrong unit. No mistake is searched for.
+        raise PressError(outside_sentence)
     if is_mostly_outside:
         raise unexplained_error(presses, problem.charges, MOSTLY_OUTSIDE)
-    return presses[~is_outside], [f"{sentence}; left out"]
+    return presses[~is_outside], [f"{outside_sentence}; left out"]
 
 
 def _scaled_by_scatter(posterior: FilmPosterior) -> tuple[FilmPosterior, list[str]]:
-    """Increase the stated errors if the presses scatter more than expected.
+    """Increase the variances of an estimate if the residuals of the presses are larger than expected.
 
-    The variances are multiplied by chi2 divided by its degrees of freedom, the square of Birge's ratio (1932). The
-    variances remain unchanged if chance explains the scatter.
+    The variances are multiplied by chi2 / degrees_of_freedom, where chi2 is the sum of the squared residuals. The
+    factor is the square of Birge's ratio (Birge 1932). The variances are not changed if random errors of the expected
+    size can explain the residuals.
 
     Args:
-        posterior: The estimate of the film.
+        posterior: The estimate of the film from presses.
 
     Returns:
-        The estimate, and a caution if the errors were increased.
+        The estimate, and a list that contains a warning if the variances were increased and is empty otherwise.
     """
     chi2, degrees_of_freedom = posterior.total
     if degrees_of_freedom == 0.0:  # without redundant measurements, no scatter can be observed
@@ -232,7 +238,10 @@ def _scaled_by_scatter(posterior: FilmPosterior) -> tuple[FilmPosterior, list[st
 
 
 def _check_enough_measured(presses: MeasuredPresses, problem: CalibrationProblem) -> None:
-    """Raise PressError if position and force of all presses are unknown and the charges have no redundancy."""
+    """Raise PressError if all positions and forces are unknown and a press has at most three charges.
+
+    Three charges determine only the position and the force of a press, but no property of the film.
+    """
     if np.isnan(presses.contact).all() and len(problem.electrodes) <= 3:
         raise PressError(
             f"{len(presses)} presses of unknown position and force: three charges only determine x, y and the force, "
@@ -242,14 +251,15 @@ def _check_enough_measured(presses: MeasuredPresses, problem: CalibrationProblem
 
 
 def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> None:
-    """Raise PressError if no film explains the presses, or only an improbable film does.
+    """Raise PressError if no film explains the presses, or if only an improbable film explains them.
 
-    A few presses with a common mistake may agree with a film that is possible but unusual. For an unusual film, an
-    error is therefore also raised if the correction of a common mistake explains the presses far better.
+    A few presses with a common mistake, such as a wrong unit, may agree with a film that is possible but unusual. For
+    an unusual film, PressError is therefore also raised if the correction of a common mistake makes the presses agree
+    far better with a film.
 
     Args:
-        presses: The presses.
-        problem: The possible films.
+        presses: The presses to which the film was fitted.
+        problem: The calibration problem, which defines the possible films and their estimate before the presses.
         posterior: The estimate of the film from these presses.
     """
     chi2, degrees_of_freedom = posterior.total
@@ -259,7 +269,7 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
         and chi_square.probability_above(chi2, degrees_of_freedom) < UNEXPLAINED_PROBABILITY
     )
 
-    # Squared Mahalanobis distance of the estimated film from the film that was expected before the presses.
+    # Squared Mahalanobis distance of the estimated film from the film that was expected before the presses
     deviation = (posterior.parameters - problem.before.parameters) / problem.prior.std
     squared_distance = float(deviation @ np.linalg.solve(problem.before.covariance, deviation))
     film_probability = chi_square.probability_above(squared_distance, deviation.size)
@@ -273,6 +283,8 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
 
     refuse_closed_back(presses, problem.charges)  # raises a more specific error if the back is closed
     if is_unexplained or is_improbable:
+        # The message states the larger of two deviations: that of the presses from the film, in units of the noise,
+        # and that of the film from its description, in prior standard deviations.
         mean_square_of_presses = chi2 / max(degrees_of_freedom, 1.0)
         mean_square_of_film = squared_distance / deviation.size
         reason = large_residual(float(np.sqrt(max(mean_square_of_presses, mean_square_of_film))))
@@ -282,18 +294,19 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
 
 
 def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> FilmPosterior:
-    """Increase the covariance of the estimate, because a wrong press cannot be recognised among only a few presses.
+    """Increase the covariance of an estimate, because a wrong press among only a few presses cannot be recognised.
 
-    If one of the presses is wrong, the estimate is no better than the prior. The covariance is the mean of both cases,
-    weighted by their probabilities.
+    If a press was recorded wrongly, the estimate is assumed to be no better than the estimate before the presses. The
+    returned covariance is a weighted mean of the covariances before and after the presses. The weight of the covariance
+    before the presses is the probability that a press was recorded wrongly.
 
     Args:
         posterior: The estimate after the presses.
         before: The estimate before the presses.
     """
     # Presses that were left out as wrong make further mistakes likely, unless many good presses agree with each other.
-    # The probability is a rule of thumb: it is proportional to the number of presses that were left out, and inversely
-    # proportional to the square of the number of good presses.
+    # As a rule of thumb, the probability of a mistake is the number of presses that were left out, divided by the
+    # square of the number of good presses.
     good_count = int((~posterior.bad).sum())
     left_out_count = int(posterior.bad.sum())
     mistake_probability = min(left_out_count / (good_count * good_count), MAX_MISTAKE_PROBABILITY)
@@ -301,14 +314,15 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
         mistake_probability += MISTAKE_PROBABILITY * good_count
     correct_probability = 1.0 - mistake_probability
 
-    # Mean of the covariances of both cases. The estimate before the presses contains only the first of the unknowns of
-    # the posterior.
+    # Weighted mean of the covariances. The estimate before the presses contains only the first unknowns of the
+    # posterior, and the variances of the other unknowns before the presses are zero.
     joint = correct_probability * posterior.joint
     prior_unknowns = slice(0, len(before.unknowns))
     joint[prior_unknowns, prior_unknowns] += mistake_probability * before.unknown_covariance
     parameters = slice(0, len(before.parameters))
 
-    # Without the presses, the warming is not correlated with the unknowns.
+    # If a press was recorded wrongly, the warming (the change of the pretension with temperature) is assumed not to be
+    # correlated with the unknowns.
     warming = posterior.warming
     if warming is not None:
         warming = warming._replace(covariance=correct_probability * warming.covariance)
@@ -316,12 +330,12 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
 
 
 def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> Iterator[str]:
-    """Yield warnings about the presses and the estimate. Each warning is one sentence.
+    """Yield warnings about the presses and the estimate, each as one string.
 
     Args:
         presses: All presses of the calibration.
-        problem: The possible films.
-        posterior: The estimate of the film, and the presses that were left out as bad.
+        problem: The calibration problem, which defines the possible films.
+        posterior: The estimate of the film, which also states the presses that were left out as bad.
     """
     if posterior.bad.any():
         lines = row_words(presses[posterior.bad].lines, presses.row_noun)
@@ -333,7 +347,7 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
             f"only {len(good)} {noun}: a wrong one among so few cannot be recognised, and the stated errors include "
             "this possibility; with more than three presses they become much smaller"
         )
-    # A calibration describes the effect of a closed back by imperfections of the film.
+    # Imperfections of the film may be estimated although the film has none and its back is closed.
     if posterior.imperfect and has_closed_back(good, problem.charges):
         yield CLOSED_BACK_CAUTION
 
@@ -357,7 +371,7 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
 
 
 def _position_cautions(presses: MeasuredPresses) -> Iterator[str]:
-    """Yield a warning if no press has a known position, or if all known positions lie close to each other.
+    """Yield a warning if no press has a known position, or if the known positions lie close to each other.
 
     Args:
         presses: The presses that were not left out. Unknown positions are NaN.
@@ -379,13 +393,14 @@ def _position_cautions(presses: MeasuredPresses) -> Iterator[str]:
 
 
 def _parameters_at_bounds(problem: CalibrationProblem, posterior: FilmPosterior) -> list[str]:
-    """Return the names of the parameters whose estimates lie on a bound.
+    """Return the names of the parameters whose estimates lie on or close to a bound.
 
-    A lower bound that is not negative, such as a pretension of zero, is a physical limit and does not count.
+    A lower bound that is not negative, such as a pretension of zero, is a physical limit. Parameters at such a lower
+    bound are not returned.
 
     Args:
-        problem: The possible films, with the bounds of their parameters.
-        posterior: The estimate of the film.
+        problem: The calibration problem, which defines the bounds of the parameters.
+        posterior: The estimate of the film from presses.
     """
     prior = problem.prior
     lower, upper = prior.bounds

@@ -1,12 +1,14 @@
-"""Writer and reader of the estimate of a film in `calibration.json`.
+"""Writer and reader of `calibration.json`, the file with the estimate of a film.
 
-The file contains each parameter with its standard deviation. The file also contains the correlations of all parameters,
-rounded to six digits. If the film has a discrepancy, the file also contains its coefficients. The standard deviations
-and correlations then refer to the parameters and the coefficients. If temperatures were measured, the file also
+The file contains the value and the standard deviation of each parameter of the film. The section `correlations`
+contains the correlations of all parameters, rounded to six digits. If the film has a discrepancy, the section
+`discrepancy` contains the coefficients of the film. The section `discrepancy` also contains the standard deviations and
+the correlations of the parameters and coefficients together. If temperatures were measured, the section `temperature`
 contains the change of the pretension with temperature.
 
-An unknown whose standard deviation is zero is written with correlations of zero to all others. Older versions wrote
-null for these correlations, because zero divided by zero is not a number. The reader replaces such a null by zero.
+If the standard deviation of an unknown is zero, its correlations with other unknowns are not defined, and zeros are
+written for them. Older versions of this module wrote null for undefined correlations. The reader replaces such a null
+by zero.
 """
 
 from pathlib import Path
@@ -24,10 +26,10 @@ from isocharge.train.calibration.nuisances import PRETENSION_PER_KELVIN
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate, Warming
 
 FORMAT_VERSION = 1
-"""Version of the format, which is written and read."""
+"""Version of the file format that this module writes and reads."""
 
 PASCAL_FACTOR = 1e6
-"""Factor from MPa to Pa, the unit of the pretension in the file."""
+"""Factor that converts MPa to Pa. The file contains the pretension in Pa."""
 
 LARGEST_STD = 100.0
 """Largest standard deviation that the reader accepts, in standard deviations of the prior."""
@@ -36,10 +38,10 @@ LARGEST_COEFFICIENT = 30.0
 """Largest coefficient of a discrepancy that the reader accepts, dimensionless. Real films have less than 3."""
 
 BOUND_TOLERANCE = 1e-6
-"""Distance from the bounds of a parameter that counts as rounding, in standard deviations of the prior."""
+"""Largest distance of a parameter beyond its bounds that counts as a rounding error, in prior standard deviations."""
 
 CORRELATION_TOLERANCE = 2e-6
-"""Difference of correlations that counts as rounding, because correlations are written with six digits."""
+"""Largest difference of two correlations that counts as rounding, because correlations are written with six digits."""
 
 EIGENVALUE_TOLERANCE = 1e-4
 """Largest magnitude of a negative eigenvalue of a correlation matrix that counts as rounding.
@@ -47,11 +49,11 @@ EIGENVALUE_TOLERANCE = 1e-4
 Rounding the correlations of 160 unknowns causes negative eigenvalues of about 1e-5."""
 
 TEMPERATURES_C = (-100.0, 200.0)
-"""Lowest and highest temperature of a film, degrees Celsius, as in files of presses."""
+"""Lowest and highest temperature of a film that the reader accepts, degrees Celsius, as in files of presses."""
 
 
 class _Estimate(Struct, frozen=True):
-    """Value of a quantity in the file, with its standard deviation."""
+    """Estimate of a quantity in the file: its value and its standard deviation."""
 
     value: Finite
     std: NotNegative
@@ -61,7 +63,7 @@ Correlation = Annotated[float, Meta(ge=-1.0 - CORRELATION_TOLERANCE, le=1.0 + CO
 
 
 class _Temperature(Struct, frozen=True):
-    """Section of the file about the change of the pretension with temperature."""
+    """Section `temperature` of the file, about the change of the pretension with temperature."""
 
     at_C: Annotated[float, Meta(ge=TEMPERATURES_C[0], le=TEMPERATURES_C[1])]
     pretension_per_K: _Estimate
@@ -69,7 +71,7 @@ class _Temperature(Struct, frozen=True):
 
 
 class _Discrepancy(Struct, frozen=True):
-    """Section of the file about the coefficients of the film."""
+    """Section `discrepancy` of the file, about the coefficients of the film."""
 
     coefficients: list[Finite]
     std: list[NotNegative]
@@ -77,7 +79,7 @@ class _Discrepancy(Struct, frozen=True):
 
 
 class _CalibrationFile(Struct, frozen=True):
-    """The entries of calibration.json that the reader uses."""
+    """Entries of calibration.json that `read_film` uses."""
 
     format_version: Literal[1]
     sensor: Text
@@ -88,7 +90,12 @@ class _CalibrationFile(Struct, frozen=True):
 
 
 def film_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, Any]:
-    """Return the part of calibration.json that `read_film` reads."""
+    """Return the part of calibration.json that `read_film` reads.
+
+    Args:
+        prior: Distribution of the films, with the names and units of the parameters.
+        posterior: The estimate of the film from presses.
+    """
     return {
         "format_version": FORMAT_VERSION,
         "sensor": prior.sensor.name,
@@ -100,10 +107,16 @@ def film_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, Any]:
 
 
 def _parameter_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, dict[str, float]]:
-    """Return the value and the standard deviation of each parameter, in the units of the file."""
-    units = prior.file_factors
-    values = units * posterior.parameters
-    stds = units * prior.std * np.sqrt(np.diag(posterior.covariance))
+    """Return the value and the standard deviation of each parameter by its name, in the units of the file.
+
+    Args:
+        prior: Distribution of the films, with the names and units of the parameters.
+        posterior: The estimate of the film from presses.
+    """
+    file_factors = prior.file_factors  # factors from the units of the prior to those of the file
+    values = file_factors * posterior.parameters
+    # The covariance is in units of the prior standard deviations.
+    stds = file_factors * prior.std * np.sqrt(np.diag(posterior.covariance))
     return {
         name: {"value": float(value), "std": float(std)}
         for name, value, std in zip(prior.names, values, stds, strict=True)
@@ -111,9 +124,12 @@ def _parameter_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, di
 
 
 def _correlation_table(covariance: Array) -> list[list[float]]:
-    """Return the correlations of a covariance, shape (n, n), rounded to six digits.
+    """Convert a covariance matrix into rows of correlations, rounded to six digits.
 
-    If the variance of an unknown is zero, its correlations with all other unknowns are zero.
+    If the variance of an unknown is zero, its correlations with all other unknowns are set to zero.
+
+    Args:
+        covariance: Covariance matrix, shape (n, n).
     """
     std = np.sqrt(np.diag(covariance))
     correlations = _divide_by_std(covariance, np.outer(std, std))
@@ -122,9 +138,13 @@ def _correlation_table(covariance: Array) -> list[list[float]]:
 
 
 def _discrepancy_table(posterior: FilmPosterior) -> dict[str, Any] | None:
-    """Return coefficients, standard deviations and correlations of parameters and coefficients for the file.
+    """Return the section `discrepancy` of the file, or None if the film probably needs no coefficients.
 
-    The result is None if the film probably has neither imperfections nor a discrepancy.
+    The section contains the coefficients of the film. The section also contains the standard deviations and the
+    correlations of the parameters and coefficients together.
+
+    Args:
+        posterior: The estimate of the film from presses.
     """
     if not posterior.imperfect:
         return None
@@ -136,20 +156,22 @@ def _discrepancy_table(posterior: FilmPosterior) -> dict[str, Any] | None:
 
 
 def _temperature_table(posterior: FilmPosterior) -> dict[str, Any] | None:
-    """Return the change of the pretension with temperature for the file, in C and Pa/K.
+    """Return the section `temperature` of the file, or None if no temperatures were measured.
 
-    The table includes the correlations of the change with the other unknowns in the file: the parameters, and the
-    coefficients if the film has imperfections. The result is None if no temperatures were measured.
+    The section contains the temperature of the film, in degrees Celsius, and the change of the pretension with
+    temperature, in Pa/K. The section also contains the correlations of this change with the other unknowns in the
+    file.
 
     Args:
-        posterior: The estimate of the film.
+        posterior: The estimate of the film from presses.
     """
     warming = posterior.warming
     if warming is None:
         return None
+    # Without imperfections, the file contains only the parameters of the film. They are the first unknowns.
     film_covariance = posterior.joint if posterior.imperfect else posterior.covariance
     film_std = np.sqrt(np.diag(film_covariance))
-    covariance_with_film = warming.covariance[: film_std.size]  # the unknowns in the file are the first ones
+    covariance_with_film = warming.covariance[: film_std.size]
     correlations = _divide_by_std(covariance_with_film, warming.std * film_std)
     return {
         "at_C": warming.at_C,
@@ -159,7 +181,12 @@ def _temperature_table(posterior: FilmPosterior) -> dict[str, Any] | None:
 
 
 def _divide_by_std(covariance: Array, product_of_std: Array) -> Array:
-    """Divide covariances by products of standard deviations; the result is zero where a product is zero."""
+    """Divide covariances by products of standard deviations. The result is zero where a product is zero.
+
+    Args:
+        covariance: Covariances of pairs of unknowns, an array of any shape.
+        product_of_std: Product of the standard deviations of each pair, in the same shape.
+    """
     return np.divide(covariance, product_of_std, out=np.zeros_like(covariance), where=product_of_std > 0.0)
 
 
@@ -168,38 +195,39 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
 
     Args:
         path: The file.
-        problem: The calibration that needs the estimate.
+        problem: The calibration problem for which the estimate is read.
 
     Raises:
-        PressError: If the file does not fit the format, belongs to another sensor or to other parameters, or has
-            numbers that no calibration gives.
+        PressError: If the file does not fit the format, belongs to another sensor or to other parameters, or contains
+            numbers that no calibration can have written.
     """
-    table = read_json(path, "the calibration.json of `train calibrate`", PressError, _CalibrationFile)
+    content = read_json(path, "the calibration.json of `train calibrate`", PressError, _CalibrationFile)
     prior = problem.prior
-    names = tuple(table.parameters)
-    if names != prior.names or table.sensor != prior.sensor.name:
+    names = tuple(content.parameters)
+    if names != prior.names or content.sensor != prior.sensor.name:
         raise PressError(
-            f"{path}: a calibration of {shown(table.sensor)} with the parameters {cut(', '.join(names))}; expected "
+            f"{path}: a calibration of {shown(content.sensor)} with the parameters {cut(', '.join(names))}; expected "
             f"{prior.sensor.name!r} with {', '.join(prior.names)}"
         )
 
     # The unknowns of the film are its parameters, followed by its coefficients if the file has them.
-    parameters, parameter_std = _read_parameters(path, table, prior)
-    parameter_correlations = _correlations(path, "correlations", table.correlations, parameter_std)
-    if table.discrepancy is None:
+    parameters, parameter_std = _read_parameters(path, content, prior)
+    parameter_correlations = _correlations(path, "correlations", content.correlations, parameter_std)
+    if content.discrepancy is None:
         coefficients = np.empty(0)
         film_std = parameter_std
         film_correlations = parameter_correlations
     else:
-        coefficients, film_std = _read_coefficients(path, table.discrepancy, problem, parameter_std)
-        film_correlations = _film_correlations(path, table.discrepancy, film_std, parameter_correlations)
+        coefficients, film_std = _read_coefficients(path, content.discrepancy, problem, parameter_std)
+        film_correlations = _film_correlations(path, content.discrepancy, film_std, parameter_correlations)
 
-    # If the film changes with temperature, its correlations are checked together with those of the change.
-    if table.temperature is None:
+    # If the file has a section `temperature`, the correlations of the film are checked together with those of the
+    # change of the pretension.
+    if content.temperature is None:
         film_covariance = _positive_semidefinite(path, film_correlations) * np.outer(film_std, film_std)
         warming = None
     else:
-        film_covariance, warming = _read_temperature(path, table.temperature, film_correlations, film_std)
+        film_covariance, warming = _read_temperature(path, content.temperature, film_correlations, film_std)
     return FilmEstimate(
         parameters=parameters,
         covariance=film_covariance[: len(names), : len(names)],
@@ -209,12 +237,14 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
     )
 
 
-def _film_correlations(path: Path, table: _Discrepancy, film_std: Array, parameter_correlations: Array) -> Array:
-    """Read the correlations of parameters and coefficients, and check the correlations of the parameters.
+def _film_correlations(path: Path, section: _Discrepancy, film_std: Array, parameter_correlations: Array) -> Array:
+    """Read the correlations of the parameters and coefficients of a film from the section `discrepancy`.
+
+    The file contains the correlations of the parameters in two sections, which must agree with each other.
 
     Args:
         path: The file, for error messages.
-        table: Section `discrepancy` of the file.
+        section: Section `discrepancy` of the file.
         film_std: Standard deviations of parameters and coefficients, shape (n,).
         parameter_correlations: Correlations of the parameters, from the section `correlations`, shape (n_parameter,
             n_parameter).
@@ -225,9 +255,9 @@ def _film_correlations(path: Path, table: _Discrepancy, film_std: Array, paramet
     Raises:
         PressError: If the matrix is not a correlation matrix, or contradicts the section `correlations`.
     """
-    correlations = _correlations(path, "discrepancy.correlations", table.correlations, film_std)
+    correlations = _correlations(path, "discrepancy.correlations", section.correlations, film_std)
     n_parameter = len(parameter_correlations)
-    shared_correlations = correlations[:n_parameter, :n_parameter]
+    shared_correlations = correlations[:n_parameter, :n_parameter]  # the parameters are the first unknowns
     if np.abs(shared_correlations - parameter_correlations).max() > 2.0 * CORRELATION_TOLERANCE:
         raise PressError(
             f"{path}: discrepancy.correlations: expected those of the parameters, as under correlations, in the "
@@ -237,13 +267,13 @@ def _film_correlations(path: Path, table: _Discrepancy, film_std: Array, paramet
 
 
 def _read_temperature(
-    path: Path, table: _Temperature, film_correlations: Array, film_std: Array
+    path: Path, section: _Temperature, film_correlations: Array, film_std: Array
 ) -> tuple[Array, Warming]:
-    """Read the change of the pretension with temperature.
+    """Read the change of the pretension with temperature from the section `temperature`.
 
     Args:
         path: The file, for error messages.
-        table: Section `temperature` of the file, in Pa/K and degrees Celsius.
+        section: Section `temperature` of the file, in Pa/K and degrees Celsius.
         film_correlations: Correlations of the unknowns of the film, shape (n, n).
         film_std: Standard deviations of the unknowns of the film, shape (n,).
 
@@ -251,33 +281,35 @@ def _read_temperature(
         Covariance of the unknowns of the film, shape (n, n), and the change of the pretension in MPa/K.
 
     Raises:
-        PressError: If the section is not possible together with the unknowns of the film.
+        PressError: If the section has wrong numbers, or its correlations are not possible together with those of the
+            film.
     """
-    correlations = _with_temperature(path, table, film_correlations, film_std)
-    change = table.pretension_per_K
+    correlations = _with_temperature(path, section, film_correlations, film_std)
+    change = section.pretension_per_K
     change_std = change.std / PASCAL_FACTOR
     std = np.append(film_std, change_std)
     covariance = _positive_semidefinite(path, correlations) * np.outer(std, std)
-    n_film = film_std.size  # index of the change, which follows the unknowns of the film
+    n_film = film_std.size  # number of unknowns of the film, and index of the change, which follows them
     warming = Warming(
         MPa_per_K=change.value / PASCAL_FACTOR,
         std=change_std,
-        at_C=table.at_C,
+        at_C=section.at_C,
         covariance=covariance[:n_film, n_film],
     )
     return covariance[:n_film, :n_film], warming
 
 
-def _read_parameters(path: Path, table: _CalibrationFile, prior: FilmPrior) -> tuple[Array, Array]:
-    """Read the parameters, and check that they are within the bounds of the films.
+def _read_parameters(path: Path, content: _CalibrationFile, prior: FilmPrior) -> tuple[Array, Array]:
+    """Read the parameters of a film and their standard deviations, and check that all values are within limits.
 
     Args:
         path: The file, for error messages.
-        table: Contents of the file.
-        prior: Distribution of the films.
+        content: Content of the file.
+        prior: Distribution of the films, with the bounds and units of the parameters.
 
     Returns:
-        Parameters, and their standard deviations over those of the prior, each of shape (n_parameter,).
+        Parameters in the units of the prior, and their standard deviations divided by those of the prior, each of shape
+        (n_parameter,).
 
     Raises:
         PressError: If a value is outside the bounds, or a standard deviation is too large.
@@ -286,7 +318,7 @@ def _read_parameters(path: Path, table: _CalibrationFile, prior: FilmPrior) -> t
     lower, upper = (bound * file_factors for bound in prior.bounds)
     tolerance = BOUND_TOLERANCE * prior.std * file_factors
     largest_std = LARGEST_STD * prior.std * file_factors
-    for index, (name, estimate) in enumerate(table.parameters.items()):
+    for index, (name, estimate) in enumerate(content.parameters.items()):
         if not lower[index] - tolerance[index] <= estimate.value <= upper[index] + tolerance[index]:
             raise PressError(
                 f"{path}: parameters.{name}.value: expected {lower[index]:.6g} to {upper[index]:.6g}, as these films "
@@ -296,21 +328,21 @@ def _read_parameters(path: Path, table: _CalibrationFile, prior: FilmPrior) -> t
             raise PressError(
                 f"{path}: parameters.{name}.std: expected at most {largest_std[index]:.6g}, got {estimate.std:g}"
             )
-    parameters = np.array([estimate.value for estimate in table.parameters.values()]) / file_factors
-    std = np.array([estimate.std for estimate in table.parameters.values()]) / file_factors / prior.std
+    parameters = np.array([estimate.value for estimate in content.parameters.values()]) / file_factors
+    std = np.array([estimate.std for estimate in content.parameters.values()]) / file_factors / prior.std
     return parameters, std
 
 
 def _read_coefficients(
-    path: Path, table: _Discrepancy, problem: CalibrationProblem, parameter_std: Array
+    path: Path, section: _Discrepancy, problem: CalibrationProblem, parameter_std: Array
 ) -> tuple[Array, Array]:
-    """Read the coefficients of the film, and check their number and size.
+    """Read the coefficients and standard deviations in the section `discrepancy`, and check their number and size.
 
     Args:
         path: The file, for error messages.
-        table: Section `discrepancy` of the file.
-        problem: The calibration that needs the estimate.
-        parameter_std: Standard deviations of the parameters over those of the prior, shape (n_parameter,).
+        section: Section `discrepancy` of the file.
+        problem: The calibration problem, which defines the number of coefficients.
+        parameter_std: Standard deviations of the parameters divided by those of the prior, shape (n_parameter,).
 
     Returns:
         Coefficients, shape (n_coefficient,), and the standard deviations of parameters and coefficients together, shape
@@ -321,20 +353,20 @@ def _read_coefficients(
             contradict those of the parameters.
     """
     coefficient_count = problem.charges.n_coefficient
-    if len(table.coefficients) != coefficient_count:
+    if len(section.coefficients) != coefficient_count:
         raise PressError(
-            f"{path}: discrepancy.coefficients: expected {coefficient_count} numbers, got {len(table.coefficients)}; "
+            f"{path}: discrepancy.coefficients: expected {coefficient_count} numbers, got {len(section.coefficients)}; "
             "calibrate anew"
         )
     std_count = parameter_std.size + coefficient_count
-    if len(table.std) != std_count:
+    if len(section.std) != std_count:
         raise PressError(
             f"{path}: discrepancy.std: expected {std_count} numbers, one for each parameter and coefficient, got "
-            f"{len(table.std)}; calibrate anew"
+            f"{len(section.std)}; calibrate anew"
         )
 
-    coefficients = np.array(table.coefficients)
-    std = np.array(table.std)
+    coefficients = np.array(section.coefficients)
+    std = np.array(section.std)
     for key, values, limit in (
         ("coefficients", coefficients, LARGEST_COEFFICIENT),
         ("std", std, LARGEST_STD),
@@ -346,7 +378,7 @@ def _read_coefficients(
                 f"{path}: discrepancy.{key}[{largest_index}]: expected at most {limit:g}, got {largest_value:g}"
             )
 
-    # The first standard deviations are those of the parameters, which the file contains twice.
+    # The file contains the standard deviations of the parameters twice: here and beside the values of the parameters.
     if not np.allclose(std[: parameter_std.size], parameter_std, rtol=1e-6, atol=1e-12):
         raise PressError(
             f"{path}: discrepancy.std: expected the standard deviations of the parameters, over those of the prior, in "
@@ -355,12 +387,12 @@ def _read_coefficients(
     return coefficients, std
 
 
-def _with_temperature(path: Path, table: _Temperature, correlations: Array, std: Array) -> Array:
-    """Append the change of the pretension with temperature, as a last row and column, to a matrix of correlations.
+def _with_temperature(path: Path, section: _Temperature, correlations: Array, std: Array) -> Array:
+    """Extend the correlations of a film by a last row and column for the change of the pretension with temperature.
 
     Args:
         path: The file, for error messages.
-        table: Section `temperature` of the file.
+        section: Section `temperature` of the file, which contains the added correlations.
         correlations: Correlations of the unknowns of the film, shape (n, n).
         std: Standard deviations of the unknowns of the film, shape (n,).
 
@@ -370,7 +402,7 @@ def _with_temperature(path: Path, table: _Temperature, correlations: Array, std:
     Raises:
         PressError: If the number of correlations is wrong, or the change of the pretension is too large.
     """
-    change = table.pretension_per_K
+    change = section.pretension_per_K
     largest_Pa_per_K = LARGEST_STD * PRETENSION_PER_KELVIN.std_with_temperatures * PASCAL_FACTOR
     for key, number in (("value", change.value), ("std", change.std)):
         if abs(number) > largest_Pa_per_K:
@@ -378,15 +410,15 @@ def _with_temperature(path: Path, table: _Temperature, correlations: Array, std:
                 f"{path}: temperature.pretension_per_K.{key}: expected at most {largest_Pa_per_K:g} Pa/K, "
                 f"got {number:g}"
             )
-    # A file without these correlations is of an older version, in which the change was uncorrelated with the film.
-    given_row: list[Correlation] = table.correlations or [0.0] * std.size
+    # Older versions wrote no correlations of the change, because they assumed that it is uncorrelated with the film.
+    given_row: list[Correlation] = section.correlations or [0.0] * std.size
     if len(given_row) != std.size:
         raise PressError(
             f"{path}: temperature.correlations: expected {std.size} numbers, one for each unknown of the film, "
             f"got {len(given_row)}"
         )
     may_be_null = (std == 0.0) | (change.std == 0.0)  # the correlation of a constant is not defined
-    # `_correlation_array` reads a matrix, so the row is given and returned as a matrix of one row.
+    # `_correlation_array` converts a matrix, so the row is passed and returned as a matrix with one row.
     (temperature_row,) = _correlation_array(path, "temperature.correlations", [given_row], may_be_null[None])
 
     extended = np.eye(std.size + 1)
@@ -397,25 +429,27 @@ def _with_temperature(path: Path, table: _Temperature, correlations: Array, std:
 
 
 def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Array) -> Array:
-    """Read a matrix of correlations, and check that it is symmetric with ones on its diagonal.
+    """Read a matrix of correlations, and check that the matrix is symmetric with ones on its diagonal.
 
     Args:
         path: The file, for error messages.
         key: Key of the matrix, for error messages.
-        rows: Rows of the matrix. The correlations of an unknown without variance are null, and become zero.
+        rows: Rows of the matrix. The correlations of an unknown without variance may be null, and become zero.
         std: Standard deviations of the unknowns, shape (n,).
 
     Returns:
         Correlations, shape (n, n).
 
     Raises:
-        PressError: If the matrix has another shape, or is not a matrix of correlations.
+        PressError: If the matrix has the wrong shape, is not symmetric, has a diagonal entry other than 1, or contains
+            null for an unknown with a variance.
     """
     is_square = len(rows) == std.size and all(len(row) == std.size for row in rows)
     if not is_square:
         raise PressError(f"{path}: {key}: expected {std.size} rows of as many numbers")
     is_constant = std == 0.0
-    matrix = _correlation_array(path, key, rows, may_be_null=is_constant[:, None] | is_constant[None, :])
+    involves_constant = is_constant[:, None] | is_constant[None, :]  # shape (n, n)
+    matrix = _correlation_array(path, key, rows, may_be_null=involves_constant)
 
     diagonal = np.where(is_constant, 1.0, np.diag(matrix))
     deviation_from_one = np.abs(diagonal - 1.0)
@@ -438,18 +472,18 @@ def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Arra
 
 
 def _correlation_array(path: Path, key: str, rows: list[list[Correlation]], may_be_null: Booleans) -> Array:
-    """Convert rows of correlations into an array, in which null becomes zero.
+    """Convert rows of correlations into an array, and replace each null by zero.
 
     Args:
         path: The file, for error messages.
         key: Key of the rows, for error messages.
         rows: Rows of numbers and null, all of the same length.
-        may_be_null: Where null is allowed, of the shape of the rows.
+        may_be_null: Whether null is allowed at each place, shape (n_row, n_column).
 
     Raises:
-        PressError: If a row contains null where a number is needed.
+        PressError: If the rows contain null at a place where it is not allowed.
     """
-    matrix = np.array(rows, dtype=float)  # NumPy converts None into NaN
+    matrix = np.array(rows, dtype=float)  # JSON's null was read as None, which NumPy converts into NaN
     is_null = np.isnan(matrix)
     is_missing = is_null & ~may_be_null
     if is_missing.any():
@@ -462,7 +496,9 @@ def _correlation_array(path: Path, key: str, rows: list[list[Correlation]], may_
 
 
 def _positive_semidefinite(path: Path, correlations: Array) -> Array:
-    """Return the correlation matrix without the small negative eigenvalues that rounding causes.
+    """Replace small negative eigenvalues of a correlation matrix by zero.
+
+    Rounding errors of the correlations cause such eigenvalues.
 
     Args:
         path: The file, for the error message.
@@ -472,9 +508,9 @@ def _positive_semidefinite(path: Path, correlations: Array) -> Array:
         The nearest positive semidefinite matrix, shape (n, n).
 
     Raises:
-        PressError: If an eigenvalue is too negative for rounding, so that the matrix cannot contain correlations.
+        PressError: If the magnitude of a negative eigenvalue exceeds `EIGENVALUE_TOLERANCE`.
     """
-    eigenvalues, vectors = np.linalg.eigh(correlations)
+    eigenvalues, eigenvectors = np.linalg.eigh(correlations)  # in ascending order
     smallest_eigenvalue = eigenvalues[0]
     if smallest_eigenvalue < -EIGENVALUE_TOLERANCE:
         raise PressError(
@@ -484,4 +520,4 @@ def _positive_semidefinite(path: Path, correlations: Array) -> Array:
     if smallest_eigenvalue >= 0.0:
         return correlations
     limited_eigenvalues = np.maximum(eigenvalues, 0.0)
-    return np.asarray((vectors * limited_eigenvalues) @ vectors.T)
+    return np.asarray((eigenvectors * limited_eigenvalues) @ eigenvectors.T)

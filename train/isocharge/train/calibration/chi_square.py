@@ -1,6 +1,6 @@
-"""Chi-square distribution, with which the residuals of presses are tested.
+"""Functions of the chi-square distribution, which are used to test the residuals of presses.
 
-`scipy.stats` has the same functions, but its import takes a third of a second.
+`scipy.stats` has the same functions, but importing it is slow.
 """
 
 import numpy as np
@@ -10,10 +10,10 @@ from isocharge.common.arrays import Array
 
 
 def probability_above(chi2: Array | float, degrees_of_freedom: Array | float) -> Array:
-    """Compute the probability that a chi-square variable exceeds a value.
+    """Compute the probability that a chi-square variable exceeds a given value.
 
     Args:
-        chi2: The value, at least 0.
+        chi2: The given value, at least 0.
         degrees_of_freedom: Degrees of freedom, more than 0. An array must have the shape of `chi2`.
 
     Returns:
@@ -23,7 +23,7 @@ def probability_above(chi2: Array | float, degrees_of_freedom: Array | float) ->
 
 
 def value_exceeded_with(probability: float, degrees_of_freedom: Array) -> Array:
-    """Compute the value that a chi-square variable exceeds with a given probability.
+    """Compute the value that a chi-square variable exceeds with a given probability (the upper quantile).
 
     Args:
         probability: Probability between 0 and 1.

@@ -1,10 +1,12 @@
-"""Detection of a closed back, behind which air is trapped, from the presses of a film.
+"""Detection of a closed back, which traps air behind the film, from the presses of a calibration.
 
-A calibration assumes that air can flow out of the space behind the film (a vented back). If the back is closed, the
-trapped air carries a part of the load, and the charges of the electrodes away from the probe are much smaller. No film
-of the prior has such charges, so a calibration describes them by a large discrepancy or refuses the presses. The
-presses are therefore also compared with a few films with a closed back, which are solved directly. This comparison
-takes a few seconds. This comparison is made only if no film with a vented back agrees with the presses.
+A calibration assumes a vented back, which lets air flow out of the space behind the film. If the back is closed, the
+trapped air carries a part of the load. The electrodes away from the probe then collect much less charge than those of
+any film with a vented back. Therefore, a calibration of such presses either estimates a large discrepancy or refuses
+the presses.
+
+If no film with a vented back agrees with the presses, the presses are also compared with a few films that have a closed
+back. The charges of the films with a closed back are simulated directly, which takes a few seconds.
 """
 
 from dataclasses import replace
@@ -22,19 +24,19 @@ MIN_VENTED_MISFIT = 0.5
 """Misfit of films with a vented back, as `charge_misfit` returns it, below which the back is not examined."""
 
 CAVITY_DEPTH_mm = 20.0
-"""Depth of the cavity behind the films that are compared.
+"""Depth of the cavity behind the simulated films with a closed back, mm.
 
 Up to a depth of about 200 mm, the trapped air is so stiff that the depth hardly matters.
 """
 
 INTERPOLATED_COUNT = 25
-"""Number of pretensions between those of `PRETENSIONS` for which charges are interpolated."""
+"""Number of pretensions, from the first to the last of `PRETENSIONS`, for which charges are interpolated."""
 
 MAX_EXAMINED = 8
-"""Largest number of presses that are compared."""
+"""Largest number of presses that are compared with films with a closed back."""
 
 ACCURACY = 5e-3
-"""Relative error of the solved charges, which is far below the effect of a closed back."""
+"""Relative error of the simulated charges, which is far below the effect of a closed back."""
 
 CLOSED_BACK_CAUTION = (
     "films with a closed back explain the presses far better than films with a vented back: air is probably trapped "
@@ -46,21 +48,21 @@ CLOSED_BACK_CAUTION = (
 def has_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> bool:
     """Return whether films with a closed back explain the presses much better than films with a vented back.
 
-    At most `MAX_EXAMINED` presses are examined, because every press on a film with a closed back needs a solve. The
-    solves are omitted if a film with a vented back explains the presses well.
+    At most `MAX_EXAMINED` presses are examined, because each press on a film with a closed back has to be simulated.
+    Nothing is simulated if a film with a vented back explains the presses well.
 
     Args:
-        presses: The presses. Those without a place or a force are not used.
-        charges: Charges of the films of the calibration.
+        presses: The presses. A press whose place or force is unknown is not used.
+        charges: Model of the charges of all films of the calibration, which have a vented back.
     """
     placed = presses[presses.placed]
     if not len(placed):
         return False
-    # If there are fewer presses than rows, some rows are equal, and each press is examined only once.
+    # If there are fewer presses than `MAX_EXAMINED`, some rows are repeated. `np.unique` removes the repetitions.
     evenly_spaced_rows = np.linspace(0, len(placed) - 1, MAX_EXAMINED).round().astype(int)
     examined = placed[np.unique(evenly_spaced_rows)]
 
-    # The charges are computed for a few pretensions, and interpolated between them.
+    # The charges are computed for the pretensions in `PRETENSIONS`, and interpolated for pretensions between them.
     vented_charges = _interpolated(expected_charges(charges, examined.contact))
     vented_misfit = charge_misfit(charges, examined.contact, examined.charge_pC, vented_charges)
     is_explained = vented_misfit <= MIN_VENTED_MISFIT
@@ -71,22 +73,22 @@ def has_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> bool:
     contact = charges.into_domain(examined.contact)
     try:
         solved_charges = np.array([_closed_charges(charges, share, contact) for share in PRETENSIONS])
-    except (SceneError, SolveError):  # a film with a closed back cannot be solved, so nothing is known about the back
-        return False
+    except (SceneError, SolveError):
+        return False  # a film with a closed back cannot be simulated, so there is no evidence for a closed back
     closed_charges = _interpolated(solved_charges)
     closed_misfit = charge_misfit(charges, examined.contact, examined.charge_pC, closed_charges)
     return closed_misfit < CLEARER * vented_misfit
 
 
 def refuse_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> None:
-    """Raise an error if films with a closed back explain presses that no film with a vented back explains.
+    """Raise an error if films with a closed back explain the presses much better than films with a vented back.
 
     Args:
-        presses: The presses.
-        charges: Charges of the films of the calibration.
+        presses: The presses, which no film with a vented back explains.
+        charges: Model of the charges of all films of the calibration, which have a vented back.
 
     Raises:
-        PressError: If films with a closed back explain the presses.
+        PressError: If films with a closed back explain the presses much better; see `has_closed_back`.
     """
     if has_closed_back(presses, charges):
         raise PressError(
@@ -96,25 +98,28 @@ def refuse_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
 
 def _interpolated(charge: Array) -> Array:
-    """Interpolate charges between the pretensions of `PRETENSIONS`.
+    """Interpolate charges linearly between the pretensions in `PRETENSIONS`.
 
     Args:
-        charge: Charges for each of `PRETENSIONS`, shape (n_pretension, n, n_electrode), pC.
+        charge: Charges for each pretension in `PRETENSIONS`, shape (n_pretension, n, n_electrode), pC.
 
     Returns:
         Charges for `INTERPOLATED_COUNT` pretensions, shape (INTERPOLATED_COUNT, n, n_electrode), pC.
     """
-    shares = np.linspace(PRETENSIONS[0], PRETENSIONS[-1], INTERPOLATED_COUNT)
-    # Interpolating the unit vectors gives the weight of each pretension k for each interpolated pretension i.
-    weights = np.array([np.interp(shares, PRETENSIONS, unit_vector) for unit_vector in np.eye(len(PRETENSIONS))])
+    interpolated_pretensions = np.linspace(PRETENSIONS[0], PRETENSIONS[-1], INTERPOLATED_COUNT)
+    # Interpolation of the k-th unit vector gives the weight of pretension k at each interpolated pretension i. The
+    # weights have the shape (n_pretension, INTERPOLATED_COUNT).
+    unit_vectors = np.eye(len(PRETENSIONS))
+    weights = np.array([np.interp(interpolated_pretensions, PRETENSIONS, vector) for vector in unit_vectors])
+    # Sum over the pretensions k, for each press n and electrode e
     return np.asarray(np.einsum("ki,kne->ine", weights, charge))
 
 
 def _closed_charges(charges: FilmCharges, pretension_share: float, contact: Array) -> Array:
-    """Compute the charges of the mean film of the prior with a closed back and a given pretension.
+    """Simulate the charges of presses on the mean film of the prior, with a closed back and a given pretension.
 
     Args:
-        charges: Charges of the films of the calibration.
+        charges: Model of the charges of all films of the calibration, with their prior.
         pretension_share: Pretension divided by the largest pretension of the prior.
         contact: Presses (x, y, F), shape (n, 3), mm and N.
 

@@ -1,19 +1,21 @@
-"""Errors of contacts that are caused by the uncertainty of a film, and a choice of presses that reduce these errors.
+"""Errors of estimated contacts due to the uncertainty of a film, and the choice of presses that reduce these errors.
 
-An estimator may assume wrong parameters of the film, which differ from the real parameters by dp. The error of the
-estimated contact is then the change that compensates the difference of the charges best:
+Let dp be the difference between the parameters that an estimator assumes and the real parameters of the film. The
+estimator then finds a contact whose error dc compensates the change of the charges best:
 
     dc = -G dp,   G = (J' W J)^-1 J' W P.
 
-J and P are the derivatives of the charges with respect to the contact and to the parameters, and W is the inverse of
-the noise variance. If the parameters have the covariance C, the errors of the contacts have the covariance G C G'.
-Noise alone causes errors with the covariance (J' W J)^-1, which is the Cramer-Rao limit. The matrix J' W J also
-contains the prior of a contact. According to this prior, the contact lies in the working area and in the range of
-forces. The errors are therefore finite where the charge map folds.
+Here J is the derivative of the charges with respect to the contact, P is the derivative of the charges with respect to
+the parameters, and W is the inverse of the noise covariance. If the parameters have the covariance C, the errors dc
+have the covariance G C G'. Noise alone causes errors with the covariance (J' W J)^-1, which is the Cramer-Rao limit.
 
-The information that a press adds about the film depends on the contact, but hardly on the measured charges. The best
-next press can therefore be chosen before it is made. Presses are chosen one after the other. Each further press is the
-best one given the previous presses (a greedy A-optimal design, Pukelsheim 1993).
+In the code, the inverse of a prior covariance of the contact is added to J' W J. According to this prior, the contact
+lies in the working area and in the range of forces. Because of this prior, the errors are finite even at the folds of
+the charge map, where J' W J is singular.
+
+The information that a press adds about the film depends on the contact of the press, but hardly on its charges.
+Therefore, the best next press can be chosen before any charge is measured. Several presses are chosen one after the
+other, and each choice takes the previous choices into account (a greedy A-optimal design, Pukelsheim 1993).
 """
 
 from dataclasses import dataclass
@@ -35,10 +37,10 @@ N_CANDIDATE_POSITIONS = 80
 """Number of positions that are compared for the next press."""
 
 CANDIDATE_FORCES = (0.15, 0.45, 0.95)
-"""Forces that are compared for the next press: positions in the logarithm of the force range, from 0 to 1."""
+"""Forces that are compared for the next press, on a logarithmic scale from 0 (smallest force) to 1 (largest force)."""
 
 FORCE_ORDER_SEED = 0
-"""Seed of the random order of the forces of contacts that are spread over a domain."""
+"""Seed of the random order in which `spread_contacts` assigns forces to positions."""
 
 POSITION_GRID_MM = 0.5
 """Grid to which the coordinates of proposed presses are rounded, mm, so that a person can set them."""
@@ -69,7 +71,11 @@ class ContactError:
 
     @classmethod
     def of(cls, covariance: Array) -> "ContactError":
-        """Compute the errors of contacts from the covariances of (x, y, ln F), shape (n, 3, 3)."""
+        """Compute root-mean-square errors from the covariances of estimated contacts.
+
+        Args:
+            covariance: Covariances of the estimated (x, y, ln F), shape (n, 3, 3).
+        """
         variances = np.diagonal(covariance, axis1=1, axis2=2)  # of x, y and ln F, shape (n, 3)
         x_variance, y_variance, log_force_variance = variances.T
         position_variance = x_variance + y_variance
@@ -82,20 +88,20 @@ class ContactError:
 
 @dataclass(frozen=True)
 class ContactSensitivity:
-    """Linearised effects of noise and of errors of the film's unknowns on estimated contacts.
+    """Linearised effects of noise, and of errors in the unknowns of the film, on estimated contacts.
 
-    The unknowns of the film are its parameters, in units of their prior standard deviations, and the coefficients of
-    the discrepancy if there is one.
+    The unknowns of the film are its parameters, followed by its coefficients if there are any. Parameters are in units
+    of their prior standard deviations.
 
     Attributes:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        contact_jacobian: Derivatives of the estimated (x, y, ln F) with respect to the unknowns, the matrix -G of each
-            contact, shape (n, 3, n_unknown).
+        contact_jacobian: Derivatives of the estimated (x, y, ln F) with respect to the unknowns, shape (n, 3,
+            n_unknown). It is the matrix -G of each contact in the description of the module.
         noise_covariance: Covariance of the estimated (x, y, ln F) that noise alone causes, shape (n, 3, 3).
-        misfit_jacobian: Derivatives of the part of the charges that no contact explains with respect to the unknowns,
-            shape (n, n_electrode, n_unknown), in units of the noise.
-        log_charge_jacobian: Derivatives of ln Q at fixed contacts with respect to the unknowns, shape
-            (n, n_electrode, n_unknown).
+        misfit_jacobian: Derivatives of the misfit with respect to the unknowns, in units of the noise, shape (n,
+            n_electrode, n_unknown). The misfit is the part of the charges that no contact explains.
+        log_charge_jacobian: Derivatives of the logarithms of the charges at fixed contacts with respect to the
+            unknowns, shape (n, n_electrode, n_unknown).
         charge_gain: Derivatives of the estimated (x, y, ln F) with respect to the charges, shape (n, 3, n_electrode),
             mm/pC, mm/pC and 1/pC.
     """
@@ -108,29 +114,31 @@ class ContactSensitivity:
     charge_gain: Array
 
     @classmethod
-    def at(cls, problem: CalibrationProblem, parameters: Array) -> "ContactSensitivity":
-        """Compute the effects at contacts that are spread over the domain.
+    def at(cls, problem: CalibrationProblem, unknowns: Array) -> "ContactSensitivity":
+        """Compute the linearised effects of noise and film errors at contacts that are spread over the domain.
 
         Args:
-            problem: The films.
-            parameters: The film at which the charges are linearised, as `FilmCharges.film` takes it.
+            problem: The calibration problem, with the films and the noise.
+            unknowns: Unknowns of the film at which the charges are linearised, as `FilmCharges.film` expects them.
         """
         domain = problem.domain
         contact = spread_contacts(domain, N_CONTACTS)
-        contact_slopes, film_slopes = _whitened_slopes(problem, parameters, contact)
+        contact_slopes, film_slopes = _whitened_slopes(problem, unknowns, contact)
 
-        # Covariance of a contact by noise, from the information of the charges and of the prior. The prior of ln F is
-        # uniform, so its standard deviation is its width divided by the root of 12.
+        # Prior standard deviations of x, y and ln F. The prior of ln F is uniform, and the standard deviation of a
+        # uniform distribution is its width divided by the root of 12.
         min_force, max_force = domain.force_range
         log_force_range = max(np.log(max_force / min_force), MIN_LOG_FORCE_RANGE)
         log_force_std = log_force_range / np.sqrt(12.0)
         prior_std = np.array([0.5 * domain.radius, 0.5 * domain.radius, log_force_std])
-        # J' J of each contact n: sums over the electrodes k, for each pair of coordinates i and j
+        # J' W J of each contact n: sums over the electrodes k, for each pair of coordinates i and j. The slopes are
+        # already in units of the noise.
         charge_information = np.einsum("nki,nkj->nij", contact_slopes, contact_slopes)
         noise_covariance = np.linalg.inv(charge_information + np.diag(prior_std**-2))
 
-        # The estimated contact moves by the gain times the change of the charges over their noise.
-        charge = problem.charges.charges(parameters, contact)
+        # If the charges change, the estimated contact moves by the gain times this change. The whitened gain refers to
+        # changes in units of the noise, shape (n, 3, n_electrode).
+        charge = problem.charges.charges(unknowns, contact)
         sigma = problem.noise.sigma(charge)
         whitened_gain = noise_covariance @ contact_slopes.swapaxes(1, 2)
         return cls(
@@ -143,23 +151,35 @@ class ContactSensitivity:
         )
 
     def contact_error(self, covariance: Array) -> ContactError:
-        """Compute the errors of contacts that a covariance of the film's unknowns causes."""
+        """Compute the errors of contacts that the uncertainty of the film causes.
+
+        Args:
+            covariance: Covariance of the unknowns of the film, shape (n_unknown, n_unknown).
+        """
         return ContactError.of(self.contact_covariance(covariance))
 
     def contact_covariance(self, covariance: Array) -> Array:
-        """Compute the covariances of (x, y, ln F), shape (n, 3, 3), that a covariance of the film's unknowns causes."""
+        """Compute the covariances of estimated contacts that the uncertainty of the film causes.
+
+        Args:
+            covariance: Covariance of the unknowns of the film, shape (n_unknown, n_unknown).
+
+        Returns:
+            Covariances of (x, y, ln F), shape (n, 3, 3).
+        """
         return np.asarray(self.contact_jacobian @ covariance @ self.contact_jacobian.swapaxes(1, 2))
 
     @property
     def noise_error(self) -> ContactError:
-        """Errors that noise alone causes."""
+        """Errors of contacts that noise alone causes."""
         return ContactError.of(self.noise_covariance)
 
     def error_weights(self) -> Array:
-        """Return the matrix S for which the trace of S C is the mean squared error of the contacts.
+        """Return a matrix S for which trace(S C) is the mean squared error of the contacts.
 
-        C is the covariance of the film's unknowns. Errors of position and force are in units of the errors that noise
-        alone causes, so that the mean is dimensionless.
+        Here C is any covariance of the film's unknowns. The mean squared error is an average over all contacts, and
+        includes the errors of both position and force. These errors are divided by the position error and the force
+        error that noise alone causes. Therefore, the mean squared error is dimensionless.
 
         Returns:
             Matrix S, shape (n_unknown, n_unknown).
@@ -167,35 +187,35 @@ class ContactSensitivity:
         noise_error = self.noise_error
         noise_std = np.array([noise_error.position_mm, noise_error.position_mm, 0.01 * noise_error.force_percent])
         scaled_jacobian = self.contact_jacobian / noise_std[:, None]
-        # Sum over the contacts n and the components i of the error, for each pair of unknowns p and q
+        # Sums over the contacts n and the components i of the contact, for each pair of unknowns p and q
         sum_of_products = np.einsum("nip,niq->pq", scaled_jacobian, scaled_jacobian)
         return np.asarray(sum_of_products / len(scaled_jacobian))
 
 
 def spread_contacts(domain: Domain, count: int) -> Array:
-    """Return contacts whose positions and logarithms of the force are evenly spread over a domain.
+    """Return contacts that are evenly spread over a domain, in the position and in the logarithm of the force.
 
-    The order of the forces is random, so that the force does not depend on the position.
+    The forces are assigned to the positions in a random order. Therefore, the force does not depend on the position.
 
     Args:
-        domain: The domain.
+        domain: Range of positions and forces in which the contacts lie.
         count: Number of contacts.
 
     Returns:
         Contacts (x, y, F), shape (count, 3), mm and N.
     """
-    position = sunflower(count)
+    position = sunflower(count)  # complex numbers x + i y in the unit disk
     force_rank = np.random.default_rng(FORCE_ORDER_SEED).permutation(count)
     unit_log_force = 2.0 * (force_rank + 0.5) / count - 1.0
     return domain.to_contact(np.column_stack([position.real, position.imag, unit_log_force]))
 
 
-def _whitened_slopes(problem: CalibrationProblem, parameters: Array, contact: Array) -> tuple[Array, Array]:
-    """Return the derivatives of the charges in units of the noise of each charge.
+def _whitened_slopes(problem: CalibrationProblem, unknowns: Array, contact: Array) -> tuple[Array, Array]:
+    """Compute the derivatives of the charges of a film, divided by the standard deviation of the noise of each charge.
 
     Args:
-        problem: The films.
-        parameters: The film, as `FilmCharges.film` takes it.
+        problem: The calibration problem, with the films and the noise.
+        unknowns: Unknowns of the film, as `FilmCharges.film` expects them.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
     Returns:
@@ -203,53 +223,55 @@ def _whitened_slopes(problem: CalibrationProblem, parameters: Array, contact: Ar
         the film, shape (n, n_electrode, n_unknown).
     """
     charges = problem.charges
-    contact_slopes = charges.by_contact(parameters, contact)
-    film_slopes = charges.by_parameter(parameters, contact, contact_slopes)
-    noise_std = problem.noise.sigma(charges.charges(parameters, contact))  # shape (n, n_electrode)
+    contact_slopes = charges.contact_slopes(unknowns, contact)
+    film_slopes = charges.unknown_slopes(unknowns, contact, contact_slopes)
+    noise_std = problem.noise.sigma(charges.charges(unknowns, contact))  # shape (n, n_electrode)
     weight = 1.0 / noise_std[:, :, None]
     return weight * contact_slopes, weight * film_slopes
 
 
 def information_of(
     problem: CalibrationProblem,
-    parameters: Array,
+    unknowns: Array,
     contact: Array,
     position_std_mm: float = POSITION_STD_MM,
     force_std: float = FORCE_STD,
 ) -> Array:
-    """Compute the information that each press adds about the unknowns of the film.
+    """Compute the Fisher information that each press adds about the unknowns of a film.
 
     Args:
-        problem: The films.
-        parameters: The film at which the charges are linearised, as `FilmCharges.film` takes it.
-        contact: Presses (x, y, F), shape (n, 3), mm and N.
+        problem: The calibration problem, with the films and the noise.
+        unknowns: Unknowns of the film at which the charges are linearised, as `FilmCharges.film` expects them.
+        contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
         position_std_mm: Standard deviation of the position of a press, mm; infinite if the position is unknown.
         force_std: Standard deviation of the force of a press, relative to the force.
 
     Returns:
-        Fisher information about the parameters in units of their prior standard deviations and about the coefficients
-        of the discrepancy, shape (n, n_unknown, n_unknown).
+        Fisher information of each press, shape (n, n_unknown, n_unknown). The unknowns are the parameters, in units of
+        their prior standard deviations, and the coefficients of the film.
     """
-    roots = _information_roots(problem, parameters, contact, position_std_mm, force_std)
+    roots = _information_roots(problem, unknowns, contact, position_std_mm, force_std)
     return np.asarray(roots.swapaxes(1, 2) @ roots)
 
 
 def _information_roots(
-    problem: CalibrationProblem, parameters: Array, contact: Array, position_std_mm: float, force_std: float
+    problem: CalibrationProblem, unknowns: Array, contact: Array, position_std_mm: float, force_std: float
 ) -> Array:
-    """Compute a matrix R for each press whose product R' R is the information of the press.
+    """Compute a matrix R for each press such that R' R is the Fisher information of the press about a film.
 
-    The rows of R are the derivatives of the residuals of the charges and of the measured contact (x, y, ln F) with
-    respect to the unknowns of the film. The contact of the press is adjusted to each change of the unknowns. The
-    arguments are those of `information_of`.
+    Each row of R is the derivative of one residual with respect to the unknowns of the film. The first residuals are
+    those of the charges. The last three residuals are those of the measured contact (x, y, ln F). If the unknowns
+    change, the contact that fits best moves, and the derivatives include the effect of this movement. The arguments are
+    those of `information_of`.
 
     Returns:
         Matrices R, shape (n, n_electrode + 3, n_unknown).
     """
-    contact_slopes, film_slopes = _whitened_slopes(problem, parameters, contact)
+    contact_slopes, film_slopes = _whitened_slopes(problem, unknowns, contact)
 
-    # The contact that the rig measures depends only on the contact itself. Each coordinate has its own error, so its
-    # derivatives form a diagonal matrix. The derivatives with respect to the film are zero.
+    # The residuals of the measured contact depend only on the contact. Each of them depends only on its own coordinate,
+    # so their derivatives with respect to the contact form a diagonal matrix. Their derivatives with respect to the
+    # unknowns of the film are zero.
     rig_weights = np.array([1.0 / position_std_mm, 1.0 / position_std_mm, 1.0 / force_std])
     rig_contact_slopes = np.broadcast_to(np.diag(rig_weights), (len(contact), 3, 3))
     rig_film_slopes = np.zeros((len(contact), 3, film_slopes.shape[2]))
@@ -279,7 +301,7 @@ class ProposedPress:
 
     @property
     def contact(self) -> Array:
-        """(x, y, F), shape (3,), mm and N."""
+        """Contact (x, y, F) of the press, shape (3,), mm and N."""
         return np.array([self.x_mm, self.y_mm, self.force_N])
 
 
@@ -292,14 +314,15 @@ def next_presses(
     force_std: float = FORCE_STD,
     avoid_mm: Array | None = None,
 ) -> list[ProposedPress]:
-    """Choose the presses to make next, the best one first.
+    """Choose the next presses, in the order in which they should be made.
 
-    The presses are chosen one after the other from many candidates. Each chosen press is the candidate that reduces the
-    expected error of contacts most, given the presses chosen before.
+    The presses are chosen one after the other from many candidates. Each round chooses the candidate that reduces the
+    expected mean squared error of contacts most. The expected error assumes that all previously chosen presses are
+    made.
 
     Args:
-        problem: The films.
-        count: Number of presses.
+        problem: The calibration problem, with the films and the noise.
+        count: Number of presses to choose.
         film: The present estimate of the film, such as the posterior of a calibration; by default `problem.expected`.
         position_std_mm: Standard deviation that the positions of the presses will have, mm.
         force_std: Standard deviation that the forces of the presses will have, relative to the force.
@@ -308,7 +331,7 @@ def next_presses(
 
     Raises:
         PressError: If all candidate positions are avoided.
-        SceneError: If even the smallest force exceeds the stress limit.
+        SceneError: If even the smallest force of the domain exceeds the stress limit of the problem.
     """
     if film is None:
         film = problem.expected
@@ -316,12 +339,13 @@ def next_presses(
         avoid_mm = np.empty((0, 2))
     sensitivity = ContactSensitivity.at(problem, film.unknowns)
     candidates = _candidates(problem.domain.radius, problem.proposed_forces, avoid_mm)
-    # For each candidate, the matrix R whose product R' R is the information that the press adds about the film, shape
+    # For each candidate, a matrix R such that R' R is the Fisher information of the press about the film, shape
     # (n_candidate, n_residual, n_unknown)
     information_roots = _information_roots(problem, film.unknowns, candidates, position_std_mm, force_std)
     error_weights = sensitivity.error_weights()
 
-    covariance = film.unknown_covariance  # after each round, the covariance that is expected after the chosen presses
+    # In each round, the covariance is replaced by the covariance that is expected after the chosen presses.
+    covariance = film.unknown_covariance
     proposed = []
     for _ in range(count):
         best_index, covariance = _best_candidate(information_roots, covariance, error_weights)
@@ -334,51 +358,54 @@ def next_presses(
 def _best_candidate(information_roots: Array, covariance: Array, error_weights: Array) -> tuple[int, Array]:
     """Return the candidate that reduces the mean squared error most, and the covariance after this press.
 
-    A press with the information R' R reduces the covariance C by (R C)' (1 + R C R')^-1 (R C). The reduction of the
-    mean squared error is the trace of the error weights times this matrix.
+    A press with the Fisher information R' R reduces the covariance C of the unknowns by the matrix
+    D = (R C)' (1 + R C R')^-1 (R C). The mean squared error decreases by trace(S D), where S contains the error
+    weights.
 
     Args:
         information_roots: Matrix R of each candidate, shape (n, n_residual, n_unknown).
         covariance: Covariance C of the film's unknowns before the press, shape (n_unknown, n_unknown).
-        error_weights: Matrix S for which the trace of S C is the mean squared error, shape (n_unknown, n_unknown).
+        error_weights: Matrix S for which trace(S C) is the mean squared error, shape (n_unknown, n_unknown).
 
     Returns:
-        Index of the candidate, and the covariance after the press.
+        Index of the candidate, and the covariance of the unknowns after its press.
     """
     n_residual = information_roots.shape[1]
     projection = information_roots @ covariance  # R C
     innovation = np.eye(n_residual) + projection @ information_roots.swapaxes(1, 2)  # 1 + R C R'
     weighted_projection = projection @ error_weights @ projection.swapaxes(1, 2)  # R C S C R'
-    error_reduction = np.einsum("nij,nji->n", np.linalg.inv(innovation), weighted_projection)  # traces of products
+    # trace(S D) of each candidate n, which equals the trace of (1 + R C R')^-1 (R C S C R')
+    error_reduction = np.einsum("nij,nji->n", np.linalg.inv(innovation), weighted_projection)
     best_index = int(np.argmax(error_reduction))
 
-    # (R C)' (1 + R C R')^-1 (R C) of the best candidate
+    # The matrix D of the best candidate
     best_projection = projection[best_index]
     covariance_reduction = best_projection.T @ np.linalg.solve(innovation[best_index], best_projection)
     return best_index, covariance - covariance_reduction
 
 
 def _candidates(radius: float, force_range: tuple[float, float], avoid_mm: Array) -> Array:
-    """Return the candidates for the next press: every allowed position with every force.
+    """Return the candidates for the next press: all combinations of an allowed position and a candidate force.
 
-    The positions are distributed evenly over the working area. Positions and forces are rounded so that a person can
-    set them.
+    The positions are distributed evenly over the working area. Positions and forces are rounded to values that a person
+    can easily set.
 
     Args:
         radius: Largest distance of a press from the centre, mm.
-        force_range: Smallest and largest force, N.
-        avoid_mm: Positions to avoid, shape (n_avoided, 2), mm.
+        force_range: Smallest and largest force of a press, N.
+        avoid_mm: Positions that cannot be pressed, shape (n_avoided, 2), mm.
 
     Returns:
-        Presses (x, y, F), shape (n, 3), mm and N.
+        Contacts (x, y, F) of the candidates, shape (n, 3), mm and N.
 
     Raises:
-        PressError: If all positions are avoided.
+        PressError: If no position is allowed.
     """
-    spiral = radius * sunflower(N_CANDIDATE_POSITIONS)
-    coordinates = np.column_stack([spiral.real, spiral.imag])
-    positions = np.unique(np.round(coordinates / POSITION_GRID_MM) * POSITION_GRID_MM, axis=0)
+    complex_positions = radius * sunflower(N_CANDIDATE_POSITIONS)  # complex numbers x + i y
+    exact_positions = np.column_stack([complex_positions.real, complex_positions.imag])
+    positions = np.unique(np.round(exact_positions / POSITION_GRID_MM) * POSITION_GRID_MM, axis=0)
 
+    # A rounded position may lie outside the working area.
     is_inside = np.hypot(positions[:, 0], positions[:, 1]) <= radius
     offset = positions[:, None] - avoid_mm  # shape (n_position, n_avoided, 2)
     avoided_distance = np.hypot(offset[..., 0], offset[..., 1])
@@ -387,7 +414,8 @@ def _candidates(radius: float, force_range: tuple[float, float], avoid_mm: Array
     if not len(positions):
         raise PressError(f"no place within {radius:.3g} mm of the centre is left to press; skip fewer")
 
-    # The candidate forces are fractions of the logarithmic range of forces.
+    # The exact forces divide the logarithmic range of forces at the fractions `CANDIDATE_FORCES`. A force that would be
+    # rounded to zero is replaced by the smallest force of the grid.
     min_force, max_force = force_range
     exact_forces = min_force * (max_force / min_force) ** np.array(CANDIDATE_FORCES)
     rounded_forces = np.round(exact_forces / FORCE_GRID_N) * FORCE_GRID_N

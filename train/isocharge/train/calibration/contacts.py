@@ -1,8 +1,9 @@
-"""Contacts of the presses of a calibration, adjusted to both the measurements of the rig and the charges.
+"""Adjustment of the contacts of presses to both the measurements of the rig and the charges.
 
-A rig measures the position and the force of a press with some uncertainty, or does not measure one of them at all. For
-a given film, the adjusted contact minimises the sum of the squared residuals. Each measured charge and each measurement
-of the rig has a residual. These residuals show how well the film explains the press.
+A rig measures the position and the force of a press with some uncertainty. The position or the force may also be
+unknown. Each measured charge and each measurement of the rig has one residual, which depends on the contact and on the
+film. For a given film, the adjusted contact of a press is the contact with the smallest sum of squared residuals. The
+residuals at the adjusted contact show how well the film explains the press.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,18 +21,19 @@ from isocharge.train.calibration.film_maps import CONTACT_STEPS
 from isocharge.train.calibration.press_data import PressData
 
 CANDIDATE_POSITIONS = 300
-"""Number of positions among which the start is chosen for a press of unknown position."""
+"""Number of positions that are compared in order to choose the first contact of a press with an unknown position."""
 
 MIN_CHANGE = 1e-5
-"""Smallest change of chi2 for which the search for the contact of a press continues, relative to 1 + chi2."""
+"""Smallest change of chi2, relative to 1 + chi2, for which the search for the contact of a press continues."""
 
 
 class AdjustedContacts(NamedTuple):
-    """Contacts adjusted to one film.
+    """Contacts of presses that are adjusted to one film.
 
     Attributes:
         contact: Contacts (x, y, ln F), shape (n, 3).
-        residual: Residuals of charges and rig as in `PressData.residual`, shape (n, n_electrode + 3).
+        residual: Residuals of the charges and of the rig, as `PressData.residual` returns them, shape (n, n_electrode +
+            3).
     """
 
     contact: Array
@@ -43,40 +45,43 @@ class AdjustedContacts(NamedTuple):
         return np.asarray((self.residual**2).sum(axis=1))
 
 
-def derivatives_with_adjusted_contacts(by_unknowns: Array, by_contact: Array) -> Array:
-    """Compute the derivatives of the residuals if the contacts are adjusted again after each change of the unknowns.
+def derivatives_with_adjusted_contacts(unknown_slopes: Array, contact_slopes: Array) -> Array:
+    """Compute the derivatives of residuals if the contacts are adjusted again after each change of the unknowns.
 
-    A small change of the unknowns moves the adjusted contact, so that the sum of squared residuals stays minimal. The
-    part of the derivatives that this movement compensates is subtracted (Golub and Pereyra 1973).
+    If the unknowns change slightly, the adjusted contact moves to the new minimum of the sum of squared residuals. This
+    movement compensates a part of the derivatives at fixed contacts. The compensated part is subtracted (variable
+    projection, Golub and Pereyra 1973).
 
     Args:
-        by_unknowns: Derivatives at fixed contacts, shape (n, n_electrode + 3, n_unknown).
-        by_contact: Derivatives with respect to the contacts, shape (n, n_electrode + 3, 3).
+        unknown_slopes: Derivatives of the residuals with respect to the unknowns at fixed contacts, shape (n,
+            n_residual, n_unknown).
+        contact_slopes: Derivatives of the residuals with respect to the contact, shape (n, n_residual, 3).
 
     Returns:
-        Derivatives of the residuals, shape (n, n_electrode + 3, n_unknown).
+        Derivatives of the residuals with respect to the unknowns, shape (n, n_residual, n_unknown).
     """
-    # Least-squares solution for the movement of the contact with each unknown, by the normal equations
-    transposed = by_contact.swapaxes(1, 2)
-    contact_change = np.linalg.solve(transposed @ by_contact, transposed @ by_unknowns)
-    return np.asarray(by_unknowns - by_contact @ contact_change)
+    # The least-squares solution of contact_slopes @ contact_change = unknown_slopes, from the normal equations. If an
+    # unknown increases by one unit, the adjusted contact moves by minus `contact_change`, shape (n, 3, n_unknown).
+    transposed_slopes = contact_slopes.swapaxes(1, 2)
+    contact_change = np.linalg.solve(transposed_slopes @ contact_slopes, transposed_slopes @ unknown_slopes)
+    return np.asarray(unknown_slopes - contact_slopes @ contact_change)
 
 
 def with_force(contact: Array) -> Array:
-    """Return contacts (x, y, ln F) as (x, y, F), shape (n, 3)."""
+    """Convert contacts (x, y, ln F) into contacts (x, y, F), shape (n, 3)."""
     return np.column_stack([contact[:, :2], np.exp(contact[:, 2])])
 
 
 def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> AdjustedContacts:
-    """Find the contacts that agree best with both the measured charges and the contacts measured by the rig.
+    """Find the contacts that agree best with both the measured charges and the contacts that the rig measured.
 
-    The sum of squared residuals of each press is minimised over its contact (x, y, ln F). The search uses scaled
-    contacts, in which the domain is the unit disk times [-1, 1].
+    For each press, the sum of the squared residuals is minimised over the contact (x, y, ln F). The search uses scaled
+    contacts. In these coordinates, the positions of the domain fill the unit disk, and ln F lies in [-1, 1].
 
     Args:
-        charges: The films.
-        unknowns: Unknowns of the film under the presses, as `FilmCharges.film` takes them.
-        data: The presses.
+        charges: Model of the charges of all films.
+        unknowns: Unknowns of the pressed film, as `FilmCharges.film` expects them.
+        data: The measured presses.
         start: Contacts (x, y, ln F) at which the search begins, shape (n, 3).
     """
     residuals = _ContactResiduals.of(charges, unknowns, data, start)
@@ -87,19 +92,21 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
 
 
 class _ContactResiduals(NamedTuple):
-    """Residuals of presses on one film as a function of the contacts, in the form that `minimise` expects.
+    """Residuals of presses on one film as a function of their contacts, in the form that `minimise` expects.
 
-    The charge of a press is interpolated between films with neighbouring pretensions. It is the product of the charge
-    without coefficients and of a factor by the coefficients (imperfections and discrepancy). The factor changes slowly
-    with the contact and takes long to compute, so it is approximated as a linear function of the contact.
+    The charge of a press is the charge of the film without coefficients times a factor. The factor contains the effects
+    of the coefficients, which describe imperfections and the discrepancy. The factor changes slowly with the contact,
+    and its computation takes long. Therefore, the factor is approximated by a linear function of the contact. The
+    charges and the factors are interpolated between copies of the film with several pretensions, because the pretension
+    may differ from press to press.
 
     Attributes:
-        domain: Contacts for which the films have charges.
-        data: The presses.
-        forward_maps: Forward map of each of k films, between which the charges are interpolated.
-        film_weights: Weight of each film in each press, shape (n, k).
-        start: Contacts (x, y, ln F) about which the factor is linear, shape (n, 3).
-        start_factor: Factors at these contacts, shape (n, n_electrode).
+        domain: Range of contacts for which the charges of the films are known.
+        data: The measured presses.
+        forward_maps: Forward map of each of the k films between which the charges are interpolated.
+        film_weights: Weight of each of the k films for each press, shape (n, k).
+        start: Contacts (x, y, ln F) about which the factor is linearised, shape (n, 3).
+        start_factor: Factors at the contacts `start`, shape (n, n_electrode).
         factor_slopes: Derivatives of the factors with respect to (x, y, ln F), shape (n, n_electrode, 3).
     """
 
@@ -113,12 +120,12 @@ class _ContactResiduals(NamedTuple):
 
     @classmethod
     def of(cls, charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> "_ContactResiduals":
-        """Compute everything that does not depend on the contacts of the search.
+        """Create the residuals, and compute all values that do not change during the search for the contacts.
 
         Args:
-            charges: The films.
-            unknowns: Unknowns of the film under the presses, as `FilmCharges.film` takes them.
-            data: The presses.
+            charges: Model of the charges of all films.
+            unknowns: Unknowns of the pressed film, as `FilmCharges.film` expects them.
+            data: The measured presses.
             start: Contacts (x, y, ln F) at which the search begins, shape (n, 3).
         """
         layout = charges.layout
@@ -140,14 +147,16 @@ class _ContactResiduals(NamedTuple):
         )
 
     def at(self, rows: Integers, scaled_contact: Array) -> tuple[Array, Array]:
-        """Compute the residuals of some presses, and their derivatives with respect to the scaled contact.
+        """Compute the residuals of some presses, and the derivatives of these residuals.
 
         Args:
-            rows: Indices of the presses, shape (k,).
-            scaled_contact: Contacts in which the domain is the unit disk times [-1, 1], shape (k, 3).
+            rows: Indices of the presses, shape (m,).
+            scaled_contact: Contacts of these presses in scaled coordinates, shape (m, 3). In these coordinates, the
+                positions of the domain fill the unit disk, and ln F lies in [-1, 1].
 
         Returns:
-            Residuals, shape (k, n_electrode + 3), and derivatives, shape (k, 3, n_electrode + 3).
+            Residuals, shape (m, n_electrode + 3), and their derivatives with respect to the scaled contact, shape (m,
+            3, n_electrode + 3).
         """
         contact = scaled_contact * self.domain.scale + self.domain.centre  # (x, y, ln F)
         film_charges = [
@@ -156,11 +165,11 @@ class _ContactResiduals(NamedTuple):
         charge, charge_slopes = _interpolated(film_charges, self.film_weights[rows])
 
         # Linear approximation of the factor about the start
-        factor_slopes = self.factor_slopes[rows]  # shape (k, n_electrode, 3)
-        displacement = (contact - self.start[rows])[:, None]  # shape (k, 1, 3)
+        factor_slopes = self.factor_slopes[rows]  # shape (m, n_electrode, 3)
+        displacement = (contact - self.start[rows])[:, None]  # shape (m, 1, 3)
         factor = self.start_factor[rows] + (factor_slopes * displacement).sum(axis=2)
 
-        # Derivatives of factor * charge by the product rule, shape (k, n_electrode, 3)
+        # Derivatives of factor * charge by the product rule, shape (m, n_electrode, 3)
         product_slopes = factor[:, :, None] * charge_slopes + charge[:, :, None] * factor_slopes
         presses = self.data[rows]
         residual_slopes = presses.residual_slopes(product_slopes) * self.domain.scale  # per unit of the scaled contact
@@ -168,18 +177,18 @@ class _ContactResiduals(NamedTuple):
 
 
 def neighbouring_films(charges: FilmCharges, unknowns: Array, data: PressData) -> tuple[list[Array], Array]:
-    """Return films with different pretensions, between which the charges of each press are interpolated.
+    """Return copies of a film with several pretensions, between which the charges of each press are interpolated.
 
-    The pretension of the film may differ from press to press, for example because of the temperature. The returned
-    films are copies of the given film that differ only in their pretension.
+    The pretension of a film may differ from press to press, for example because of the temperature. The returned copies
+    of the film differ only in their pretension.
 
     Args:
-        charges: The films.
-        unknowns: Unknowns of the film.
+        charges: Model of the charges of all films.
+        unknowns: Unknowns of the film, as `FilmCharges.film` expects them.
         data: The presses, with the change of the pretension during each press.
 
     Returns:
-        The unknowns of k films, and their weights in each press, shape (n, k).
+        The unknowns of each of the k copies, and the weight of each copy for each press, shape (n, k).
     """
     pretension = charges.layout.parameter("pretension")  # index in the vector of unknowns
     lower, upper = charges.prior.bounds
@@ -195,11 +204,11 @@ def neighbouring_films(charges: FilmCharges, unknowns: Array, data: PressData) -
 
 
 def _interpolated(film_values_and_slopes: list[tuple[Array, Array]], film_weights: Array) -> tuple[Array, Array]:
-    """Interpolate the values and derivatives at presses between neighbouring films.
+    """Interpolate the values and derivatives at each press between films with several pretensions.
 
     Args:
-        film_values_and_slopes: Values and derivatives on each of k films, as `_values_and_slopes` returns them.
-        film_weights: Weight of each film in each press, shape (n, k).
+        film_values_and_slopes: Values and derivatives on each of the k films, as `_values_and_slopes` returns them.
+        film_weights: Weight of each of the k films for each press, shape (n, k).
 
     Returns:
         Interpolated values, shape (n, n_electrode), and interpolated derivatives, shape (n, n_electrode, 3).
@@ -210,35 +219,36 @@ def _interpolated(film_values_and_slopes: list[tuple[Array, Array]], film_weight
 
 
 def weighted_sum(arrays: Sequence[Array], weights: Array) -> Array:
-    """Return the weighted sum of arrays, with different weights for each row.
+    """Return the weighted sum of several arrays, in which each row has its own weights.
 
     Args:
         arrays: The k arrays, each of shape (n, ...).
-        weights: Weight of each array in each row, shape (n, k).
+        weights: Weight of each of the k arrays in each row, shape (n, k).
 
     Returns:
         The sum, shape (n, ...).
     """
     total = np.zeros_like(arrays[0])
     for array, row_weights in zip(arrays, weights.T, strict=True):
-        # The weights of the rows get axes of length 1, so that they are broadcast over the other axes of the array.
+        # With further axes of length 1, the weights of the rows are broadcast over all other axes of the array.
         trailing_axes = tuple(range(1, array.ndim))
         total = total + array * np.expand_dims(row_weights, trailing_axes)
     return total
 
 
 def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tuple[Array, Array]:
-    """Compute a function of the contact, and its derivatives by one-sided differences.
+    """Evaluate a function at contacts, and compute its derivatives by one-sided finite differences.
 
     Args:
-        function: Function of contacts (x, y, F), shape (n, 3), that returns an array of shape (n, n_electrode).
-        contact: Contacts (x, y, F), shape (n, 3).
+        function: Function that converts contacts (x, y, F), shape (n, 3), into an array of shape (n, n_electrode).
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
     Returns:
         Values, shape (n, n_electrode). Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3).
     """
     x_step, y_step, log_force_step = CONTACT_STEPS
-    # One call for the contacts and for the three displaced copies of them, because this is faster than four calls.
+    # The contacts, and three copies that are displaced along x, y and ln F, shape (4, n, 3). A single call of the
+    # function for all of them is faster than four calls.
     displaced = np.repeat(contact[None], 4, axis=0)
     displaced[1, :, 0] += x_step
     displaced[2, :, 1] += y_step
@@ -254,15 +264,16 @@ def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tu
 
 
 def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> Array:
-    """Return the initial contacts of the search for the adjusted contacts.
+    """Return the contacts at which the search for the adjusted contacts begins.
 
-    The search begins at the contact that the rig measured. If the position of a press is unknown, it begins at the
-    position where the ratios between the charges of the film are most similar to the measured ratios.
+    If the rig measured the position of a press, the search begins at this position. If the position of a press is
+    unknown, the search begins at the position where the ratios of the film's charges are most similar to the ratios of
+    the measured charges. The force is the measured force, or the middle of the range of forces if it is unknown.
 
     Args:
-        charges: The films.
-        unknowns: Unknowns of the film.
-        data: The presses.
+        charges: Model of the charges of all films.
+        unknowns: Unknowns of the film, as `FilmCharges.film` expects them.
+        data: The measured presses.
 
     Returns:
         Contacts (x, y, ln F), shape (n, 3).
@@ -275,31 +286,32 @@ def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> Ar
 
 
 def _most_similar_positions(charges: FilmCharges, unknowns: Array, data: PressData) -> Array:
-    """Find the positions where the ratios between the charges of a film are most similar to the measured ratios.
+    """Find the positions where the ratios of a film's charges are most similar to the ratios of the measured charges.
 
-    For each press, `CANDIDATE_POSITIONS` positions are compared. Ratios are used because they hardly depend on the
-    stiffness and on the coefficients of the film, which are not known yet.
+    For each press, `CANDIDATE_POSITIONS` positions are compared. The ratios of charges hardly depend on the stiffness
+    and the piezoelectric coefficients of the film, which may still be inaccurate at this stage of a calibration.
 
     Args:
-        charges: The films.
-        unknowns: Unknowns of the film.
-        data: The presses.
+        charges: Model of the charges of all films.
+        unknowns: Unknowns of the film, as `FilmCharges.film` expects them.
+        data: The presses whose positions are searched for.
 
     Returns:
         Positions (x, y), shape (n, 2), mm.
     """
-    # Candidates (x, y, F) with a typical force, from positions x + i y that are distributed evenly over the domain
+    # Candidates (x, y, F) with the same typical force. Their positions are distributed evenly over the domain, and are
+    # first computed as complex numbers x + i y.
     complex_positions = charges.domain.radius * sunflower(CANDIDATE_POSITIONS)
     typical_force = np.exp(np.median(data.contact[:, 2]))
     forces = np.full(CANDIDATE_POSITIONS, typical_force)
     candidates = np.column_stack([complex_positions.real, complex_positions.imag, forces])
     log_computed = np.log(charges.charges(unknowns, candidates))  # shape (n_candidate, n_electrode)
 
-    log_charge = np.log(np.maximum(data.charge, 1.0))  # limited to at least 1 pC, because charges may be negative
+    log_charge = np.log(np.maximum(data.charge, 1.0))  # at least 1 pC, because charges may be zero or negative
     log_measured = np.where(data.has_charge, log_charge, np.nan)
 
-    # The ratios agree if the logarithms of measured and computed charges differ by the same amount on all electrodes,
-    # so that the variance of these differences is zero.
+    # If the ratios agree exactly, the logarithms of measured and computed charges differ by the same amount on all
+    # electrodes. The variance of this difference over the electrodes is then zero.
     log_quotient = log_measured[:, None] - log_computed  # shape (n, n_candidate, n_electrode)
     most_similar = np.nanvar(log_quotient, axis=2).argmin(axis=1)
     return candidates[most_similar, :2]

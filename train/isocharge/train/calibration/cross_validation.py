@@ -1,8 +1,9 @@
-"""Errors of a calibration on presses to which it was not fitted, by cross-validation over the pressed places.
+"""Cross-validation of a calibration: measurement of its errors on presses that were not used in the fit.
 
-The places are divided into folds. For each fold, the film is fitted again to the presses at all other places. The
-network of this film then estimates the contacts of the fold from their charges. The differences from the measured
-contacts include effects that no parameter describes, the noise of the charges, and the errors of the rig.
+The pressed places are divided into folds. For each fold, the film is fitted again to the presses of all other folds.
+The network of the fitted film then estimates the contacts of the presses in the fold from their charges. The estimated
+contacts differ from the measured contacts for three reasons: effects that no parameter describes, noise of the charges,
+and errors of the rig.
 """
 
 import math
@@ -22,7 +23,7 @@ from isocharge.train.model_release.evaluate import ONLY_SIMULATED, contact_error
 from isocharge.train.training.fitted import Answers, Fitted
 
 FOLD_COUNT = 5
-"""Number of folds."""
+"""Number of folds into which the presses are divided."""
 
 MAX_FITTED_PRESSES = 250
 """Largest number of presses to which a film is fitted again. More presses take longer and hardly change the film."""
@@ -30,12 +31,12 @@ MAX_FITTED_PRESSES = 250
 
 @dataclass(frozen=True)
 class HeldOutAnswers:
-    """Measured presses, and the contacts that networks estimate for them after a fit without these presses.
+    """Measured presses, and contacts estimated by networks of films that were fitted without these presses.
 
     Attributes:
         presses: The measured presses.
-        answers: Contacts and misfits that the networks compute from the charges of the presses. The standard deviations
-            are those of the differences from the measured contacts, so they include the errors of the rig.
+        answers: Contacts and misfits that the networks computed from the charges of the presses. The standard
+            deviations are those of the differences from the measured contacts, so they include the errors of the rig.
     """
 
     presses: LabelledPresses
@@ -43,7 +44,7 @@ class HeldOutAnswers:
 
     @property
     def errors(self) -> dict[str, float]:
-        """Errors of the position, mm, and of the force, %. The keys are those of `model_release.evaluate`."""
+        """Errors of the position (mm) and of the force (%), by the names that `model_release.evaluate` uses."""
         contact, std, _ = self.answers
         all_errors = contact_errors(contact, std, self.presses.contact)
         return {name: error for name, error in all_errors.items() if name not in ONLY_SIMULATED}
@@ -60,66 +61,66 @@ def cross_validate(
     """Estimate the contacts of measured presses with networks of films that were fitted without these presses.
 
     The presses are divided into `FOLD_COUNT` folds by their places. For each fold, the film is fitted to the presses of
-    the other folds, and its network estimates the contacts of the fold.
+    all other folds. The network of this film then estimates the contacts of the presses in the fold.
 
     Args:
-        problem: Films that the sensor may have.
+        problem: The calibration problem, which defines the possible films.
         presses: The presses to which the film was fitted.
-        data: The same presses, with the effect of friction on their charges.
+        data: The same presses in the form for a fit, with the effect of friction on their charges.
         posterior: Estimate of the film from these presses. Presses that were left out as bad are not used here either.
         network_of: Function that returns the network of a film.
         at_C: Temperature of the film, degrees Celsius; None if the temperatures of the presses are unknown.
 
     Returns:
-        The presses that can be judged, and their answers; None if fewer than `FEWEST_MEASURED` presses can be judged.
-        A press can be judged if its place, force and charges are known, if it was not left out as bad, and if it lies
-        in the domain of the networks.
+        The presses that can be judged, and the answers of the networks for them. None if fewer than `FEWEST_MEASURED`
+        presses can be judged. A press can be judged if its place, force and charges are known, if it was not left out
+        as bad, and if it lies in the domain of the networks.
     """
     is_judged = complete(presses) & ~posterior.bad & ~problem.domain.is_outside(presses.contact)
     if is_judged.sum() < FEWEST_MEASURED:
         return None
 
-    # Presses that cannot be judged are in no fold, so the film is fitted to them in every round.
+    # Presses that cannot be judged belong to no fold. Unless they are bad, the film is fitted to them in every round.
     no_fold = -1
-    fold = np.full(len(presses), no_fold)
-    fold[is_judged] = folds_by_place(presses.contact[is_judged], FOLD_COUNT)
+    fold_of_press = np.full(len(presses), no_fold)
+    fold_of_press[is_judged] = folds_by_place(presses.contact[is_judged], FOLD_COUNT)
 
-    # Estimates for the presses, which are filled in fold by fold
+    # Answers of the networks for all presses, which are filled in fold by fold
     contact = np.empty((len(presses), 3))
-    std = np.empty((len(presses), 3))
+    network_std = np.empty((len(presses), 3))
     misfit = np.empty((len(presses), 1))
-    for fold_index in range(FOLD_COUNT):
-        is_held_out = fold == fold_index
+    for fold in range(FOLD_COUNT):
+        is_held_out = fold_of_press == fold
         is_fitted = _thinned(~is_held_out & ~posterior.bad)  # not all presses if there are very many
-        with threadpool_limits(1):  # many small matrices, for which a second thread only waits
+        with threadpool_limits(1):  # the matrices are small, so a second thread would only wait
             film = refit_film(
                 problem.charges, data[is_fitted], problem.before, posterior, at_C, friction=problem.friction
             )
         fold_contact, fold_std, fold_misfit = network_of(film).predict(presses.charge_pC[is_held_out])
         contact[is_held_out] = fold_contact
-        std[is_held_out] = fold_std
+        network_std[is_held_out] = fold_std
         misfit[is_held_out] = fold_misfit
 
-    # The difference between estimated and measured contacts has the errors of both.
+    # The estimated and the measured contact have independent errors, so the variances of both are added.
     force_N = presses.contact[:, 2]
     rig_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std * force_N])
-    std = np.hypot(std, rig_std)
+    difference_std = np.hypot(network_std, rig_std)
     judged_presses = LabelledPresses(presses.contact[is_judged], presses.charge_pC[is_judged], measured=True)
-    judged_answers = Answers(contact[is_judged], std[is_judged], misfit[is_judged])
+    judged_answers = Answers(contact[is_judged], difference_std[is_judged], misfit[is_judged])
     return HeldOutAnswers(judged_presses, judged_answers)
 
 
 def _thinned(is_chosen: Booleans) -> Booleans:
-    """Select at most `MAX_FITTED_PRESSES` of the chosen presses, evenly spaced.
+    """Select every k-th of the chosen presses, so that at most `MAX_FITTED_PRESSES` are selected.
 
     Args:
-        is_chosen: Whether each press is chosen, shape (n,).
+        is_chosen: Whether each press is one of the chosen presses, shape (n,).
 
     Returns:
         Whether each press is selected, shape (n,).
     """
     chosen_rows = np.flatnonzero(is_chosen)
-    stride = max(1, math.ceil(len(chosen_rows) / MAX_FITTED_PRESSES))
+    stride = max(1, math.ceil(len(chosen_rows) / MAX_FITTED_PRESSES))  # the number k
     is_selected = np.zeros_like(is_chosen)
     is_selected[chosen_rows[::stride]] = True
     return is_selected

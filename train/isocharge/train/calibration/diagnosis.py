@@ -1,9 +1,9 @@
-"""Search for a mistake in the presses of a calibration that no film explains.
+"""Search for mistakes in the records of presses that no film explains.
 
-The mistakes that are considered are swapped columns, rotated or mirrored axes, and other units. The presses are
-corrected for each mistake in turn and compared with a few films. An error message names the mistakes whose correction
-makes the presses agree with a film. The data themselves are never changed. Separate checks find positions off the film,
-dead channels and channels with the wrong sign before this search.
+The mistakes that are considered are swapped charge columns, rotated or mirrored axes of the rig, and wrong units. For
+each mistake, a corrected copy of the presses is compared with the charges of a few films. An error message names the
+mistakes whose correction makes the presses agree with a film. The presses themselves are never changed. Before the
+search, separate checks find positions outside the film, dead channels, and channels with the wrong sign.
 """
 
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ from isocharge.train.calibration.film_charges import FilmCharges
 MAX_DEAD_RATIO = 0.02
 """Ratio of the median charge of a channel to that of the other channels, below which the channel counts as dead.
 
-The limit is smaller for channels on which films have smaller charges."""
+The limit is smaller for a channel whose charges are smaller than those of the other channels on a possible film."""
 
 MIN_REVERSED_RATIO = 0.3
 """Ratio of the median charge of a channel to that of the other channels, above which its sign is checked."""
@@ -36,13 +36,13 @@ MIN_POSITION_RANGE_MM = 0.05
 
 
 class OtherUnit(NamedTuple):
-    """Unit that may have been used by mistake.
+    """Wrong unit in which values may have been written by mistake.
 
     Attributes:
-        values: Name of the values.
-        expected: Expected unit.
-        written: Unit in which the values may have been written.
-        factor: Factor that converts the values to the expected unit.
+        values: Name of the values that have the unit.
+        expected: Unit in which the values should have been written.
+        written: Unit in which the values may have been written instead.
+        factor: Factor that converts values from the written unit to the expected unit.
     """
 
     values: Literal["forces", "positions", "charges"]
@@ -64,23 +64,23 @@ OTHER_UNITS = (
     OtherUnit("charges", "pC", "C", 1e12),
     OtherUnit("charges", "pC", "fC", 1e-3),
 )
-"""Units that are considered."""
+"""Wrong units that are considered."""
 
 PRETENSIONS = (0.03, 0.25, 0.5, 1.0)
-"""Pretensions of the films that are compared, relative to the largest pretension of the prior."""
+"""Pretensions of the films with which presses are compared, relative to the largest pretension of the prior."""
 
 SCATTER_STD = 0.1
-"""Standard deviation of the logarithm of measured over expected charges, among electrodes and presses.
+"""Usual standard deviation, over electrodes and presses, of the logarithm of measured divided by expected charges.
 
-Gains and the shift of the electrodes cause such differences."""
+The gains and the shift of the electrodes cause such a scatter."""
 
 OFFSET_STD = 0.6
-"""Standard deviation of a common offset of the logarithm of measured over expected charges.
+"""Usual standard deviation of the common offset of all logarithms of measured divided by expected charges.
 
 The piezoelectric coefficients cause such an offset."""
 
 MIN_CHARGE_pC = 1e-3
-"""Lower limit to which charges are raised in comparisons of their logarithms, pC."""
+"""Lower limit of charges whose logarithms are compared, pC. Smaller and negative charges are replaced by it."""
 
 MAX_SQUARED_DEVIATION = 4.0
 """Limit of the squared deviation of a logarithm of charges, which bounds the effect of outliers."""
@@ -89,10 +89,10 @@ MAX_OUTSIDE_FRACTION = 0.2
 """Largest fraction of presses outside the domain for which a misfit is computed."""
 
 CLEARER = 0.25
-"""Ratio of the misfits with and without the correction of a mistake, below which the mistake is named."""
+"""Ratio of the misfits with and without the correction of a mistake, below which the mistake may be named."""
 
 MAX_MISFIT_RATIO = 2.0
-"""Largest ratio of the misfit of a mistake to the smallest misfit for which the mistake is named as well."""
+"""Largest ratio of the misfit after a correction to the smallest such misfit, up to which the mistake is named."""
 
 AXES = (
     ("they are turned by 90 degrees", np.array([[0.0, -1.0], [1.0, 0.0]])),
@@ -107,18 +107,19 @@ AXES = (
 
 
 def check_places(presses: MeasuredPresses, radius: float) -> None:
-    """Raise an error if a press lies off the film, or if the positions were probably written in metres.
+    """Raise an error if a press lies outside the film, or if the positions were probably written in metres.
 
     Args:
         presses: The presses. Positions that were not measured are NaN.
         radius: Radius of the film, mm.
 
     Raises:
-        PressError: If a position is off the film, or all positions lie within `MIN_POSITION_RANGE_MM` of each other.
+        PressError: If a position is outside the film, or if the positions are different but all lie within
+            `MIN_POSITION_RANGE_MM` of each other.
     """
     places = presses.contact[:, :2]
     distance = np.hypot(places[:, 0], places[:, 1])
-    outside_rows = np.flatnonzero(distance >= radius)  # the comparison is false for positions that were not measured
+    outside_rows = np.flatnonzero(distance >= radius)  # the comparison is False for NaN, an unknown position
     if outside_rows.size:
         row = outside_rows[0]
         raise PressError(
@@ -127,7 +128,7 @@ def check_places(presses: MeasuredPresses, radius: float) -> None:
         )
     measured_places = places[np.isfinite(places[:, 0])]
     spread = np.ptp(measured_places, axis=0).max() if len(measured_places) else 0.0
-    if 0.0 < spread < MIN_POSITION_RANGE_MM:  # repeated presses at one place, with a spread of zero, are allowed
+    if 0.0 < spread < MIN_POSITION_RANGE_MM:  # a spread of zero is allowed: repeated presses at one place
         raise PressError(
             f"all places lie within {spread:.3g} mm of each other; positions are in mm: were they written in metres?"
         )
@@ -138,10 +139,11 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
     Args:
         presses: The measured presses.
-        charges: Charges of the films of the calibration. A channel may have as small charges as one of these films.
+        charges: Model of the charges of all films. A channel with small charges does not count as dead if one of a few
+            examined films has similarly small charges.
 
     Raises:
-        PressError: If there is such a channel.
+        PressError: If a channel has no charges, is dead or has the wrong sign.
     """
     charge = presses.charge_pC
     for name, channel_charge in zip(presses.electrodes, charge.T, strict=True):
@@ -157,15 +159,15 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
 
 def _smallest_film_ratios(presses: MeasuredPresses, charges: FilmCharges) -> Array:
-    """Return the smallest charge of each channel on one of the films, relative to the charges of the other channels.
+    """Return the smallest ratio of each channel's charge to the other channels' charges among a few films.
 
     Args:
-        presses: The measured presses. Those with a known place and force are computed for each film.
-        charges: Charges of the films of the calibration.
+        presses: The measured presses. The charges of the films are computed for presses with a known place and force.
+        charges: Model of the charges of all films.
 
     Returns:
-        Ratios as in `_charge_ratios`, but not larger than 1, shape (n_electrode,). All ratios are 1 if no press has a
-        known place and force.
+        Ratios as `_charge_ratios` returns them, but limited to at most 1, shape (n_electrode,). All ratios are 1 if no
+        press has a known place and force.
     """
     placed_contact = presses.contact[presses.placed]
     if not len(placed_contact):
@@ -180,8 +182,8 @@ def _check_channel(name: str, charge: Array, ratio: float, smallest_film_ratio: 
     Args:
         name: Name of the electrode.
         charge: Charges of the channel, shape (n,), pC; NaN where a charge was not measured.
-        ratio: Median charge of the channel divided by the median charge of the other channels.
-        smallest_film_ratio: The smallest such ratio among the films of the calibration.
+        ratio: Typical charge of the channel divided by that of the other channels; see `_charge_ratios`.
+        smallest_film_ratio: Smallest value of this ratio among a few possible films.
 
     Raises:
         PressError: If the channel is dead or has the wrong sign.
@@ -195,7 +197,7 @@ def _check_channel(name: str, charge: Array, ratio: float, smallest_film_ratio: 
     negative_count = np.sum(charge < 0.0)
     measured_count = np.sum(np.isfinite(charge))
     is_mostly_negative = negative_count > MAX_NEGATIVE_FRACTION * measured_count
-    # The charges of channels with a small ratio may be negative on taut uniaxial films.
+    # On taut uniaxial films, a channel with a small ratio may really have negative charges.
     if is_mostly_negative and ratio > MIN_REVERSED_RATIO:
         raise PressError(
             f"electrode {name!r}: {negative_count} of its {measured_count} charges are negative; a press gives a "
@@ -204,12 +206,13 @@ def _check_channel(name: str, charge: Array, ratio: float, smallest_film_ratio: 
 
 
 def _charge_ratios(charge: Array) -> Array:
-    """Return the typical charge of each channel divided by the typical charge of the other channels.
+    """Return the typical charge of each channel, divided by the typical charge of the other channels.
 
-    The typical charge of a channel is the median of the magnitudes of its charges.
+    The typical charge of a channel is the median of the magnitudes of its charges. The typical charge of several
+    channels is the median of their typical charges.
 
     Args:
-        charge: Charges, shape (n, n_electrode), pC; NaN where none was measured.
+        charge: Charges, shape (n, n_electrode), pC; NaN where a charge was not measured.
 
     Returns:
         Ratios, shape (n_electrode,).
@@ -223,44 +226,48 @@ def _charge_ratios(charge: Array) -> Array:
 
 
 def expected_charges(charges: FilmCharges, contact: Array) -> Array:
-    """Compute the charges of the mean film of the prior with each of `PRETENSIONS`.
+    """Compute the charges of presses on a few films: the mean film of the prior with each pretension in `PRETENSIONS`.
 
     Args:
-        charges: The films.
-        contact: Contacts (x, y, F), shape (n, 3), mm and N. Contacts outside the domain are moved into it.
+        charges: Model of the charges of all films, with their prior.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N. A contact outside the domain of the films is moved into the
+            domain.
 
     Returns:
         Charges, shape (n_pretension, n, n_electrode), pC.
     """
     prior = charges.prior
-    contact = charges.into_domain(contact)
+    contact_in_domain = charges.into_domain(contact)
     expected = []
-    for share in PRETENSIONS:
+    for pretension_share in PRETENSIONS:
         parameters = prior.mean.copy()
-        parameters[prior.index("pretension")] = share * prior.spread.pretension
-        expected.append(charges.charges(parameters, contact))
+        parameters[prior.index("pretension")] = pretension_share * prior.spread.pretension
+        expected.append(charges.charges(parameters, contact_in_domain))
     return np.array(expected)
 
 
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     """Find the mistakes whose correction makes the presses agree far better with a film.
 
-    A mistake is returned if its correction reduces the misfit at least by the factor `CLEARER`. The misfit must also be
-    nearly as small as after the best correction.
+    A mistake is returned if its correction reduces the misfit to less than `CLEARER` times the misfit of the presses as
+    they were written. The misfit after the correction must also be at most `MAX_MISFIT_RATIO` times the misfit after
+    the best correction.
 
     Args:
-        presses: The measured presses.
-        charges: Charges of the films of the calibration.
+        presses: The measured presses. A press whose place or force is unknown is not used.
+        charges: Model of the charges of all films.
 
     Returns:
-        One sentence for each mistake, the best explanation first; empty if no mistake explains the presses.
+        One sentence for each mistake, with the best explanation first. The list is empty if no mistake explains the
+        presses.
     """
     placed = presses[presses.placed]
     if not len(placed):
         return []
     corrections = list(_corrected_presses(placed, charges))
 
-    # The charges of the films are computed for all corrected contacts at once, which is faster.
+    # The charges of the films are computed for all corrected contacts in one call, because this is faster. The result
+    # has the shape (n_film, n_correction * n, n_electrode), and is then split into one array for each correction.
     all_contacts = np.concatenate([correction.contact for correction in corrections])
     charges_by_correction = np.split(expected_charges(charges, all_contacts), len(corrections), axis=1)
     corrected_misfits = {}  # misfit after each correction, by the sentence about the mistake
@@ -271,18 +278,24 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
 
     limit_for_improvement = CLEARER * misfit(presses, charges)
     limit_for_similarity = MAX_MISFIT_RATIO * min(corrected_misfits.values())
-    sentences_best_first = sorted(corrected_misfits, key=corrected_misfits.__getitem__)
+    misfits_best_first = sorted(corrected_misfits.items(), key=lambda item: item[1])
     return [
         sentence
-        for sentence in sentences_best_first
-        if corrected_misfits[sentence] < limit_for_improvement and corrected_misfits[sentence] <= limit_for_similarity
+        for sentence, corrected_misfit in misfits_best_first
+        if corrected_misfit < limit_for_improvement and corrected_misfit <= limit_for_similarity
     ]
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
-    """Return the misfit of all presses with a measured place and force; see `charge_misfit`.
+    """Return the misfit of all presses with a known place and force; see `charge_misfit`.
 
-    A misfit of 1 is common, and a misfit of 20 is not.
+    If the place and the force of no press are known, the misfit is 0.
+
+    Correctly recorded presses usually have a misfit of about 1. A misfit of 20 indicates a mistake in the records.
+
+    Args:
+        presses: The measured presses.
+        charges: Model of the charges of all films.
     """
     placed = presses[presses.placed]
     if not len(placed):
@@ -291,23 +304,26 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
 
 
 def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected: Array) -> float:
-    """Compute how much measured charges differ from the charges of the most similar of several films.
+    """Compute the misfit between measured charges and the charges of the most similar of several films.
 
-    The difference is computed from the logarithms of the ratios of measured to expected charges. The difference has two
-    parts: the mean squared scatter of these logarithms about their median, and the squared median. Each part is in
-    units of the spread of the films.
+    The misfit of one film is the sum of two terms, which are computed from the logarithms of measured divided by
+    expected charges. The first term is the mean squared deviation of these logarithms from their median, divided by
+    `SCATTER_STD` squared. The second term is the squared median of the logarithms, divided by `OFFSET_STD` squared. The
+    smallest misfit of all films is returned.
 
     Args:
-        charges: The films of the calibration. If many contacts lie outside their domain, the misfit is infinite.
+        charges: Model of the charges of all films, with their domain. The misfit is infinite if more than
+            `MAX_OUTSIDE_FRACTION` of the contacts lie outside this domain.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        charge: Measured charges, shape (n, n_electrode), pC.
+        charge: Measured charges, shape (n, n_electrode), pC; NaN where a charge was not measured.
         expected: Charges of each film, shape (n_film, n, n_electrode), pC.
     """
-    # A contact lies outside the domain if the nearest contact of the domain is another one.
+    # A contact lies outside the domain if it differs from the nearest contact of the domain.
     is_outside = (charges.into_domain(contact) != contact).any(axis=1)
     if is_outside.mean() > MAX_OUTSIDE_FRACTION:
         return np.inf
-    # For each film, the offset common to all charges, and the mean squared deviation from this offset
+    # For each film, the median is an offset that is common to all charges. The scatter is the mean squared deviation
+    # from this offset. Both have the shape (n_film,).
     log_ratio = _log_charge(charge) - _log_charge(expected)  # shape (n_film, n, n_electrode)
     offset = np.nanmedian(log_ratio, axis=(1, 2))
     squared_deviation = np.minimum((log_ratio - offset[:, None, None]) ** 2, MAX_SQUARED_DEVIATION)
@@ -317,7 +333,11 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
 
 
 def _log_charge(charge: Array) -> Array:
-    """Return the logarithms of charges, which are first limited to at least `MIN_CHARGE_pC`; NaN remains NaN."""
+    """Return the logarithms of charges. Charges below `MIN_CHARGE_pC` are first raised to this limit; NaN remains NaN.
+
+    Args:
+        charge: Charges, an array of any shape, pC.
+    """
     return np.asarray(np.log(np.maximum(charge, MIN_CHARGE_pC)))
 
 
@@ -325,7 +345,7 @@ class Correction(NamedTuple):
     """Presses after the correction of a possible mistake.
 
     Attributes:
-        sentence: Description of the mistake.
+        sentence: Sentence that describes the mistake.
         contact: Corrected contacts (x, y, F), shape (n, 3), mm and N.
         charge: Corrected charges, shape (n, n_electrode), pC.
     """
@@ -336,32 +356,33 @@ class Correction(NamedTuple):
 
 
 def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[Correction]:
-    """Yield the presses after the correction of each mistake that is considered.
+    """Yield a corrected copy of the presses for each mistake that is considered.
 
-    The mistakes are swapped charge columns, rotated or reflected axes of the rig, and wrong units.
+    The mistakes are swapped charge columns, rotated or mirrored axes of the rig, and wrong units.
 
     Args:
-        presses: The measured presses, with place and force.
-        charges: Charges of the films of the calibration, from which possible orders of the columns follow.
+        presses: The measured presses, all with a known place and force.
+        charges: Model of the charges of all films, with which plausible orders of the columns are found.
     """
     contact = presses.contact
     charge = presses.charge_pC
     electrodes = presses.electrodes
 
-    # Swapped columns: `electrode_of_column` contains the index of the electrode whose charges each column holds.
+    # Swapped columns. For each column, `electrode_of_column` contains the index of the electrode to which the charges
+    # belong.
     for electrode_of_column in _fitting_orders(presses, charges):
         held_names = ", ".join(electrodes[electrode_index] for electrode_index in electrode_of_column)
         sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {held_names}"
         column_of_electrode = np.argsort(electrode_of_column)  # the inverse permutation
         yield Correction(sentence, contact, charge[:, column_of_electrode])
 
-    # Rotated or reflected axes
+    # Rotated or mirrored axes
     for description, matrix in AXES:
         position = contact[:, :2] @ matrix.T
         rotated_contact = np.column_stack([position, contact[:, 2]])
         yield Correction(f"the rig's axes are not the film's: {description}", rotated_contact, charge)
 
-    # Wrong units, each of either the positions, the forces or the charges
+    # Wrong units. Each unit belongs to the positions, the forces or the charges, and the other values are not changed.
     for unit in OTHER_UNITS:
         position_factor = unit.factor if unit.values == "positions" else 1.0
         force_factor = unit.factor if unit.values == "forces" else 1.0
@@ -374,27 +395,28 @@ def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterat
 
 
 def _fitting_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
-    """Find the orders of the electrodes with which the charge columns agree best with films.
+    """Find the assignments of charge columns to electrodes that agree best with a few films.
 
-    For each of `PRETENSIONS`, the columns are assigned to the electrodes of a film with this pretension. The assignment
-    minimises the squared differences between the logarithms of measured and expected charges.
+    For each pretension in `PRETENSIONS`, the columns are assigned to the electrodes of a film with this pretension. The
+    best assignment minimises the sum of squared differences between the logarithms of measured and expected charges.
 
     Args:
-        presses: The measured presses, with place and force.
-        charges: Charges of the films of the calibration.
+        presses: The measured presses, all with a known place and force.
+        charges: Model of the charges of all films.
 
     Returns:
-        For each order, the index of the electrode that each column holds. The order as written is not among them.
+        Set of assignments. Each assignment contains, for each column, the index of the electrode to which its charges
+        belong. The set does not include the assignment that the presses have in their file.
     """
     orders = set()
     log_measured = _log_charge(presses.charge_pC)
     for expected in expected_charges(charges, presses.contact):
         log_expected = _log_charge(expected)
         log_ratio = log_measured[:, :, None] - log_expected[:, None]  # shape (n, n_column, n_electrode)
-        # The median is subtracted, because a common factor of all charges does not matter. The limit reduces the effect
-        # of outliers.
+        # The median is subtracted, because a common factor of all charges does not matter here. The upper limit of the
+        # squared deviations reduces the effect of outliers.
         squared_deviation = np.minimum((log_ratio - np.nanmedian(log_ratio)) ** 2, MAX_SQUARED_DEVIATION)
-        # The best assignment has the smallest sum of these distances, with each electrode assigned to one column.
+        # The best assignment has the smallest sum of distances, and assigns each electrode to exactly one column.
         distance = np.nansum(squared_deviation, axis=0)  # shape (n_column, n_electrode)
         _, electrode_of_column = linear_sum_assignment(distance)
         orders.add(tuple(electrode_of_column.tolist()))
@@ -413,7 +435,7 @@ UNUSUAL_FILM = "only a film that differs unusually from its description has such
 
 
 def large_residual(residual_over_noise: float) -> str:
-    """Return the reason why presses are refused after a fit.
+    """Return the reason why presses that differ too much from the best film of a fit are refused.
 
     Args:
         residual_over_noise: Root-mean-square residual of the best film, in units of the noise.
@@ -422,15 +444,15 @@ def large_residual(residual_over_noise: float) -> str:
 
 
 def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: str) -> PressError:
-    """Return the error for presses that no film of the sensor explains.
+    """Create the error that is raised if no film of the sensor explains the presses.
 
-    The message names up to three mistakes that would explain the presses. If no mistake is found, the message asks for
-    a check of the setup.
+    The message names up to three mistakes that would explain the presses. If no mistake is found, the message asks the
+    user to check the setup.
 
     Args:
         presses: The presses as they are written in the file.
-        charges: Charges of the films of the calibration.
-        reason: Reason why no film explains the presses: one of the texts above.
+        charges: Model of the charges of all films.
+        reason: Reason why the presses are refused, such as `FAR_FROM_ALL_FILMS` or a text of `large_residual`.
     """
     sensor_name = charges.prior.sensor.name
     statement = f"no film of {sensor_name!r} explains these {len(presses)} presses: {reason}"

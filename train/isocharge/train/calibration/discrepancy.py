@@ -1,15 +1,18 @@
-"""Discrepancy of a film: a smooth factor on the charges of each electrode that no parameter describes.
+"""Discrepancy of a film: smooth differences between its real charges and the charges that its parameters imply.
 
-A real film has properties that no parameter describes. The effects of these properties are modelled as a Gaussian
-process of finite rank for each electrode (Kennedy and O'Hagan 2001). The process is a sum of products of Chebyshev
-polynomials in the place and in the logarithm l of the force:
+A real film has properties that no parameter describes. The effects of such properties on the charges are modelled by a
+Gaussian process of finite rank for each electrode (Kennedy and O'Hagan 2001). The process is a sum of products of
+Chebyshev polynomials T, which is added to the logarithm of the charge Q_e of the electrode e:
 
-    ln Q_e = ln Q_e(map) + sum c_eijm T_i(x / r) T_j(y / r) T_m(l),    i + j + m <= degree, m <= 2.
+    ln Q_e = ln Q_e(map) + sum c_eijm T_i(x / r) T_j(y / r) T_m(l),    i + j + m <= DEGREE, m <= FORCE_DEGREE.
 
-The coefficients have the mean zero and the standard deviation s FADING^(i + j + m). Another part of the discrepancy is
-the same for all electrodes. This common part is needed because all charges are smaller where a film is stiffer than its
-parameters imply. The standard deviation of this part is COMMON times as large. The size s is unknown. The module
-`hypotheses` computes the probabilities of several sizes from the presses.
+Here (x, y) is the position, r is the radius of the domain, and l is the logarithm of the force, scaled to [-1, 1]. The
+coefficient c_eijm has the prior mean zero and the prior standard deviation s FADING^(i + j + m), where s is the size of
+the discrepancy. The module `hypotheses` considers several sizes, and computes their probabilities from the presses.
+
+A further part of the discrepancy is the same for all electrodes. This common part is needed because the charges of all
+electrodes are smaller where a film is stiffer than its parameters imply. The standard deviation of the common part is
+`COMMON` times the standard deviation of the part of each electrode.
 """
 
 from functools import cache
@@ -21,18 +24,20 @@ from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.forward.charge_map import Domain
 
 DEGREE = 4
-"""Largest total degree of the polynomials."""
+"""Largest total degree of a term in x, y and ln F."""
 
 FORCE_DEGREE = 2
-"""Largest degree of the polynomials in ln F."""
+"""Largest degree of a term in ln F."""
 
 FADING = 0.5
-"""Ratio of the standard deviations of terms of successive degrees. It is below 1 because the discrepancy is smooth."""
+"""Ratio of the standard deviation of a coefficient to that of a coefficient whose total degree is lower by one.
+
+The ratio is below 1, because the discrepancy is smooth."""
 
 COMMON = 1.0
-"""Standard deviation of the part that all electrodes share, relative to that of the part of each electrode.
+"""Ratio of the standard deviation of the common part of the discrepancy to that of the part of each electrode.
 
-Both parts are of similar size in full simulations of imperfect films. The shared part causes errors of the force."""
+Both parts are of similar size in full simulations of imperfect films. The common part causes errors of the force."""
 
 TRACE_ANGLES = (-45.0, 0.0, 45.0)
 """Directions of the lines along which the trace of an electrode may lie, degrees from the outward direction.
@@ -42,28 +47,29 @@ area, the error of this approximation is below the noise."""
 
 
 def terms(contact: Array, domain: Domain) -> Array:
-    """Compute the polynomials of the discrepancy, each times the standard deviation of its coefficient.
+    """Compute the terms of the discrepancy, whose weighted sum is added to the logarithm of a charge.
 
-    The discrepancy of a film is a smooth function of the contact that is added to the logarithms of its charges. Its
-    terms are the products T_i(x / r) T_j(y / r) T_m(l) of Chebyshev polynomials, where r is the radius of the domain
-    and l is the logarithm of the force, scaled to [-1, 1]. The standard deviation of a coefficient is
-    FADING^(i + j + m) for a discrepancy of the size 1. For a contact outside the domain, the values at the nearest
-    contact of the domain are returned.
+    Each term is the product T_i(x / r) T_j(y / r) T_m(l) FADING^(i + j + m). Here T is a Chebyshev polynomial, r is the
+    radius of the domain, and l is the logarithm of the force, scaled to [-1, 1]. The factor FADING^(i + j + m) is the
+    prior standard deviation of the coefficient of T_i T_j T_m for a discrepancy of the size 1. For a contact outside
+    the domain, the values at the nearest contact of the domain are returned.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        domain: Domain of the polynomials.
+        domain: Range of positions and forces to which the variables of the polynomials are scaled.
 
     Returns:
-        T_i(x / r) T_j(y / r) T_m(l) FADING^(i + j + m), shape (n, n_term), dimensionless.
+        Values of the terms, shape (n, n_term), dimensionless.
     """
-    # Scaled contacts in the unit disk times [-1, 1], to which contacts outside the domain are moved.
+    # Scale the contacts. A contact outside the domain is moved to the nearest contact of the domain, whose scaled
+    # position lies in the unit disk and whose scaled ln F lies in [-1, 1].
     unit_contact = domain.to_unit(contact)
     distance = np.hypot(unit_contact[:, 0], unit_contact[:, 1])
     unit_contact[:, :2] /= np.maximum(distance, 1.0)[:, None]  # changes only positions outside the unit disk
     unit_contact[:, 2] = np.clip(unit_contact[:, 2], -1.0, 1.0)
 
-    # Polynomials of all degrees in each coordinate, shape (n, DEGREE + 1), from which those of each term are selected
+    # Polynomials of all degrees in each coordinate, shape (n, DEGREE + 1). For each term, the columns with its degrees
+    # are then selected and multiplied, shape (n, n_term).
     x_values, y_values, force_values = (chebyshev.chebvander(column, DEGREE) for column in unit_contact.T)
     degrees = _degrees()
     x_degree, y_degree, force_degree = degrees.T
@@ -74,12 +80,12 @@ def terms(contact: Array, domain: Domain) -> Array:
 
 @cache
 def _degrees() -> Integers:
-    """Return the degrees of each polynomial in x, y and ln F, shape (n_term, 3)."""
+    """Return the degrees in x, y and ln F of each term, shape (n_term, 3)."""
     all_degrees = np.indices((DEGREE + 1, DEGREE + 1, FORCE_DEGREE + 1)).reshape(3, -1).T
     total_degree = all_degrees.sum(axis=1)
     return np.asarray(all_degrees[total_degree <= DEGREE])
 
 
 def term_count() -> int:
-    """Return the number of polynomials of each electrode."""
+    """Return the number of terms of the discrepancy of each electrode."""
     return len(_degrees())

@@ -1,8 +1,9 @@
-"""Charges of presses on any film of a prior, and their derivatives with respect to the contact and the film.
+"""Charges of presses on any film of a prior, and the derivatives of these charges.
 
-A film is described by a vector of unknowns. The parameters of `FilmPrior` come first. The parameters may be followed by
-three kinds of coefficients: coefficients of the modes of imperfections, in units of their standard deviations;
-coefficients of traces that the sensor file does not describe; and coefficients of the terms of the discrepancy.
+A film is described by a vector of unknowns. The first unknowns are the parameters of `FilmPrior`. The parameters may be
+followed by coefficients, which describe modes of imperfections, traces and the discrepancy. The coefficient of a mode
+is in units of the standard deviation of the mode. The coefficients of traces describe only traces that are missing in
+the sensor file.
 `UnknownLayout` defines the order of the unknowns.
 """
 
@@ -30,25 +31,30 @@ from isocharge.train.calibration.imperfections import (
 from isocharge.train.calibration.unknowns import UnknownLayout
 
 LOAD_PARAMETERS = ("pretension", "young", "thickness")
-"""Parameters that change the stress of the film under a load. The others move electrodes or scale charges."""
+"""Parameters that change the stress of the film under a load."""
 
 NEGLIGIBLE = 1e-3
-"""Coefficient below which modes and traces are not computed, because they change the charges by less than 1e-4."""
+"""Size of the coefficients of modes and traces below which their effects are not computed.
+
+Modes and traces with smaller coefficients change the charges by less than 1e-4 of their value."""
 
 LARGEST_LOCAL_COEFFICIENT = 0.1
-"""Largest coefficient of modes and traces whose factor is assumed to be the same on neighbouring films."""
+"""Largest coefficient of modes and traces whose factor on the charges is assumed not to depend on the parameters."""
 
 MIN_FACTOR = 0.05
 """Lower bound for the factor of modes and traces. The first-order expansion is not valid for smaller factors."""
 
+MAX_CACHED_MODES = 2
+"""Number of films whose modes and mode charges are cached."""
+
 
 @dataclass(frozen=True)
 class FilmCharges(FilmMaps):
-    """Charges of all films of a prior, including the effects of imperfections, traces and discrepancy."""
+    """Model of the charges of all films of a prior, including imperfections, traces and the discrepancy."""
 
     @cached_property
     def modes(self) -> tuple[str, ...]:
-        """Names of the modes of these films. The tuple is empty if no modes of the family were solved."""
+        """Names of the modes of imperfections. The tuple is empty if no modes were computed for these films."""
         return tuple(MODES) if self.family.imperfections else ()
 
     @cached_property
@@ -58,14 +64,14 @@ class FilmCharges(FilmMaps):
 
     @cached_property
     def _mode_stds(self) -> Array:
-        """Standard deviations of the modes, in the units of the modes, shape (n_mode,)."""
+        """Standard deviation of each mode among typical films, in the unit of the mode, shape (n_mode,)."""
         return np.array([MODES[name].std for name in self.modes])
 
     @cached_property
     def _is_uneven_tension(self) -> Booleans:
         """Whether each mode is an uneven tension, shape (n_mode,).
 
-        To second order, these modes act like a lower mean tension.
+        The second-order effect of an uneven tension is the effect of a lower mean tension.
         """
         return np.array([MODES[name].is_uneven_tension for name in self.modes], dtype=bool)
 
@@ -76,18 +82,18 @@ class FilmCharges(FilmMaps):
 
     @cached_property
     def _trace_lines(self) -> Array:
-        """Ends of the lines along which traces may lie; see `trace_lines`."""
+        """Both ends of each line along which a trace may lie; see `trace_lines`."""
         return trace_lines(self.prior.sensor)
 
     def trace_widths(self, unknowns: Array, covariance: Array) -> dict[str, tuple[float, float]]:
-        """Return the total width of the traces of each electrode that the sensor file does not describe.
+        """Return the total width of the traces that are missing in the sensor file, for each electrode.
 
         Args:
             unknowns: Parameters and coefficients of a film, shape (n_parameter + n_coefficient,).
-            covariance: Covariance of the unknowns, with parameters in units of their prior standard deviations.
+            covariance: Covariance of the unknowns, in which parameters are in units of their prior standard deviations.
 
         Returns:
-            Width and its standard deviation by the name of the electrode, mm.
+            Width and standard deviation of the width, by the name of the electrode, mm.
         """
         traces = self.layout.traces
         widths, stds = trace_widths(unknowns[traces], covariance[traces, traces])
@@ -95,7 +101,7 @@ class FilmCharges(FilmMaps):
         return {name: (float(width), float(std)) for name, width, std in zip(names, widths, stds, strict=True)}
 
     def film(self, unknowns: Array) -> FunctionMap:
-        """Return the charges of one film as a function of the contact.
+        """Return the map from contacts to the charges of one film.
 
         Args:
             unknowns: Parameters of the film, shape (n_parameter,), or parameters and coefficients, shape
@@ -104,24 +110,25 @@ class FilmCharges(FilmMaps):
         forward_map = self.forward_map(unknowns[self.layout.parameters])
 
         def charges(contact: Array) -> Array:
-            """Return the charges of contacts (x, y, F), shape (n, n_electrode), pC."""
+            """Compute the charges, shape (n, n_electrode), of contacts (x, y, F), shape (n, 3)."""
             charge = forward_map.charges(contact)
             return charge * self.factor(unknowns, contact, charge)
 
         return FunctionMap(charges, forward_map.electrodes, self.domain)
 
     def factor(self, unknowns: Array, contact: Array, charge: Array | None = None) -> Array:
-        """Compute the factors by which modes, traces and discrepancy change the charges of a film.
+        """Compute the factors by which modes, traces and the discrepancy change the charges of a film.
 
-        Modes are imperfections of the film, such as an uneven tension. Traces are lines to the electrodes that collect
-        charge. The discrepancy is a polynomial of the contact for ln(factor). Modes and traces with negligible
-        coefficients are left out, because their charges take time to compute.
+        Modes are imperfections of the film, such as an uneven tension. Traces are metal lines that lead to the
+        electrodes and also collect charge. The discrepancy multiplies each charge by a factor whose logarithm is a
+        polynomial of the contact. Modes and traces are left out if all their coefficients are negligible, because the
+        computation of their charges is slow.
 
         Args:
-            unknowns: Parameters and coefficients, as in `film`.
+            unknowns: Parameters and coefficients of the film, as in `film`.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            charge: Charges without modes, traces and discrepancy, shape (n, n_electrode), pC. If None, they
-                are computed.
+            charge: Charges without modes, traces and discrepancy, shape (n, n_electrode), pC. If this argument is None,
+                the charges are computed.
 
         Returns:
             Factors, shape (n, n_electrode), dimensionless.
@@ -143,11 +150,12 @@ class FilmCharges(FilmMaps):
     def _imperfection_factor(self, unknowns: Array, contact: Array, charge: Array) -> Array:
         """Compute the factors by which modes and traces change the charges of a film.
 
-        Modes and traces add charges, so the factor is 1 plus the added charges over the charges without them. An uneven
-        tension also causes a factor of second order. The result is at least `MIN_FACTOR`.
+        Modes and traces add charges. Therefore, the factor is 1 plus the ratio of the added charges to the charges
+        without modes and traces. An uneven tension has an additional second-order effect, which multiplies this factor.
+        The result is at least `MIN_FACTOR`.
 
         Args:
-            unknowns: Parameters and coefficients, as in `film`.
+            unknowns: Parameters and coefficients of the film, as in `film`.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             charge: Charges without modes and traces, shape (n, n_electrode), pC.
 
@@ -160,12 +168,13 @@ class FilmCharges(FilmMaps):
         trace_coefficients = unknowns[layout.traces]
         factor = np.ones_like(charge)
 
-        # First order: the added charges are proportional to the coefficients.
+        # First order: the added charges are proportional to the coefficients. A Jacobian contains the charges that are
+        # added per unit of each coefficient, shape (n, n_electrode, n_coefficient).
         if np.abs(trace_coefficients).max() > NEGLIGIBLE:
             forward_map = self.forward_map(parameters)
-            trace_jacobian = trace_charges(forward_map, self._trace_lines, contact)  # shape (n, n_electrode, n_trace)
+            trace_jacobian = trace_charges(forward_map, self._trace_lines, contact)
             factor += trace_jacobian @ trace_coefficients / charge
-        if np.abs(mode_coefficients).max(initial=0.0) > NEGLIGIBLE:  # there may be no modes
+        if np.abs(mode_coefficients).max(initial=0.0) > NEGLIGIBLE:  # the initial value is used if there are no modes
             modes = self._mode_charges(parameters, contact, charge)
             factor += modes.mode_jacobian @ mode_coefficients / charge
 
@@ -179,11 +188,12 @@ class FilmCharges(FilmMaps):
         return float(unknowns[self.layout.parameter("pretension")])
 
     def _mode_charges(self, parameters: Array, contact: Array, charge: Array) -> ModeCharges:
-        """Return the effects of the modes on the charges of presses, from a cache if possible.
+        """Return the effects of the modes on the charges of presses, from the cache if possible.
 
-        The modes depend only on the film and the probe, but their charges also depend on the sensor and on the
-        contacts. A cached result is therefore returned for the same film, probe, sensor and contacts. If only film and
-        probe are the same, the modes are taken from the cache, and their charges are computed.
+        The modes depend only on the film and the probe. The charges of the modes also depend on the electrodes and
+        gains of the sensor, and on the contacts. Therefore, a cached result is returned if film, probe, sensor and
+        contacts are the same. If only the film and the probe are the same, the cached modes are used to compute the
+        charges.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -209,8 +219,13 @@ class FilmCharges(FilmMaps):
         return computed
 
     def _cache_mode_charges(self, film_and_probe: tuple[Film, Probe], computed: ModeCharges) -> None:
-        """Store a result of `_mode_charges`. The cache contains the results for at most two films."""
-        is_full = len(self._cached_modes) > 1
+        """Store a result of `_mode_charges` in the cache, and remove the oldest result if the cache is full.
+
+        Args:
+            film_and_probe: Key of the result.
+            computed: The result.
+        """
+        is_full = len(self._cached_modes) >= MAX_CACHED_MODES
         if is_full and film_and_probe not in self._cached_modes:
             oldest_key = next(iter(self._cached_modes))
             del self._cached_modes[oldest_key]
@@ -219,16 +234,17 @@ class FilmCharges(FilmMaps):
     def _computed_mode_charges(
         self, modes: ModeMap, forward_map: ForwardMap, parameters: Array, contact: Array, charge: Array
     ) -> ModeCharges:
-        """Compute the effects of the modes on the charges of presses.
+        """Compute the effects of known modes on the charges of presses.
 
         Args:
-            modes: The modes of the film.
+            modes: The modes of the film, for any electrodes and gains.
             forward_map: Forward map of the film.
             parameters: Parameters of the film, shape (n_parameter,).
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             charge: Charges of these contacts without modes, shape (n, n_electrode), pC.
         """
-        # The modes belong to a film, and are evaluated here with the electrodes and the gains of this sensor.
+        # The modes may have been computed with another sensor. They are evaluated with the electrodes and the gains of
+        # the sensor of `forward_map`.
         sensor = forward_map.sensor
         fields = replace(modes.fields, sensor=sensor) if modes.fields is not None else None
         modes_of_sensor = replace(modes, film=forward_map, fields=fields)
@@ -240,16 +256,21 @@ class FilmCharges(FilmMaps):
 
     @cached_property
     def _cached_modes(self) -> dict[tuple[Film, Probe], ModeCharges]:
-        """Cache of `_mode_charges`, by film and probe. The first entry is the oldest one."""
+        """Cache of `_mode_charges`, by film and probe. The first entry of the cache is the oldest."""
         return {}
 
     def _unevenness(self, pretension: float, mode_coefficients: Array) -> tuple[float, Array]:
-        """Return the unevenness of the tension and its derivatives; see `tension_unevenness`."""
+        """Return the unevenness of the tension of a film, and its derivatives; see `tension_unevenness`.
+
+        Args:
+            pretension: Pretension of the film, MPa.
+            mode_coefficients: Coefficients of the modes, in standard deviations, shape (n_mode,).
+        """
         tension_stds = np.where(self._is_uneven_tension, self._mode_stds, 0.0)
         return tension_unevenness(pretension, tension_stds, mode_coefficients)
 
     def charges(self, unknowns: Array, contact: Array) -> Array:
-        """Compute the charges of contacts on one film.
+        """Compute the charges of presses on one film.
 
         Args:
             unknowns: Parameters and coefficients of the film, as in `film`.
@@ -260,8 +281,8 @@ class FilmCharges(FilmMaps):
         """
         return self.film(unknowns).charges(contact)
 
-    def by_contact(self, unknowns: Array, contact: Array) -> Array:
-        """Compute the derivatives of the charges of one film with respect to (x, y, ln F).
+    def contact_slopes(self, unknowns: Array, contact: Array) -> Array:
+        """Compute the derivatives of the charges of one film with respect to the contact (x, y, ln F).
 
         Args:
             unknowns: Parameters and coefficients of the film, as in `film`.
@@ -273,90 +294,151 @@ class FilmCharges(FilmMaps):
         return differences(self.film(unknowns).charges, contact, CONTACT_STEPS)
 
     def into_domain(self, contact: Array) -> Array:
-        """Return the nearest contacts of the domain.
+        """Return the nearest contact of the domain for each of some contacts.
 
         Args:
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N. They may lie outside the domain.
+
+        Returns:
+            Contacts (x, y, F) in the domain, shape (n, 3), mm and N.
         """
         position = onto_disk(contact[:, :2], self.domain.radius)
         force = np.clip(contact[:, 2], *self.domain.force_range)
         return np.column_stack([position, force])
 
-    def by_parameter(self, unknowns: Array, contact: Array, by_contact: Array) -> Array:
+    def unknown_slopes(self, unknowns: Array, contact: Array, contact_slopes: Array) -> Array:
         """Compute the derivatives of the charges with respect to the unknowns of the film.
 
-        With the pretension T, the charges have the form E q(F / (E h a), T / E, h / a). They are linear in d31 and d32.
-        The derivatives with respect to the scales are therefore exact, and the others are finite differences. Small
-        changes of electrodes, coefficients and probe are assumed not to change the factor of the modes.
+        The charges of a film with coefficients are the charges of the film without coefficients times a factor. The
+        charges without coefficients obey scaling laws; see `parameter_jacobian`. The effect of modes on the factor is
+        assumed not to depend on the piezoelectric coefficients, the positions of the electrodes, and the radius of the
+        probe.
 
         Args:
             unknowns: Parameters of the film, shape (n_parameter,), or parameters and coefficients, shape
                 (n_parameter + n_coefficient,).
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            by_contact: Derivatives with respect to the contacts, as the method `by_contact` returns them.
+            contact_slopes: Derivatives of the charges with respect to the contacts, as the method `contact_slopes`
+                returns them.
 
         Returns:
-            Derivatives with respect to the parameters over their prior standard deviations, shape (n, n_electrode,
-            n_parameter), or with respect to parameters and coefficients, shape (n, n_electrode, n_parameter +
-            n_coefficient), pC.
+            Derivatives with respect to the parameters in units of their prior standard deviations, and with respect to
+            the coefficients if `unknowns` contains them, shape (n, n_electrode, n_parameter + n_coefficient), pC.
         """
         layout = self.layout
         parameters = unknowns[layout.parameters]
         coefficients = unknowns[layout.coefficients]
         film = self.forward_map(parameters)
         charge = film.charges(contact)
-        force_derivative = by_contact[:, :, 2]
+
+        # Derivatives of the charges of the film without coefficients. If the coefficients are not zero,
+        # `contact_slopes` includes the effect of their factor and cannot be used here.
+        force_derivative = contact_slopes[:, :, 2]
         if coefficients.any():
             force_derivative = log_force_derivative(film, contact)
-        film_jacobian = self.parameter_jacobian(film, parameters, contact, charge, force_derivative)
-        film_jacobian *= self.prior.std
+        film_jacobian = self.parameter_jacobian(film, parameters, contact, charge, force_derivative) * self.prior.std
         if not coefficients.size:
             return np.asarray(film_jacobian)
 
-        # Product rule: the charge is that of the film without coefficients times the factor of the coefficients.
-        factor = self.factor(unknowns, contact, charge)[:, :, None]
-        for name, log_derivative in self._load_slopes(unknowns, contact).items():
-            index = layout.parameter(name)
-            film_jacobian[:, :, index] += charge * log_derivative * self.prior.std[index]
-        if np.abs(unknowns[layout.traces]).max() > LARGEST_LOCAL_COEFFICIENT:
-            for name, log_derivative in self._trace_slopes(unknowns, contact).items():
-                film_jacobian[:, :, layout.parameter(name)] += charge * log_derivative
-        film_jacobian *= factor
+        # Product rule: the derivative of factor * charge is factor * (d charge + charge * d ln(factor)).
+        factor = self.factor(unknowns, contact, charge)[:, :, None]  # shape (n, n_electrode, 1)
+        film_jacobian = self._with_factor_slopes(film_jacobian, unknowns, contact, charge) * factor
 
-        # Modes add charge, and an uneven tension multiplies the charge by exp(unevenness * log_unevenness).
-        modes = self._mode_charges(parameters, contact, charge)
-        _, unevenness_slopes = self._unevenness(self._pretension(parameters), unknowns[layout.modes])
-        log_unevenness_charge = (charge * modes.log_unevenness)[:, :, None]
-        mode_jacobian = modes.mode_jacobian + factor * log_unevenness_charge * unevenness_slopes
-        # Uneven tensions are relative to E, as the pretension is, so that they contribute to the derivative of ln E.
+        # The tension of an uneven mode is relative to Young's modulus E, as the pretension is. Therefore, an uneven
+        # tension contributes to the derivative with respect to ln E.
+        mode_jacobian = self._mode_jacobian(unknowns, contact, charge, factor)
         tension_coefficients = unknowns[layout.modes] * self._is_uneven_tension
         young = layout.parameter("young")
         film_jacobian[:, :, young] -= mode_jacobian @ tension_coefficients * self.prior.std[young]
 
         trace_jacobian = trace_charges(film, self._trace_lines, contact)
-        # A coefficient of the discrepancy changes only the charge of its own electrode, so a diagonal matrix is used.
-        own_charge = factor * charge[:, :, None] * np.eye(charge.shape[1])  # shape (n, n_electrode, n_electrode)
-        term_values = terms(contact, self.domain)  # shape (n, n_term)
-        # Shape (n, n_electrode, n_term, n_electrode of the coefficient), whose last two axes are joined
-        term_products = own_charge[:, :, None, :] * term_values[:, None, :, None]
-        term_jacobian = term_products.reshape(*charge.shape, -1)
+        term_jacobian = self._term_jacobian(contact, factor[:, :, 0] * charge)
         return np.concatenate([film_jacobian, mode_jacobian, trace_jacobian, term_jacobian], axis=2)
 
+    def _with_factor_slopes(self, film_jacobian: Array, unknowns: Array, contact: Array, charge: Array) -> Array:
+        """Add the effect of the factor of modes and traces to the derivatives of the charges.
+
+        The added terms are charge * d ln(factor), as in the product rule for factor * charge.
+
+        Args:
+            film_jacobian: Derivatives of the charges without coefficients with respect to the parameters in units of
+                their prior standard deviations, shape (n, n_electrode, n_parameter), pC.
+            unknowns: Parameters and coefficients of the film.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges of these contacts without coefficients, shape (n, n_electrode), pC.
+
+        Returns:
+            Derivatives, shape (n, n_electrode, n_parameter), pC.
+        """
+        layout = self.layout
+        jacobian = film_jacobian.copy()
+        for name, log_derivative in self._load_slopes(unknowns, contact).items():
+            index = layout.parameter(name)
+            jacobian[:, :, index] += charge * log_derivative * self.prior.std[index]
+        if np.abs(unknowns[layout.traces]).max() > LARGEST_LOCAL_COEFFICIENT:
+            for name, log_derivative in self._trace_slopes(unknowns, contact).items():
+                jacobian[:, :, layout.parameter(name)] += charge * log_derivative
+        return jacobian
+
+    def _mode_jacobian(self, unknowns: Array, contact: Array, charge: Array, factor: Array) -> Array:
+        """Compute the derivatives of the charges with respect to the coefficients of the modes.
+
+        A mode adds charge. A mode of uneven tension also multiplies the charge by exp(unevenness * log_unevenness).
+
+        Args:
+            unknowns: Parameters and coefficients of the film.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges of these contacts without coefficients, shape (n, n_electrode), pC.
+            factor: Factor of the coefficients on these charges, shape (n, n_electrode, 1).
+
+        Returns:
+            Derivatives, shape (n, n_electrode, n_mode), pC.
+        """
+        parameters = unknowns[self.layout.parameters]
+        modes = self._mode_charges(parameters, contact, charge)
+        _, unevenness_slopes = self._unevenness(self._pretension(parameters), unknowns[self.layout.modes])
+        log_unevenness_charge = (charge * modes.log_unevenness)[:, :, None]
+        return np.asarray(modes.mode_jacobian + factor * log_unevenness_charge * unevenness_slopes)
+
+    def _term_jacobian(self, contact: Array, charge: Array) -> Array:
+        """Compute the derivatives of the charges with respect to the coefficients of the discrepancy.
+
+        A coefficient changes the logarithm of the charge of its own electrode by the value of its term.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges of these contacts, including the factor of the coefficients, shape (n, n_electrode), pC.
+
+        Returns:
+            Derivatives, shape (n, n_electrode, n_term * n_electrode), pC. In the last axis, the index of the electrode
+            changes fastest.
+        """
+        # Axes: contact, electrode of the charge, term, electrode of the coefficient. The two electrodes must be equal,
+        # so the derivatives are zero except on a diagonal.
+        own_charge = charge[:, :, None] * np.eye(charge.shape[1])  # shape (n, n_electrode, n_electrode)
+        term_values = terms(contact, self.domain)  # shape (n, n_term)
+        jacobian = own_charge[:, :, None, :] * term_values[:, None, :, None]
+        return jacobian.reshape(*charge.shape, -1)  # joins the axes of the coefficients
+
     def _without_terms(self, unknowns: Array) -> Array:
-        """Return parameters and coefficients of a film, with the terms of the discrepancy set to zero."""
-        film = unknowns.copy()
-        film[self.layout.terms] = 0.0
-        return film
+        """Return a copy of the unknowns of a film in which the coefficients of the discrepancy are zero.
+
+        Args:
+            unknowns: Parameters and coefficients of the film.
+        """
+        film_without_terms = unknowns.copy()
+        film_without_terms[self.layout.terms] = 0.0
+        return film_without_terms
 
     def _stepped(self, unknowns: Array, name: str) -> tuple[Array, float]:
-        """Change one parameter by a small step towards its prior mean, so that it remains within its bounds.
+        """Change one parameter by a small step. The step leads towards the prior mean, and thus away from the bounds.
 
         Args:
             unknowns: Parameters and coefficients of a film.
             name: Name of the parameter.
 
         Returns:
-            Changed parameters and coefficients, and the step in prior standard deviations.
+            Changed parameters and coefficients, and the step, in prior standard deviations of the parameter.
         """
         index = self.layout.parameter(name)
         step = -STEP if unknowns[index] > self.prior.mean[index] else STEP
@@ -365,19 +447,19 @@ class FilmCharges(FilmMaps):
         return stepped, step
 
     def _load_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
-        """Compute the derivatives of ln(factor of modes and traces) with respect to pretension, ln E and ln h.
+        """Compute the derivatives of ln(factor) with respect to the pretension, ln E and ln h.
 
-        T is the pretension, E is Young's modulus, h is the thickness, and a is the radius of the film. Like the
-        charges, the factor depends on them only through F / (E h a) and T / E. Two finite differences, one with respect
-        to ln F and one with respect to T, therefore determine all three derivatives.
+        The factor is that of modes and traces, E is Young's modulus, and h is the thickness. The factor depends on
+        these parameters only through F / (E h a) and T / E, where F is the force, a is the radius of the film, and T is
+        the pretension. Therefore, all three derivatives follow from two finite differences, with respect to ln F and T.
 
         Args:
             unknowns: Parameters and coefficients of the film.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Derivatives by the name of the parameter, each of shape (n, n_electrode). There are none if the
-            coefficients of modes and traces are small, because the derivatives are negligible then.
+            Derivatives by the name of the parameter, each of shape (n, n_electrode). The dictionary is empty if the
+            coefficients of modes and traces are small, because the derivatives are then negligible.
         """
         film = self._without_terms(unknowns)  # the discrepancy does not depend on the parameters
         if np.abs(film[self.layout.imperfections]).max() < LARGEST_LOCAL_COEFFICIENT:
@@ -394,30 +476,33 @@ class FilmCharges(FilmMaps):
         tension_step = step * self.prior.std[self.layout.parameter("pretension")]
         tension_derivative = (self.factor(film_with_tension, contact) - factor) / tension_step
 
-        # Chain rule for factor = f(F / (E h a), T / E): d/d ln h = -d/d ln F, and d/d ln E = -d/d ln F - T d/dT
+        # By the chain rule, d/d ln h = -d/d ln F and d/d ln E = -d/d ln F - T d/dT.
         derivatives = {
             "pretension": tension_derivative,
             "young": -force_derivative - self._pretension(film) * tension_derivative,
             "thickness": -force_derivative,
         }
+        # Derivatives of ln(factor)
         positive_factor = np.maximum(factor, MIN_FACTOR)
-        return {name: derivative / positive_factor for name, derivative in derivatives.items()}  # of ln(factor)
+        return {name: derivative / positive_factor for name, derivative in derivatives.items()}
 
     def _trace_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
-        """Compute the derivatives of ln(factor of traces) with respect to the parameters that do not change the load.
+        """Compute the derivatives of ln(factor of traces) with respect to the parameters outside `LOAD_PARAMETERS`.
 
-        These parameters are the piezoelectric coefficients, the place of the electrodes and the radius of the probe. A
-        trace and its electrode lie at different places, so the relative changes of their charges are different.
+        The parameters are the piezoelectric coefficients, the shift and the rotation of the electrodes, and the radius
+        of the probe. These parameters change the charge of a trace and the charge of its electrode by different ratios,
+        because the trace and the electrode lie at different places.
 
         Args:
             unknowns: Parameters and coefficients of the film.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Derivatives with respect to each parameter over its prior standard deviation, by the name of the parameter,
-            each of shape (n, n_electrode).
+            Derivatives with respect to each parameter in units of its prior standard deviation, by the name of the
+            parameter, each of shape (n, n_electrode).
         """
-        # A film with the traces alone. The factors of discrepancy and modes are assumed not to change.
+        # The factors of the discrepancy and of the modes are assumed not to depend on these parameters. They are
+        # removed, so that the factor is that of the traces alone.
         film = self._without_terms(unknowns)
         film[self.layout.modes] = 0.0
         factor = self.factor(film, contact)
@@ -427,5 +512,5 @@ class FilmCharges(FilmMaps):
                 continue
             stepped_film, step = self._stepped(film, name)
             derivative = (self.factor(stepped_film, contact) - factor) / step
-            log_derivatives[name] = derivative / np.maximum(factor, MIN_FACTOR)  # d ln f = df / f
+            log_derivatives[name] = derivative / np.maximum(factor, MIN_FACTOR)  # d ln(factor) = d factor / factor
         return log_derivatives

@@ -1,12 +1,13 @@
-"""Directions in which a calibrated film remains uncertain, for a service that follows the film.
+"""Directions in which a calibrated film remains uncertain, for a service that follows changes of the film.
 
-The result is written as `film_directions.npz`; see `serve.model.film_directions`.
+The directions are written to the file `film_directions.npz`; see `serve.model.film_directions`.
 
-At a given pretension, the other unknowns of a film have the covariance C = R R'. Let M be the derivative of the misfit
-vectors with respect to the unknowns, in units of the noise. The right singular vectors of M R are combinations of the
-unknowns. These combinations are independent before any touch, and their effects on the misfits of touches are
-orthogonal. The combinations are known as likelihood-informed directions (Cui et al., 2014). Touches hardly identify a
-combination with a small singular value. Such a combination is left out.
+A direction is a linear combination of the unknowns of the film. Let C = R R' be the covariance of the unknowns at a
+given pretension. Let M be the derivative of the misfits of touches with respect to the unknowns, in units of the noise.
+Each right singular vector of the matrix M R defines one direction. The directions are uncorrelated before any
+touch, and their effects on the misfits of touches are orthogonal. Such directions are known as likelihood-informed
+directions (Cui et al., 2014). Touches hardly determine a direction with a small singular value, so such directions are
+left out.
 """
 
 import numpy as np
@@ -19,10 +20,10 @@ from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.data.charge_field import fit_series
 
 DEGREES = ((5, 3), (3, 1), (1, 1))
-"""Degrees of the series in the position and in ln F. The first pair for which there are enough contacts is used."""
+"""Degrees of a series in the position and in ln F. The first pair for which there are enough contacts is used."""
 
 CONTACTS_PER_TERM = 2.0
-"""Least number of contacts for each coefficient of a series."""
+"""Smallest ratio of the number of contacts to the number of coefficients of a series."""
 
 LEAST_MISFIT = 0.2
 """Effect of a direction on the misfit below which the direction is left out, in units of the noise.
@@ -34,45 +35,48 @@ N_CHARGE_CONTACTS = 1200
 """Number of contacts to which the series of ln Q of the calibrated film is fitted."""
 
 CHARGE_DEGREES = (12, 3)
-"""Degrees of this series in the position and in ln F. The derivatives of the series are used as well."""
+"""Degrees in the position and in ln F of the series of ln Q. The service also uses the derivatives of this series."""
 
 MAX_DIRECTIONS = 16
-"""Largest number of directions. A larger number would increase the time that a touch takes."""
+"""Largest number of directions. With more directions, the computation for each touch would take longer."""
 
 LEAST_VARIANCE = 1e-12
-"""Variance of a combination of unknowns, relative to the largest one, below which it counts as known exactly."""
+"""Variance of a combination of unknowns, relative to the largest variance, up to which it is treated as zero."""
 
 
 def film_directions(result: CalibrationResult) -> FilmDirections:
-    """Compute the directions in which a calibrated film is uncertain when it is used.
+    """Compute the directions in which a calibrated film is uncertain at the later time when it is used.
 
-    A direction is a combination of the unknowns of the film, with a standard deviation of 1. The directions are sorted
-    by the misfit that they cause, and directions that cause only a small misfit are left out. The directions are
-    uncorrelated with the pretension, because the service estimates the pretension separately.
+    A direction is a linear combination of the unknowns of the film, whose standard deviation is 1. The direction that
+    causes the largest misfits comes first. Directions that cause only small misfits are left out. The directions
+    describe the uncertainty at a given pretension, because the service estimates the pretension separately.
 
     Args:
-        result: The calibration of the film.
+        result: Result of the calibration of the film.
     """
     problem = result.problem
     sensitivity = result.sensitivity
-    estimate = result.posterior.drifted(problem.prior)  # the film changes until it is used
+    estimate = result.posterior.drifted(problem.prior)  # the film may change before it is used
     pretension = problem.prior.index("pretension")
 
-    # Covariance C of the unknowns at a given pretension: that of all unknowns less the part due to the pretension. The
-    # root R, with C = R R', expresses the unknowns by independent variables with a standard deviation of 1.
+    # Covariance C of the unknowns at a given pretension: the covariance of all unknowns minus the part that is due to
+    # the pretension. The regression is the change of each unknown per unit change of the pretension.
     covariance = estimate.unknown_covariance
-    by_pretension = covariance[:, pretension] / covariance[pretension, pretension]  # regression on the pretension
-    root = _covariance_root(covariance - np.outer(by_pretension, covariance[pretension]))
+    pretension_regression = covariance[:, pretension] / covariance[pretension, pretension]
+    conditional_covariance = covariance - np.outer(pretension_regression, covariance[pretension])
 
-    # Each direction is a unit vector of these variables. The unknowns change by the root times this vector.
-    unknowns = slice(0, len(covariance))
-    directions = _visible_directions(sensitivity.misfit_jacobian[:, :, unknowns], root)
+    # The root R, with C = R R', expresses the unknowns by independent variables with a standard deviation of 1. Each
+    # direction is a unit vector of these variables, and the unknowns change by R times this vector.
+    root = _covariance_root(conditional_covariance)
+    film_unknowns = slice(0, len(covariance))  # the estimate may have only the first of all unknowns
+    directions = _visible_directions(sensitivity.misfit_jacobian[:, :, film_unknowns], root)
     unknown_changes = directions @ root.T  # shape (n_direction, n_unknown)
 
-    # Sum over the unknowns u, for each contact n, direction k and electrode e
-    log_changes = np.einsum("neu,ku->nke", sensitivity.log_charge_jacobian[:, :, unknowns], unknown_changes)
-    # Mean of each direction after a change of the pretension, with which the unknowns are correlated
-    mean_by_pretension = directions @ np.linalg.pinv(root) @ by_pretension
+    # Change of ln Q by each direction: sum over the unknowns u, for each contact n, direction k and electrode e
+    log_charge_jacobian = sensitivity.log_charge_jacobian[:, :, film_unknowns]
+    log_changes = np.einsum("neu,ku->nke", log_charge_jacobian, unknown_changes)
+    # Change of the mean of each direction per unit change of the pretension, shape (n_direction,)
+    mean_by_pretension = directions @ np.linalg.pinv(root) @ pretension_regression
     return FilmDirections(
         coefficients=_fitted_series(problem.domain, sensitivity.contact, log_changes),
         radius_mm=problem.domain.radius,
@@ -83,14 +87,14 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
 
 
 def _fitted_log_charge(result: CalibrationResult) -> Array | None:
-    """Fit a series to ln Q of the calibrated film.
+    """Fit a polynomial series in the contact to the logarithms of the charges of the calibrated film.
 
     Args:
-        result: The calibration of the film.
+        result: Result of the calibration of the film.
 
     Returns:
-        Coefficients of the series, shape (degree + 1, degree + 1, force_degree + 1, n_electrode). None if the film has
-        charges of both signs, which have no logarithm.
+        Coefficients of the series, shape (degree + 1, degree + 1, force_degree + 1, n_electrode). None if some charge
+        of the film is not positive and therefore has no logarithm.
     """
     problem = result.problem
     contact = spread_contacts(problem.domain, N_CHARGE_CONTACTS)
@@ -105,7 +109,8 @@ def _visible_directions(misfit_jacobian: Array, root: Array) -> Array:
     """Find the combinations of independent variables that change the misfits of touches most.
 
     The combinations are the right singular vectors of M R, where M is the misfit Jacobian and R is the root. Their
-    effects on the misfits are orthogonal. Combinations with an effect below `LEAST_MISFIT` are left out.
+    effects on the misfits are orthogonal. A combination whose effect on the misfits is below `LEAST_MISFIT` is left
+    out.
 
     Args:
         misfit_jacobian: Derivatives of the misfits of each contact with respect to the unknowns, in units of the noise,
@@ -113,31 +118,44 @@ def _visible_directions(misfit_jacobian: Array, root: Array) -> Array:
         root: Derivatives of the unknowns with respect to the independent variables, shape (n_unknown, n_variable).
 
     Returns:
-        Unit vectors, the largest misfit first, shape (n_direction, n_variable).
+        The combinations as unit vectors, shape (n_direction, n_variable). The combination with the largest effect comes
+        first.
     """
     n_contact, _, n_unknown = misfit_jacobian.shape
-    misfit_of_root = misfit_jacobian.reshape(-1, n_unknown) @ root  # one row for each misfit of each contact
-    _, misfit_norms, combinations = np.linalg.svd(misfit_of_root, full_matrices=False)
-    # A norm over all contacts is the root mean square misfit of a contact times the root of their number.
+    # Derivatives of the misfits with respect to the independent variables, shape (n * n_electrode, n_variable)
+    variable_jacobian = misfit_jacobian.reshape(-1, n_unknown) @ root
+    _, misfit_norms, combinations = np.linalg.svd(variable_jacobian, full_matrices=False)
+    # A singular value is a norm over all contacts: the root mean square misfit of a contact times the square root of
+    # the number of contacts.
     is_visible = misfit_norms > LEAST_MISFIT * np.sqrt(n_contact)
     return np.asarray(combinations[is_visible][:MAX_DIRECTIONS])
 
 
 def _covariance_root(covariance: Array) -> Array:
-    """Return a matrix R, shape (n, m) with m <= n, whose product R R' is a covariance that may be singular."""
-    variances, axes = np.linalg.eigh(covariance)
-    is_uncertain = variances > LEAST_VARIANCE * variances[-1]
-    return np.asarray(axes[:, is_uncertain] * np.sqrt(variances[is_uncertain]))
+    """Return a matrix R for which R R' is a given covariance matrix.
+
+    The covariance matrix may be singular. The matrix R has no column for an eigenvector with negligible variance.
+
+    Args:
+        covariance: Covariance matrix, shape (n, n).
+
+    Returns:
+        Matrix R, shape (n, m) with m <= n.
+    """
+    variances, eigenvectors = np.linalg.eigh(covariance)  # in ascending order of the variance
+    largest_variance = variances[-1]
+    is_uncertain = variances > LEAST_VARIANCE * largest_variance
+    return np.asarray(eigenvectors[:, is_uncertain] * np.sqrt(variances[is_uncertain]))
 
 
 def _fitted_series(domain: Domain, contact: Array, log_changes: Array) -> Array:
-    """Fit the series of `FilmDirections` to changes of ln Q.
+    """Fit a polynomial series in the contact to changes of ln Q.
 
-    The series has the highest degrees of `DEGREES` for which there are enough contacts. If there are too few contacts
-    for all of them, it has the last degrees.
+    The degrees of the series are the first pair in `DEGREES` for which there are enough contacts. If there are too few
+    contacts for every pair, the last pair is used.
 
     Args:
-        domain: Domain of the series.
+        domain: Range of positions and forces to which the variables of the series are scaled.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         log_changes: Changes of ln Q at the contacts, shape (n, n_direction, n_electrode).
 
@@ -145,6 +163,7 @@ def _fitted_series(domain: Domain, contact: Array, log_changes: Array) -> Array:
         Coefficients of the series, shape (degree + 1, degree + 1, force_degree + 1, n_direction, n_electrode).
     """
     n_contact, n_direction, n_electrode = log_changes.shape
+    # After the loop, `degree` and `force_degree` have the chosen values.
     for degree, force_degree in DEGREES:
         position_term_count = (degree + 1) * (degree + 2) // 2
         term_count = position_term_count * (force_degree + 1)

@@ -1,8 +1,8 @@
-"""Robust estimation of the film that explains measured presses.
+"""Robust estimation of a film from measured presses.
 
-`FitProblem` solves the least-squares problem. If the residual of a press is larger than noise explains, the press gets
-a lower weight, as for errors with Student's t distribution (Lange et al., 1989). A single bad press therefore does not
-change the film. Presses whose residuals are still too large are then left out and reported.
+The least-squares problem is solved by `FitProblem`. If noise alone cannot explain the residuals of a press, the weight
+of this press is reduced, as for errors with Student's t distribution (Lange et al., 1989). Therefore, a single bad
+press hardly changes the estimated film. Presses whose residuals remain too large are left out and reported.
 """
 
 from dataclasses import dataclass, field, replace
@@ -22,21 +22,21 @@ from isocharge.train.calibration.problem import FilmEstimate, Warming
 from isocharge.train.calibration.unknowns import UnknownLayout
 
 STUDENT_T_DEGREES = 4.0
-"""Degrees of freedom of the Student's t distribution from which the weights of possibly bad presses follow."""
+"""Degrees of freedom of the Student's t distribution from which the weights of presses are computed."""
 
 MAX_WEIGHTINGS = 6
-"""Largest number of rounds in which the weights are computed."""
+"""Largest number of rounds in which the weights of the presses are computed."""
 
 WEIGHT_TOLERANCE = 0.1
-"""Largest relative change of a weight at which the weighting ends."""
+"""Largest relative change of all weights at which no further round of weighting is needed."""
 
 SUSPICIOUS_PROBABILITY = 0.01
-"""Probability of the residuals, if all presses are good, below which bad presses are searched for."""
+"""Probability of the residuals, assuming that all presses are good, below which bad presses are searched for."""
 
 MAX_BAD_SHARE = 0.34
-"""Largest fraction of the presses that is left out.
+"""Largest fraction of the presses that may be left out.
 
-If more presses disagree, all presses are kept, because it is then uncertain which of them are wrong.
+If more presses disagree with the film, all presses are kept, because it is then uncertain which of them are wrong.
 """
 
 MIN_PRESSES_TO_JUDGE = 4
@@ -57,16 +57,16 @@ PROBABLE = 0.5
 
 @dataclass(frozen=True)
 class FilmPosterior(FilmEstimate):
-    """Estimate of a film from presses.
+    """Estimate of a film from presses, with the residuals of these presses.
 
     Attributes:
-        contact: Contacts of the presses adjusted to this film, (x, y, F), shape (n, 3), mm and N.
+        contact: Contacts (x, y, F) of the presses, adjusted to this film, shape (n, 3), mm and N.
         chi2: Sum of squared residuals of each press, shape (n,). For a good press it is about `degrees_of_freedom`.
         degrees_of_freedom: Number of redundant measurements of each press, shape (n,); see `_degrees_of_freedom`.
-        bad: Which presses were left out, shape (n,).
-        nuisances: Estimate of each nuisance of the session, by its name.
-        force_scatter: Relative standard deviation of the forces in addition to that of the rig.
-        probabilities: Probability of each hypothesis about effects besides the parameters of the film.
+        bad: Whether each press was left out as bad, shape (n,).
+        nuisances: Estimate of each nuisance of the session, by the name of the nuisance.
+        force_scatter: Standard deviation of the forces in addition to that of the rig, relative to the force.
+        probabilities: Probability of each hypothesis about effects that the parameters of the film do not describe.
     """
 
     contact: Array = field(kw_only=True)
@@ -79,20 +79,28 @@ class FilmPosterior(FilmEstimate):
 
     @property
     def total(self) -> tuple[float, float]:
-        """Sum of the squared residuals of all good presses, and the sum of their degrees of freedom."""
+        """Sum of the squared residuals, and sum of the degrees of freedom, of all presses that were not left out."""
         return float(self.chi2[~self.bad].sum()), float(self.degrees_of_freedom[~self.bad].sum())
 
     @property
     def imperfect(self) -> bool:
-        """Whether the film probably has imperfections or a discrepancy that its parameters do not describe."""
+        """Whether the film probably has imperfections or a discrepancy."""
         return self._probability_of_any("modes", "discrepancy") > PROBABLE
 
     def probability(self, effect: str) -> float:
-        """Return the probability that the session has an effect; see `Hypothesis.has`."""
+        """Return the probability that the session has an effect.
+
+        Args:
+            effect: Name of the effect, as in `Hypothesis.has`.
+        """
         return self._probability_of_any(effect)
 
     def _probability_of_any(self, *effects: str) -> float:
-        """Return the probability that the session has at least one of several effects."""
+        """Return the probability that the session has at least one of several effects.
+
+        Args:
+            effects: Names of the effects, as in `Hypothesis.has`.
+        """
         return sum(
             probability
             for hypothesis, probability in self.probabilities.items()
@@ -100,10 +108,10 @@ class FilmPosterior(FilmEstimate):
         )
 
     def scaled(self, factor: float) -> "FilmPosterior":
-        """Return the estimate with all variances multiplied by a factor.
+        """Return a copy of the estimate in which all variances are multiplied by a factor.
 
         Args:
-            factor: Factor on the variances.
+            factor: Factor on all variances and covariances.
         """
         warming = self.warming
         if warming is not None:
@@ -114,8 +122,8 @@ class FilmPosterior(FilmEstimate):
     def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> FilmEstimate:
         """Return the estimate for a later time; see `FilmEstimate.drifted`.
 
-        If the film probably has neither imperfections nor a discrepancy, the estimate contains only the parameters of
-        the film.
+        If the film probably has neither imperfections nor a discrepancy, the returned estimate contains only the
+        parameters of the film, without coefficients.
 
         Args:
             prior: Distribution of the films.
@@ -140,15 +148,16 @@ def fit_film(
     *,
     friction: float = 0.0,
 ) -> FilmPosterior:
-    """Estimate the film from presses, and leave out bad presses.
+    """Estimate a film from presses, without presses that were probably recorded wrongly.
 
-    The film is fitted to all presses first. If some residuals are too large, the presses that agree with each other are
-    searched for, and only they are fitted. These fits assume that the parameters of the film explain the presses alone.
-    Further fits then consider hypotheses, which are combinations of other effects, such as imperfections of the film.
+    First, the film is fitted to all presses. If some residuals are too large, the film is fitted again to only those
+    presses that agree with each other. Both fits assume that the parameters of the film alone explain the presses.
+    Further fits also consider hypotheses. A hypothesis is a combination of other effects, such as imperfections of the
+    film.
 
     Args:
-        charges: The films.
-        data: The presses.
+        charges: Model of the charges of all films.
+        data: The measured presses.
         initial: Estimate of the film before the presses.
         at_C: Temperature for which the initial estimate and the result hold, degrees Celsius; None if temperatures were
             not measured.
@@ -159,20 +168,20 @@ def fit_film(
     every_press = np.ones(len(data), dtype=bool)
     no_effects = Hypothesis()  # the hypothesis that the parameters alone explain the presses
 
-    # Fit all presses, and find the good ones among them if some residuals are too large.
+    # Fit all presses with the weight 1. If some residuals are too large, find and fit the presses that agree.
     is_kept = every_press
-    solved = problem.solve(data, is_kept, problem.mean, no_effects)
+    solved = problem.solve(data, np.ones(len(data)), problem.mean, no_effects)
     can_be_judged = len(data) >= MIN_PRESSES_TO_JUDGE
     if can_be_judged and _is_suspicious(solved.contacts.chi2, degrees_of_freedom):
         is_kept, start = _agreeing_presses(problem, data, solved, degrees_of_freedom)
         kept_data = data[is_kept]
         solved = problem.solve(kept_data, np.ones(len(kept_data)), start, no_effects)
 
-    # Repeat the fit with the most probable hypothesis until the film and the selection of presses no longer change.
+    # Repeat the fit with the most probable hypothesis until neither the film nor the selection of presses changes.
     settled = problem.settle(data, is_kept, degrees_of_freedom, solved, no_effects)
 
-    # If the film has imperfections, the presses that were left out may be good ones. The film is fitted to all presses
-    # if this is more probable than that these presses were recorded wrongly.
+    # If the film has imperfections, the presses that were left out may be good. The film is fitted to all presses if it
+    # is more probable that all presses are good than that the presses left out were recorded wrongly.
     if not settled.is_kept.all():
         unknowns = settled.solved.unknowns
         film_with_all_presses = SolvedFilm(unknowns, problem.adjusted_contacts(unknowns, data))
@@ -193,17 +202,17 @@ def refit_film(
     *,
     friction: float = 0.0,
 ) -> FilmPosterior:
-    """Estimate the film from presses, with a search that begins at an estimate from similar presses.
+    """Estimate a film from presses, with a search that begins at a previous estimate from similar presses.
 
-    The search also begins with the most probable hypothesis of the previous estimate. It takes less time than
+    The first fit assumes the most probable hypothesis of the previous estimate. This function takes less time than
     `fit_film`.
 
     Args:
-        charges: The films.
-        data: The presses. None of them is left out.
+        charges: Model of the charges of all films.
+        data: The presses. No press is left out.
         initial: Estimate of the film before the presses.
-        previous: Previous estimate, which explains most of these presses.
-        at_C: Temperature for which all estimates hold, degrees Celsius; None if temperatures were not measured.
+        previous: Previous estimate of the film, from similar presses.
+        at_C: Temperature for which all these estimates hold, degrees Celsius; None if temperatures were not measured.
         friction: Expected coefficient of friction of the presses; 0 for presses without friction.
     """
     problem = FitProblem.of(charges, initial, knows_temperature=at_C is not None, friction=friction)
@@ -216,11 +225,11 @@ def refit_film(
     start[layout.nuisances] = [previous.nuisances[nuisance.name].value for nuisance in NUISANCES]
 
     # A hypothesis is a combination of effects that the parameters of the film do not describe.
-    every_press = np.ones(len(data), dtype=bool)
     most_probable = max(previous.probabilities, key=lambda hypothesis: previous.probabilities[hypothesis])
-    solved = problem.solve(data, every_press, start, most_probable)
+    solved = problem.solve(data, np.ones(len(data)), start, most_probable)
 
-    # With the hypothesis without effects, `settle` begins with the solved film instead of another fit.
+    # With the hypothesis without effects, `settle` uses the solved film for its first round instead of another fit.
+    every_press = np.ones(len(data), dtype=bool)
     degrees_of_freedom = _degrees_of_freedom(data)
     settled = problem.settle(data, every_press, degrees_of_freedom, solved, Hypothesis())
     return _posterior(problem, data, degrees_of_freedom, settled, at_C)
@@ -229,7 +238,11 @@ def refit_film(
 def _degrees_of_freedom(data: PressData) -> Array:
     """Return the number of redundant measurements of each press, shape (n,).
 
-    Three of the measured charges and coordinates determine the contact. All others are redundant.
+    Three of the measured charges and coordinates determine the contact of a press. All further measurements are
+    redundant.
+
+    Args:
+        data: The measured presses.
     """
     return np.asarray(np.maximum(data.measured.sum(axis=1) - 3.0, 0.0))
 
@@ -241,6 +254,7 @@ def _is_suspicious(chi2: Array, degrees_of_freedom: Array) -> bool:
         chi2: Sum of squared residuals of each press, shape (n,).
         degrees_of_freedom: Number of redundant measurements of each press, shape (n,).
     """
+    # The distribution is not defined for zero degrees of freedom. Presses without redundancy have almost no residuals.
     press_probability = chi_square.probability_above(chi2, np.maximum(degrees_of_freedom, 1.0))
     # The smallest of n probabilities is multiplied by n, because the worst press is selected among n (Bonferroni).
     worst_press_probability = press_probability.min() * len(chi2)
@@ -251,19 +265,19 @@ def _is_suspicious(chi2: Array, degrees_of_freedom: Array) -> bool:
 def _agreeing_presses(
     problem: FitProblem, data: PressData, solved: SolvedFilm, degrees_of_freedom: Array
 ) -> tuple[Booleans, Array]:
-    """Find the film with which most presses agree, and the presses that agree with it.
+    """Find the film with which most presses agree, and the presses that agree with this film.
 
-    The film is fitted repeatedly. Presses with large residuals get smaller weights, as for errors with Student's t
-    distribution.
+    The film is fitted repeatedly. Before each fit, presses with large residuals get smaller weights, as for errors with
+    Student's t distribution.
 
     Args:
         problem: The least-squares problem.
-        data: The presses.
-        solved: The film that explains all presses best.
+        data: The measured presses.
+        solved: The film from a fit to all presses with equal weights.
         degrees_of_freedom: Number of redundant measurements of each press, shape (n,).
 
     Returns:
-        Which presses agree with the film, shape (n,), and the unknowns of the film, shape (n_unknown,).
+        Whether each press agrees with the film, shape (n,), and the unknowns of the film, shape (n_unknown,).
     """
     weight = np.ones(len(data))
     for _ in range(MAX_WEIGHTINGS):
@@ -276,34 +290,38 @@ def _agreeing_presses(
 
 
 def _is_good(chi2: Array, degrees_of_freedom: Array) -> Booleans:
-    """Return which presses agree with a film, shape (n,). If most presses do not agree, all count as good.
+    """Return whether each press agrees with a film, shape (n,).
 
-    A press agrees if chance explains its residuals with a probability of `BAD_PROBABILITY` or more, corrected for the
-    number of presses (Bonferroni).
+    A press agrees if the sum of its squared residuals does not exceed a limit. A good press exceeds the limit with the
+    probability `BAD_PROBABILITY` divided by the number of presses (Bonferroni correction). The limit is increased if
+    the residuals of all presses are larger than expected. If more than `MAX_BAD_SHARE` of the presses exceed the limit,
+    all presses count as good.
 
     Args:
         chi2: Sum of squared residuals of each press, shape (n,).
         degrees_of_freedom: Number of redundant measurements of each press, shape (n,).
     """
-    # The distribution is not defined for zero degrees of freedom. Presses without redundancy have no residuals.
+    # The distribution is not defined for zero degrees of freedom. Presses without redundancy have almost no residuals.
     positive_degrees = np.maximum(degrees_of_freedom, 1.0)
     limit = chi_square.value_exceeded_with(BAD_PROBABILITY / len(chi2), positive_degrees)
 
-    # The residuals of all presses may be larger than expected. The limit is then increased by the same factor.
+    # If the residuals of all presses are larger than expected, the limit is increased by the median of their ratios.
     expected_median = np.maximum(chi_square.value_exceeded_with(0.5, positive_degrees), 0.1)
     typical_ratio = max(1.0, float(np.median(chi2 / expected_median)))
     is_good = chi2 <= limit * typical_ratio
-    if np.mean(~is_good) > MAX_BAD_SHARE:  # no film explains most presses: leave out none of them
+    if np.mean(~is_good) > MAX_BAD_SHARE:  # it is uncertain which presses are wrong, so none is left out
         return np.ones_like(is_good)
     return np.asarray(is_good)
 
 
 def _log_density_of_mistakes(data: PressData, is_mistake: Booleans) -> float:
-    """Return the logarithm of the probability density of presses that were recorded wrongly.
+    """Return the logarithm of the probability density of some presses, assuming that they were recorded wrongly.
+
+    The density includes the prior probability that these presses were recorded wrongly.
 
     Args:
         data: All presses.
-        is_mistake: Which presses were recorded wrongly, shape (n,).
+        is_mistake: Whether each press is assumed to be recorded wrongly, shape (n,).
     """
     charge_count = data.has_charge[is_mistake].sum()
     log_density_of_charges = LOG_DENSITY_OF_MISTAKE * charge_count
@@ -314,30 +332,31 @@ def _log_density_of_mistakes(data: PressData, is_mistake: Booleans) -> float:
 def _posterior(
     problem: FitProblem, data: PressData, degrees_of_freedom: Array, settled: SettledFit, at_C: float | None
 ) -> FilmPosterior:
-    """Compute the estimate of the film from a fit that has settled.
+    """Create the estimate of a film from the result of the last fit.
 
     Args:
         problem: The least-squares problem.
         data: All presses.
         degrees_of_freedom: Number of redundant measurements of each press, shape (n,).
-        settled: The settled fit.
+        settled: Result of `FitProblem.settle`.
         at_C: Temperature of the film, degrees Celsius; None if temperatures were not measured.
     """
     layout = problem.layout
     mixture = settled.mixture  # average over all hypotheses, as a difference from the mean before the presses
     unknowns = np.clip(problem.mean + mixture.mean, *problem.bounds)
 
-    # Root-mean-square scatter of the forces over the hypotheses
+    # Root-mean-square scatter of the forces over all hypotheses, weighted by their probabilities
     scatter_variance = sum(
         probability * hypothesis.force_scatter**2 for hypothesis, probability in mixture.probabilities.items()
     )
     force_scatter = float(np.sqrt(scatter_variance))
 
-    # The contacts of the fit are a good start only if they include those of all presses.
+    # The contacts of the fit can be used as a start only if no press was left out of the fit.
     start = settled.solved.contacts.contact if settled.is_kept.all() else None
     contacts = problem.adjusted_contacts(unknowns, data.with_force_scatter(mixture.best.force_scatter), start)
 
-    # The unknowns are those of the film, which are reported with their covariance, and nuisances of the session.
+    # The unknowns of the film come first, followed by the nuisances of the session. The estimate contains the joint
+    # covariance of the unknowns of the film, but only the standard deviations of the nuisances.
     nuisances = _nuisance_estimates(layout, unknowns, mixture.covariance)
     joint = mixture.covariance[layout.film, layout.film] + problem.gain_covariance(nuisances, force_scatter)
     warming = None
@@ -362,7 +381,13 @@ def _posterior(
 
 
 def _nuisance_estimates(layout: UnknownLayout, unknowns: Array, covariance: Array) -> dict[str, NuisanceEstimate]:
-    """Return the value and the standard deviation of each nuisance by its name."""
+    """Return the estimated value and standard deviation of each nuisance, by the name of the nuisance.
+
+    Args:
+        layout: Layout of the unknowns.
+        unknowns: Estimated unknowns, shape (n_unknown,).
+        covariance: Covariance of the unknowns, shape (n_unknown, n_unknown).
+    """
     values = unknowns[layout.nuisances].tolist()
     stds = np.sqrt(np.diag(covariance)[layout.nuisances]).tolist()
     return {

@@ -1,7 +1,7 @@
-"""Charges of presses on the perfect films of a prior, and their derivatives with respect to the parameters.
+"""Charges of presses on the perfect films of a prior, and the derivatives of these charges.
 
-A perfect film has no imperfections, no traces that the sensor file does not describe, and no discrepancy. A perfect
-film is described by the parameters of `FilmPrior` alone.
+A perfect film has no imperfections, no traces that are missing in the sensor file, and no discrepancy. The parameters
+of `FilmPrior` describe a perfect film completely.
 """
 
 from dataclasses import dataclass, replace
@@ -16,20 +16,23 @@ from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.sensor.film_prior import PARAMETERS, SHARED, FilmPrior
 
 STEP = 0.005
-"""Step of the finite differences with respect to a parameter, in standard deviations of its prior."""
+"""Step of the finite differences with respect to a parameter, in prior standard deviations of the parameter."""
 
 STEPPED = tuple(parameter.name for parameter in PARAMETERS if parameter.derivative == "difference")
 """Names of the parameters whose derivatives are computed as finite differences."""
 
 CONTACT_STEPS = (5e-3, 5e-3, 1e-3)
-"""Steps of the finite differences in x and y (mm) and in ln F. They are small, because the domain is reduced by a
-step."""
+"""Steps of the finite differences in x, y (mm) and ln F.
+
+The steps are small, because the domain is reduced by one step to leave a margin for the finite differences."""
 
 CACHED_MAPS = 8
-"""Number of forward maps that are cached."""
+"""Largest number of forward maps that are cached."""
 
 EDGE = 1.0 - 1e-6
-"""Share of the radius and of the forces of the family within which presses are evaluated."""
+"""Fraction of the largest radius and force of the family up to which charges are computed.
+
+It is slightly below 1, so that rounding errors do not lead outside the family."""
 
 FORCE_MARGIN = 1.01
 """Factor by which the range of forces is reduced at both ends, for the finite differences with respect to the force."""
@@ -37,11 +40,11 @@ FORCE_MARGIN = 1.01
 
 @dataclass(frozen=True)
 class FilmMaps:
-    """Forward maps of the perfect films of a prior.
+    """Forward maps of the perfect films of a prior. A forward map computes the charges of contacts.
 
     Attributes:
         prior: Distribution of the films, which declares the parameters.
-        family: Solved films, between which the forward maps are interpolated.
+        family: Films that were simulated in advance. The forward maps of other films are interpolated between them.
     """
 
     prior: FilmPrior
@@ -49,20 +52,21 @@ class FilmMaps:
 
     @cached_property
     def domain(self) -> Domain:
-        """Contacts for which every film of the prior has charges, with a margin for the finite differences.
+        """Range of contacts for which the charges of every film of the prior can be computed.
 
-        The stiffest film limits the smallest force, and the softest film limits the largest force.
+        The range leaves a margin for finite differences. The stiffest film determines the smallest force, and the
+        softest film determines the largest force.
         """
         film = self.prior.sensor.film
         young = self.prior.index("young")
         thickness = self.prior.index("thickness")
-        # The parameters of Young's modulus and thickness are logarithms of factors.
+        # The parameters "young" and "thickness" are logarithms of factors relative to the described film.
         stiffness = film.young * film.thickness * film.radius
         lower, upper = self.prior.bounds
         min_stiffness = stiffness * np.exp(lower[young] + lower[thickness])
         max_stiffness = stiffness * np.exp(upper[young] + upper[thickness])
 
-        # The family is limited in the distance over the radius, and in the load F / (E h a).
+        # The family is limited in the distance from the centre divided by the radius a, and in the load F / (E h a).
         _, max_distance = self.family.limits["distance"]
         min_load, max_load = self.family.limits["load"]
         position_step, _, _ = CONTACT_STEPS
@@ -75,9 +79,9 @@ class FilmMaps:
     def forward_map(self, parameters: Array) -> ForwardMap:
         """Return the forward map of one film.
 
-        Films that differ only in piezoelectric coefficients, gains and electrodes have the same stresses. The forward
-        maps are therefore cached by film and probe, and a cached map is returned with the requested sensor. At most
-        `CACHED_MAPS` maps are kept.
+        Films that differ only in piezoelectric coefficients, gains and electrodes have the same stresses. Therefore,
+        the forward maps are cached by film and probe. A cached map is returned with the sensor that belongs to the
+        given parameters. The cache contains at most `CACHED_MAPS` maps.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -93,16 +97,18 @@ class FilmMaps:
 
     @cached_property
     def _maps(self) -> dict[tuple[Film, Circle], ForwardMap]:
-        """Cache of `forward_map`, by film and probe. The first entry is the oldest one."""
+        """Cache of `forward_map`, by film and probe. The first entry of the cache is the oldest."""
         return {}
 
     def parameter_jacobian(
         self, film: ForwardMap, parameters: Array, contact: Array, charge: Array, force_derivative: Array
     ) -> Array:
-        """Compute the derivatives of the charges of a film with respect to the parameters.
+        """Compute the derivatives of the charges of a film with respect to its parameters.
 
-        Only some derivatives need finite differences. The other derivatives follow from the scaling laws of the film,
-        and from the fact that the charges are linear in d31, d32 and the gains.
+        Only some derivatives need finite differences. The other derivatives follow from scaling laws of the charges,
+        and from the linear dependence of the charges on d31, d32 and the gains. The charges have the form
+        E q(F / (E h a), T / E, h / a), where E is Young's modulus, F is the force, h is the thickness, a is the radius
+        of the film, and T is the pretension.
 
         Args:
             film: Forward map of the film.
@@ -117,8 +123,8 @@ class FilmMaps:
         pretension = parameters[self.prior.index("pretension")]
         derivatives = {name: self.difference(name, parameters, contact, charge) for name in STEPPED}
 
-        # Chain rule for Q = E q(F / (E h a), T / E, h / a), with respect to ln E and ln h. The finite difference for
-        # "thickness" is computed at a constant load F / (E h a), so the change of the load is added here.
+        # Chain rule for the charge E q(F / (E h a), T / E, h / a), with respect to ln E and ln h. The finite difference
+        # for "thickness" is computed at a constant load F / (E h a), so the effect of the load is added here.
         derivatives["young"] = charge - force_derivative - pretension * derivatives["pretension"]
         derivatives["thickness"] = derivatives["thickness"] - force_derivative
 
@@ -139,8 +145,8 @@ class FilmMaps:
     def difference(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
         """Compute the derivative of the charges with respect to one parameter by a finite difference.
 
-        The derivative with respect to ln h is computed at a constant load F / (E h a), so that it contains only the
-        effect of bending.
+        If the parameter is the thickness h, the force F changes in proportion to h. The load F / h is then constant,
+        and the derivative contains only the effect of bending.
 
         Args:
             name: Name of the parameter.
@@ -154,11 +160,11 @@ class FilmMaps:
         index = self.prior.index(name)
         _, upper_bounds = self.prior.bounds
         step = STEP * self.prior.std[index]
-        if parameters[index] + step > upper_bounds[index]:
+        if parameters[index] + step > upper_bounds[index]:  # keep the changed parameter within its bounds
             step = -step
         stepped = parameters.copy()
         stepped[index] += step
-        rounded_step = stepped[index] - parameters[index]  # the change that floating-point numbers really have
+        rounded_step = stepped[index] - parameters[index]  # the step after rounding to floating-point numbers
         stepped_contact = contact
         if name == "thickness":
             stepped_contact = contact * [1.0, 1.0, np.exp(rounded_step)]  # keeps F / h constant

@@ -1,11 +1,11 @@
-"""Least-squares problem of a calibration, whose solution is the film that explains presses best.
+"""Least-squares problem of a calibration, whose solution is the film that explains the presses best.
 
-The unknowns p minimise the sum of two parts. The first part contains the squared residuals of the charges and of the
-rig. The residuals of each press are computed at the contact where the sum of their squares is smallest. The second part
-is the prior, |(p - mean) / std|^2.
+The solution is the vector of unknowns p that minimises the sum of two parts. The first part is the sum of the squared
+residuals of all presses. Each measured charge and each coordinate that the rig measured has one residual. The second
+part is (p - mean)' C^-1 (p - mean), where mean and C are the prior mean and the prior covariance of the unknowns.
 
-The problem is solved by SciPy's trust-region method. The contacts are eliminated in every step (variable projection,
-Golub and Pereyra 1973), so that only the unknowns of the film remain.
+The problem is solved by SciPy's trust-region method. In every step, the contacts of the presses are adjusted to the
+film with the unknowns p (variable projection, Golub and Pereyra 1973). Therefore, only p has to be searched for.
 """
 
 from dataclasses import dataclass
@@ -48,7 +48,7 @@ from isocharge.train.calibration.problem import FilmEstimate
 from isocharge.train.calibration.unknowns import UnknownLayout
 
 BAD_PROBABILITY = 1e-4
-"""Probability with which a good press has a larger residual than the limit for bad presses."""
+"""Probability with which a good press has a larger sum of squared residuals than the limit for bad presses."""
 
 TOLERANCE = 1e-4
 """Relative change of the sum of squares, or of the unknowns, at which a fit ends."""
@@ -60,24 +60,26 @@ MAX_ROUNDS = 3
 """Largest number of fits. Each fit uses the most probable hypothesis of the previous fit."""
 
 MEAN_OVER_STD = 1.7
-"""Mean of an effect that only lowers charges at random, such as a leak, over its standard deviation.
+"""Ratio of mean to standard deviation of an effect that only lowers charges at random, such as a leak.
 
-The value is that of a share with a uniform distribution from zero upwards. Presses cannot distinguish the mean of such
-an effect from a gain.
+The ratio is that of a uniform distribution that begins at zero. Presses cannot distinguish the mean of such an effect
+from a gain.
 """
 
 MAX_LINEAR_STEP = 0.2
 """Largest step of a parameter, in prior standard deviations, for which the derivatives are not computed again."""
 
 SMALLEST_DERIVATIVE = 1e-12
-"""Smallest length by which the derivatives of the residuals with respect to the force are divided."""
+"""Smallest length by which the vector of derivatives of the residuals of a press is divided."""
 
 BOUND_MARGIN = 1e-3
-"""Smallest distance of a start from the bounds, in standard deviations, because the method must start inside them."""
+"""Smallest distance from the bounds at which a search begins, in prior standard deviations.
+
+SciPy's method must begin strictly inside the bounds."""
 
 
 class SolvedFilm(NamedTuple):
-    """The film that explains presses best.
+    """Film that explains measured presses best, with the contacts of these presses.
 
     Attributes:
         unknowns: Unknowns of the film, shape (n_unknown,). Parameters are in units of their prior standard deviations.
@@ -92,8 +94,8 @@ class SettledFit(NamedTuple):
     """Result of repeated fits of a film, as `FitProblem.settle` returns it.
 
     Attributes:
-        is_kept: Which presses are kept, shape (n,).
-        solved: The film that explains the kept presses best.
+        is_kept: Whether each press was used in the last fit, shape (n,). The other presses were left out as bad.
+        solved: The film that explains the kept presses best, under the hypothesis of the last fit.
         mixture: Estimate of the unknowns, averaged over all hypotheses.
     """
 
@@ -104,10 +106,10 @@ class SettledFit(NamedTuple):
 
 @dataclass(frozen=True)
 class FitProblem:
-    """Films, and the estimate of their unknowns before the presses.
+    """Least-squares problem of a calibration: the possible films, and the prior of their unknowns.
 
     Attributes:
-        charges: The films.
+        charges: Model of the charges of all films.
         mean: Mean of the unknowns before the presses, shape (n_unknown,). Parameters are in units of their prior
             standard deviations.
         covariance: Covariance of the unknowns before the presses without a hypothesis, shape (n_unknown, n_unknown).
@@ -121,23 +123,25 @@ class FitProblem:
     def of(
         cls, charges: FilmCharges, initial: FilmEstimate, *, knows_temperature: bool, friction: float = 0.0
     ) -> "FitProblem":
-        """Return the problem of a film, with the mean and the covariance of all unknowns before the presses.
+        """Create the problem from an estimate of the film before the presses.
 
-        Unknowns without a prior variance stay at their mean, unless a hypothesis adds a variance.
+        In a fit, an unknown whose prior variance is zero keeps its mean, unless the hypothesis of the fit adds a
+        variance.
 
         Args:
-            charges: The films.
-            initial: Estimate of the film before the presses. Coefficients that it does not have are zero.
-            knows_temperature: Whether the temperatures of the presses are known, so that the nuisances of temperature
-                are unknowns.
-            friction: Expected coefficient of friction, which is also its standard deviation; 0 for presses without
-                friction.
+            charges: Model of the charges of all films.
+            initial: Estimate of the film before the presses. If it has no coefficients, their mean and variance are
+                zero.
+            knows_temperature: Whether the temperatures of the presses are known. If they are known, the nuisances that
+                describe the effects of temperature get a variance.
+            friction: Expected coefficient of friction, which is also its prior standard deviation; 0 for presses
+                without friction.
         """
         layout = charges.layout
         mean = np.zeros(layout.count)
         covariance = np.zeros((layout.count, layout.count))
 
-        # The unknowns of the film come first: the parameters, and the coefficients if the estimate has them.
+        # The first unknowns are those of the film: the parameters, and the coefficients if the estimate has them.
         film_unknowns = slice(0, initial.unknowns.size)
         mean[layout.parameters] = initial.parameters / charges.prior.std
         if initial.coefficients.size:
@@ -148,6 +152,7 @@ class FitProblem:
             for nuisance in NUISANCES:
                 index = layout.nuisance(nuisance.name)
                 covariance[index, index] = nuisance.std_with_temperatures**2
+        # An earlier calibration may have determined the change of the pretension with temperature.
         if knows_temperature and initial.warming is not None:
             change_index = layout.nuisance(PRETENSION_PER_KELVIN.name)
             mean[change_index] = initial.warming.MPa_per_K
@@ -162,7 +167,7 @@ class FitProblem:
 
     @property
     def layout(self) -> UnknownLayout:
-        """Indices of the unknowns in the vector of unknowns."""
+        """Layout of the vector of unknowns, with the index of each unknown."""
         return self.charges.layout
 
     @cached_property
@@ -180,76 +185,33 @@ class FitProblem:
         upper[layout.parameters] = parameter_upper / prior.std
         return lower, upper
 
-    def solve(self, data: PressData, weight: Array | Booleans, start: Array, hypothesis: Hypothesis) -> SolvedFilm:
-        """Return the film that explains weighted presses best.
+    def solve(self, data: PressData, weight: Array, start: Array, hypothesis: Hypothesis) -> SolvedFilm:
+        """Fit the film to weighted presses under a hypothesis.
 
         Args:
-            data: The presses.
+            data: The measured presses.
             weight: Weight of the squared residuals of each press, shape (n,).
             start: Unknowns at which the search begins, shape (n_unknown,).
-            hypothesis: Effects that the session may have. Unknowns that the hypothesis excludes stay at their mean.
+            hypothesis: Effects that the session may have. Unknowns without a variance under this hypothesis keep their
+                mean.
+
+        Returns:
+            The film that explains the presses best.
         """
-        data = data.with_force_scatter(hypothesis.force_scatter)
-        root_weight = np.sqrt(weight)  # the residuals are multiplied by the root, because their squares are weighted
-
-        # Only unknowns with a variance are active, that is, changed by the fit.
-        covariance = self._prior_covariance(hypothesis)
-        active = np.diag(covariance) > 0.0
-        active_covariance = covariance[np.ix_(active, active)]
-        has_coefficients = bool(active[self.layout.coefficients].any())
-        lower, upper = (bound[active] for bound in self.bounds)
-        # The whitening matrix converts deviations from the prior mean into residuals with the variance 1.
-        whitening = np.linalg.inv(np.linalg.cholesky(active_covariance))
-        latest: tuple[Array, SolvedFilm] | None = None
-
-        def film_at(active_unknowns: Array) -> SolvedFilm:
-            """Return the film with given unknowns, and the contacts that agree best with this film.
-
-            The latest film is stored, because SciPy evaluates the residuals and the derivatives of each film
-            separately. The search for the contacts begins at the contacts of the latest film.
-
-            Args:
-                active_unknowns: The unknowns that the hypothesis includes, shape (n_active,). The others have their
-                    mean.
-            """
-            nonlocal latest
-            start_of_contacts = None
-            if latest is not None:
-                latest_unknowns, latest_film = latest
-                if np.array_equal(latest_unknowns, active_unknowns):
-                    return latest_film
-                start_of_contacts = latest_film.contacts.contact
-            unknowns = self.mean.copy()
-            unknowns[active] = active_unknowns
-            film = SolvedFilm(unknowns, self.adjusted_contacts(unknowns, data, start_of_contacts))
-            latest = (active_unknowns.copy(), film)
-            return film
-
-        def residual(active_unknowns: Array) -> Array:
-            """Return the residuals of all presses and of the prior, shape (n_residual,)."""
-            press_residual = film_at(active_unknowns).contacts.residual * root_weight[:, None]
-            prior_residual = whitening @ (active_unknowns - self.mean[active])
-            return np.concatenate([press_residual.ravel(), prior_residual])
-
-        def jacobian(active_unknowns: Array) -> Array:
-            """Return the derivatives of the residuals of all presses and of the prior, shape (n_residual, n_active)."""
-            film = film_at(active_unknowns)
-            derivatives = self.derivatives(film, data, with_coefficients=has_coefficients)
-            press_rows = derivatives[:, :, active] * root_weight[:, None, None]
-            return np.concatenate([press_rows.reshape(-1, active_unknowns.size), whitening])
-
-        start_inside = np.clip(start[active], lower + BOUND_MARGIN, upper - BOUND_MARGIN)
+        fit = _FilmFit(self, data, weight, hypothesis)
+        lower, upper = (bound[fit.active] for bound in self.bounds)
+        start_inside = np.clip(start[fit.active], lower + BOUND_MARGIN, upper - BOUND_MARGIN)
         result = least_squares(
-            residual,
+            fit.residual,
             start_inside,
-            jacobian,
+            fit.jacobian,
             bounds=(lower, upper),
             x_scale=1.0,
             ftol=TOLERANCE,
             xtol=TOLERANCE,
             max_nfev=MAX_STEPS,
         )
-        return film_at(result.x)
+        return fit.film_at(result.x)
 
     def settle(
         self,
@@ -259,18 +221,18 @@ class FitProblem:
         solved: SolvedFilm,
         hypothesis: Hypothesis,
     ) -> SettledFit:
-        """Repeat the fit until the film and the selection of presses no longer change, at most `MAX_ROUNDS` times.
+        """Repeat the fit until neither the film nor the selection of presses changes, but at most `MAX_ROUNDS` times.
 
-        Each round fits the film with the most probable hypothesis of the previous round. A hypothesis is a combination
-        of effects that the parameters of the film do not describe. Presses that were left out before are used again if
-        they now agree with the film.
+        Each round fits the film under the most probable hypothesis of the previous round. A hypothesis is a combination
+        of effects that the parameters of the film do not describe. A press that was left out in an earlier round is
+        used again if it agrees with the new film.
 
         Args:
             data: All presses.
-            is_kept: Which presses are kept at first, shape (n,).
-            degrees_of_freedom: Measured numbers beyond three for each press, shape (n,).
-            solved: The film at which the first round begins. If the hypothesis has no effects, this film is not fitted
-                again for the first round.
+            is_kept: Whether each press is used in the first round, shape (n,).
+            degrees_of_freedom: Number of redundant measurements of each press, shape (n,).
+            solved: The film at which the first round begins. If the hypothesis has no effects, the first round uses
+                this film without another fit.
             hypothesis: Hypothesis of the first round.
 
         Returns:
@@ -281,11 +243,11 @@ class FitProblem:
             solved = self._solve_kept(data, is_kept, solved.unknowns, hypothesis)
         for round_index in range(MAX_ROUNDS):
             mixture = self.mixture(data[is_kept], solved)
-            # The estimate is that of a linear model about the solved film, so it must be near this film.
+            # The mixture uses derivatives at the solved film, so its estimate must be near this film.
             step = self.mean + mixture.mean - solved.unknowns
             is_step_small = np.abs(step[self.layout.parameters]).max() < MAX_LINEAR_STEP
 
-            # Add the presses that now agree with the film. Without further presses, this search is not necessary.
+            # Add the presses that now agree with the film, unless all presses are kept already.
             is_kept_next = is_kept
             if not is_kept.all():
                 is_kept_next = is_kept | self.agrees(data, solved, mixture, degrees_of_freedom)
@@ -299,82 +261,97 @@ class FitProblem:
         return SettledFit(is_kept, solved, mixture)
 
     def _solve_kept(self, data: PressData, is_kept: Booleans, start: Array, hypothesis: Hypothesis) -> SolvedFilm:
-        """Fit the film to the presses that are kept, all with the weight 1; see `solve`."""
+        """Fit the film to the kept presses, all with the weight 1; see `solve`.
+
+        Args:
+            data: All presses.
+            is_kept: Whether each press is used, shape (n,).
+            start: Unknowns at which the search begins, shape (n_unknown,).
+            hypothesis: Effects that the session may have.
+        """
         kept = data[is_kept]
         return self.solve(kept, np.ones(len(kept)), start, hypothesis)
 
     def agrees(self, data: PressData, solved: SolvedFilm, mixture: Mixture, degrees_of_freedom: Array) -> Booleans:
-        """Return which presses agree with a film, given its uncertainty, shape (n,).
+        """Return whether each press agrees with a film, given the uncertainty of the film, shape (n,).
 
-        A press agrees if r' S^-1 r does not exceed a quantile of the chi-squared distribution. Here r are the residuals
-        of the press for the estimated unknowns, and S is their covariance by noise and by the uncertainty of the film.
+        A press agrees if r' S^-1 r is at most a quantile of the chi-square distribution. Here r is the vector of the
+        residuals of the press for the estimated unknowns, and S is the covariance of r. The covariance S includes the
+        noise and the uncertainty of the film.
 
         Args:
             data: The presses. They may include presses that the fit did not use.
             solved: The film at which the residuals are linearised.
             mixture: The estimate of the unknowns.
-            degrees_of_freedom: Measured numbers beyond three for each press, shape (n,).
+            degrees_of_freedom: Number of redundant measurements of each press, shape (n,).
         """
-        data = data.with_force_scatter(mixture.best.force_scatter)
-        contacts = self.adjusted_contacts(solved.unknowns, data)
-        jacobian = self.derivatives(SolvedFilm(solved.unknowns, contacts), data)
+        scattered_data = data.with_force_scatter(mixture.best.force_scatter)
+        contacts = self.adjusted_contacts(solved.unknowns, scattered_data)
+        jacobian = self.derivatives(SolvedFilm(solved.unknowns, contacts), scattered_data)
 
-        # Residuals r for the estimated unknowns, by the linear model about the solved film.
+        # Residuals r for the estimated unknowns, by a linear approximation about the solved film
         step = self.mean + mixture.mean - solved.unknowns
         residual = contacts.residual + jacobian @ step
 
-        # Covariance S of the residuals of each press: measurement noise (1) plus the uncertainty of the film.
+        # Covariance S of the residuals of each press. The noise contributes the identity matrix, because residuals are
+        # in units of their standard deviations.
         residual_count = jacobian.shape[1]
         covariance = np.eye(residual_count) + jacobian @ mixture.covariance @ jacobian.swapaxes(1, 2)
+
+        # r' S^-1 r of each press. The residuals are passed to NumPy as matrices with one column.
         weighted_residual = np.linalg.solve(covariance, residual[:, :, None])[:, :, 0]
         chi2 = (residual * weighted_residual).sum(axis=1)
         limit = chi_square.value_exceeded_with(BAD_PROBABILITY / len(data), np.maximum(degrees_of_freedom, 1.0))
         return np.asarray(chi2 <= limit)
 
     def mixture(self, data: PressData, solved: SolvedFilm) -> Mixture:
-        """Estimate the unknowns from presses, averaged over all hypotheses and within the bounds.
+        """Estimate the unknowns from presses as an average over all hypotheses, within the bounds of the unknowns.
 
-        The residuals are linearised about a film that explains the presses.
+        The residuals of the presses are approximated by linear functions of the unknowns near a solved film.
 
         Args:
-            data: The presses.
-            solved: The film that explains the presses, with their contacts on it.
+            data: The measured presses.
+            solved: The film that explains the presses best, with the contacts of the presses on this film.
 
         Returns:
-            The mixture of the estimates of all hypotheses. Its mean is the difference from the mean before the presses.
+            The average of the estimates under all hypotheses. Its mean is the difference from the mean before the
+            presses.
         """
         unknowns = solved.unknowns
         contacts = self.adjusted_contacts(unknowns, data, solved.contacts.contact)
         jacobian = self.derivatives(SolvedFilm(unknowns, contacts), data)
         models_by_scatter = self._models_by_force_scatter(SolvedFilm(unknowns, contacts), data, jacobian)
-        mixture = mix_hypotheses(models_by_scatter, self._prior_covariance)
+        mixture = mix_hypotheses(models_by_scatter, self.prior_covariance)
         bounded_unknowns = most_probable_within(self.bounds, self.mean + mixture.mean, mixture.covariance)
         return mixture._replace(mean=bounded_unknowns - self.mean)
 
     def _models_by_force_scatter(
         self, solved: SolvedFilm, data: PressData, jacobian: Array
     ) -> dict[float, LinearModel]:
-        """Return the linear model of the residuals about a film for each scatter of the forces.
+        """Create a linear model of the residuals for each considered scatter of the forces.
 
-        A scatter of the forces is additional noise of each press, in the direction in which the stated force changes
-        the residuals of the press.
+        A scatter of the forces adds noise to the residuals of each press. The noise has the direction of the derivative
+        of these residuals with respect to the stated force.
 
         Args:
-            solved: The film, and the contacts of the presses on it.
-            data: The presses.
+            solved: The film about which the residuals are linearised, and the contacts of the presses on this film.
+            data: The measured presses.
             jacobian: Derivatives of the residuals with respect to the unknowns, shape (n, n_electrode + 3, n_unknown).
 
         Returns:
-            Linear model for each of `FORCE_SCATTERS`, which are relative standard deviations.
+            Linear model for each scatter in `FORCE_SCATTERS`. A scatter is a standard deviation relative to the force.
         """
         residual = solved.contacts.residual
         deviation = solved.unknowns - self.mean
         model = LinearModel.of(jacobian.reshape(-1, solved.unknowns.size), residual.ravel(), deviation)
 
+        # Unit vector of the derivative with respect to the force for each press, shape (n, n_electrode + 3)
         force_derivative = self._force_derivative(solved.unknowns, data, solved.contacts)
         length = np.linalg.norm(force_derivative, axis=1)
-        direction = force_derivative / np.maximum(length, SMALLEST_DERIVATIVE)[:, None]  # unit vectors
-        # Jacobian and residual in this direction: sums over the residuals k of each press n, for each unknown u
+        direction = force_derivative / np.maximum(length, SMALLEST_DERIVATIVE)[:, None]
+
+        # Components of the Jacobian, shape (n, n_unknown), and of the residuals, shape (n,), along these vectors: sums
+        # over the residuals k of each press n, for each unknown u
         jacobian_along = np.einsum("nk,nku->nu", direction, jacobian)
         residual_along = (direction * residual).sum(axis=1)
 
@@ -385,14 +362,14 @@ class FitProblem:
         return models
 
     def adjusted_contacts(self, unknowns: Array, data: PressData, start: Array | None = None) -> AdjustedContacts:
-        """Return the contact of each press that agrees best with a film.
+        """Find the contact of each press that agrees best with a film.
 
         The effects of the nuisances are first subtracted from the charges of the presses.
 
         Args:
-            unknowns: Unknowns of the film, shape (n_unknown,).
-            data: The presses.
-            start: Contacts (x, y, ln F) at which the search begins, shape (n, 3); by default from the presses.
+            unknowns: Unknowns of the film and nuisances, shape (n_unknown,).
+            data: The presses as they were measured.
+            start: Contacts (x, y, ln F) at which the search begins, shape (n, 3); by default those of `start_contacts`.
         """
         film = self._film(unknowns)
         corrected = self._without_nuisances(unknowns, data)
@@ -401,15 +378,15 @@ class FitProblem:
         return adjust_contacts(self.charges, film, corrected, start)
 
     def derivatives(self, solved: SolvedFilm, data: PressData, *, with_coefficients: bool = True) -> Array:
-        """Return the derivatives of the residuals with respect to the unknowns.
+        """Compute the derivatives of the residuals of presses with respect to the unknowns.
 
-        A change of the unknowns also moves the adjusted contacts. The derivatives include the effect of this movement.
+        A change of the unknowns also moves the adjusted contacts, and the derivatives include this movement.
 
         Args:
-            solved: The film, and the contacts of the presses on it.
-            data: The presses.
-            with_coefficients: Whether to compute the derivatives with respect to the coefficients, which takes time.
-                They are zero otherwise.
+            solved: The film, and the contacts of the presses on this film.
+            data: The measured presses.
+            with_coefficients: Whether to compute the derivatives with respect to the coefficients of the film, which is
+                slow. If False, zeros are returned for these derivatives.
 
         Returns:
             Derivatives, shape (n, n_electrode + 3, n_unknown).
@@ -418,41 +395,44 @@ class FitProblem:
         film_unknowns = layout.film if with_coefficients else layout.parameters
         contact = with_force(solved.contacts.contact)
 
-        # Derivatives of the charges on neighbouring films, between which the charges of each press are interpolated.
+        # Derivatives of the charges on films with several pretensions, between which the presses are interpolated
         films, film_weights = self._neighbouring_films(solved.unknowns, data)
-        charge_by_contact = [self.charges.by_contact(film, contact) for film in films]
-        charge_by_film = [
-            self.charges.by_parameter(film[film_unknowns], contact, by_contact)
-            for film, by_contact in zip(films, charge_by_contact, strict=True)
+        contact_slopes_of_films = [self.charges.contact_slopes(film, contact) for film in films]
+        unknown_slopes_of_films = [
+            self.charges.unknown_slopes(film[film_unknowns], contact, contact_slopes)
+            for film, contact_slopes in zip(films, contact_slopes_of_films, strict=True)
         ]
+        charge_contact_slopes = weighted_sum(contact_slopes_of_films, film_weights)
+        charge_unknown_slopes = weighted_sum(unknown_slopes_of_films, film_weights)
 
-        # The film changes only the residuals of the charges, the first of each press.
+        # The unknowns of the film change only the residuals of the charges. They are the first residuals of each press.
         jacobian = np.zeros((*data.measured.shape, layout.count))
         charge_rows = slice(0, data.charge.shape[1])
-        jacobian[:, charge_rows, film_unknowns] = data.weight[:, :, None] * weighted_sum(charge_by_film, film_weights)
+        jacobian[:, charge_rows, film_unknowns] = data.weight[:, :, None] * charge_unknown_slopes
 
-        # The nuisances change the charges directly, or they change the pretension, here in MPa.
+        # A nuisance changes either the charges or the pretension. The derivative with respect to the pretension is
+        # converted from prior standard deviations to MPa.
         pretension = layout.parameter("pretension")
-        by_pretension = jacobian[:, :, pretension] / self.charges.prior.std[pretension]
-        jacobian[:, :, layout.nuisances] = nuisance_derivatives(data, by_pretension)
+        pretension_derivative = jacobian[:, :, pretension] / self.charges.prior.std[pretension]
+        jacobian[:, :, layout.nuisances] = nuisance_derivatives(data, pretension_derivative)
 
-        residual_by_contact = data.residual_slopes(weighted_sum(charge_by_contact, film_weights))
-        return derivatives_with_adjusted_contacts(jacobian, residual_by_contact)
+        residual_contact_slopes = data.residual_slopes(charge_contact_slopes)
+        return derivatives_with_adjusted_contacts(jacobian, residual_contact_slopes)
 
     def gain_covariance(self, nuisances: dict[str, NuisanceEstimate], force_scatter: float) -> Array:
-        """Return the additional covariance of the film's unknowns when the film is used after the session.
+        """Return the additional covariance of the film's unknowns for a use of the film after the session.
 
-        A drift or a scatter of the forces in the session leaves the mean of all gains uncertain, because later presses
-        may be affected differently. The additional error is the same for all gains.
+        If the charges drift or the forces scatter during the session, the mean of all gains remains uncertain, because
+        later presses may be affected differently. The additional error is the same for all gains.
 
         Args:
             nuisances: Estimates of the nuisances of the session by name.
-            force_scatter: Relative standard deviation of the forces.
+            force_scatter: Standard deviation of the scatter of the forces, relative to the force.
 
         Returns:
             Covariance, shape (n_film_unknown, n_film_unknown), in units of the prior standard deviations.
         """
-        # The errors are independent, so that the root of the sum of their squares is taken.
+        # The errors by each nuisance and by the scatter are independent, so their variances are added.
         gain_std = 0.0
         for nuisance in NUISANCES:
             gain_std = float(np.hypot(gain_std, nuisance.gain_std(nuisances[nuisance.name])))
@@ -462,38 +442,124 @@ class FitProblem:
         common_error[self.charges.prior.gains] = gain_std / self.charges.prior.spread.gain
         return np.outer(common_error, common_error)
 
-    def _prior_covariance(self, hypothesis: Hypothesis) -> Array:
-        """Return the covariance of the unknowns before the presses for a hypothesis, shape (n_unknown, n_unknown)."""
+    def prior_covariance(self, hypothesis: Hypothesis) -> Array:
+        """Return the covariance of the unknowns before the presses under a hypothesis, shape (n_unknown, n_unknown)."""
         return self.covariance + hypothesis.covariance(self.layout)
 
     def _film(self, unknowns: Array) -> Array:
-        """Return the unknowns of the film with parameters in their own units, as `FilmCharges.film` takes them."""
+        """Return the parameters and coefficients of the film in the units that `FilmCharges.film` expects.
+
+        Args:
+            unknowns: All unknowns, with parameters in units of their prior standard deviations, shape (n_unknown,).
+
+        Returns:
+            Parameters in their own units, followed by the coefficients, shape (n_film_unknown,).
+        """
         film = unknowns[self.layout.film].copy()
         film[self.layout.parameters] *= self.charges.prior.std
         return film
 
     def _without_nuisances(self, unknowns: Array, data: PressData) -> PressData:
-        """Return the presses without the effect of the nuisances of the session."""
+        """Subtract the effects of the nuisances from presses; see `without_nuisances`."""
         return without_nuisances(data, unknowns[self.layout.nuisances])
 
     def _neighbouring_films(self, unknowns: Array, data: PressData) -> tuple[list[Array], Array]:
-        """Return the films between which the presses are interpolated; see `neighbouring_films`."""
+        """Return the films between which the charges of presses are interpolated; see `neighbouring_films`."""
         return neighbouring_films(self.charges, self._film(unknowns), self._without_nuisances(unknowns, data))
 
     def _force_derivative(self, unknowns: Array, data: PressData, contacts: AdjustedContacts) -> Array:
-        """Return the derivatives of the residuals with respect to the stated force, shape (n, n_electrode + 3).
+        """Compute the derivatives of the residuals with respect to the logarithm of the stated force.
 
-        If the stated force changes, the adjusted contacts change, too. The derivatives include this change.
+        A change of the stated force also moves the adjusted contact, and the derivatives include this movement.
 
         Args:
-            unknowns: Unknowns of the film, shape (n_unknown,).
-            data: The presses.
+            unknowns: Unknowns of the film and nuisances, shape (n_unknown,).
+            data: The measured presses.
             contacts: The adjusted contacts of the presses on this film.
+
+        Returns:
+            Derivatives, shape (n, n_electrode + 3).
         """
         contact = with_force(contacts.contact)
         films, film_weights = self._neighbouring_films(unknowns, data)
-        charge_by_contact = weighted_sum([self.charges.by_contact(film, contact) for film in films], film_weights)
-        residual_by_contact = data.residual_slopes(charge_by_contact)
-        # The stated force is treated as one unknown, so the arrays have a last axis of length 1.
-        residual_by_force = data.force_derivative()[:, :, None]
-        return derivatives_with_adjusted_contacts(residual_by_force, residual_by_contact)[:, :, 0]
+        contact_slopes_of_films = [self.charges.contact_slopes(film, contact) for film in films]
+        residual_contact_slopes = data.residual_slopes(weighted_sum(contact_slopes_of_films, film_weights))
+        # The stated force is treated as the only unknown. Therefore, an axis of length 1 is added, and then removed.
+        residual_force_slopes = data.force_derivative()[:, :, None]
+        derivatives = derivatives_with_adjusted_contacts(residual_force_slopes, residual_contact_slopes)
+        return derivatives[:, :, 0]
+
+
+class _FilmFit:
+    """Residuals of one fit as functions of the active unknowns, in the form that SciPy expects.
+
+    An unknown is active if it has a variance under the hypothesis of the fit. The fit changes only the active unknowns.
+    All other unknowns keep their mean.
+
+    Attributes:
+        active: Whether each unknown is active, shape (n_unknown,).
+    """
+
+    def __init__(self, problem: FitProblem, data: PressData, weight: Array, hypothesis: Hypothesis) -> None:
+        """Compute all values that do not change during the fit.
+
+        Args:
+            problem: The least-squares problem.
+            data: The measured presses.
+            weight: Weight of the squared residuals of each press, shape (n,).
+            hypothesis: Effects that the session may have.
+        """
+        self._problem = problem
+        self._data = data.with_force_scatter(hypothesis.force_scatter)
+        self._root_weight = np.sqrt(weight)  # factor on the residuals, whose squares then have the given weight
+
+        covariance = problem.prior_covariance(hypothesis)
+        self.active = np.diag(covariance) > 0.0
+        self._has_coefficients = bool(self.active[problem.layout.coefficients].any())
+        # The whitening matrix converts deviations from the prior mean into residuals with the variance 1.
+        active_covariance = covariance[np.ix_(self.active, self.active)]
+        self._whitening = np.linalg.inv(np.linalg.cholesky(active_covariance))
+        self._latest: tuple[Array, SolvedFilm] | None = None  # active unknowns and film of the latest evaluation
+
+    def film_at(self, active_unknowns: Array) -> SolvedFilm:
+        """Return the film with given unknowns, and the contacts that agree best with this film.
+
+        The latest film is stored, because SciPy evaluates the residuals and the derivatives of each film separately.
+        The search for the contacts on the next film begins at the contacts on the latest film.
+
+        Args:
+            active_unknowns: Values of the active unknowns, shape (n_active,).
+        """
+        start_contacts_of_search = None
+        if self._latest is not None:
+            latest_unknowns, latest_film = self._latest
+            if np.array_equal(latest_unknowns, active_unknowns):
+                return latest_film
+            start_contacts_of_search = latest_film.contacts.contact
+        unknowns = self._problem.mean.copy()
+        unknowns[self.active] = active_unknowns
+        contacts = self._problem.adjusted_contacts(unknowns, self._data, start_contacts_of_search)
+        film = SolvedFilm(unknowns, contacts)
+        self._latest = (active_unknowns.copy(), film)  # a copy, because SciPy may change its array
+        return film
+
+    def residual(self, active_unknowns: Array) -> Array:
+        """Return the weighted residuals of all presses, followed by the residuals of the prior, shape (n_residual,).
+
+        Args:
+            active_unknowns: Values of the active unknowns, shape (n_active,).
+        """
+        press_residual = self.film_at(active_unknowns).contacts.residual * self._root_weight[:, None]
+        prior_residual = self._whitening @ (active_unknowns - self._problem.mean[self.active])
+        return np.concatenate([press_residual.ravel(), prior_residual])
+
+    def jacobian(self, active_unknowns: Array) -> Array:
+        """Return the derivatives of `residual` with respect to the active unknowns, shape (n_residual, n_active).
+
+        Args:
+            active_unknowns: Values of the active unknowns, shape (n_active,).
+        """
+        film = self.film_at(active_unknowns)
+        derivatives = self._problem.derivatives(film, self._data, with_coefficients=self._has_coefficients)
+        press_rows = derivatives[:, :, self.active] * self._root_weight[:, None, None]
+        return np.concatenate([press_rows.reshape(-1, active_unknowns.size), self._whitening])

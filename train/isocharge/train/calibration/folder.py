@@ -1,9 +1,9 @@
 """Writer and reader of the folder of a calibrated film.
 
-    FOLDER/config.pbtxt            configuration for Triton
+    FOLDER/config.pbtxt            configuration for the model server Triton
     FOLDER/<version>/model.onnx    the model of this film, with golden.json and card.md as in every model
     FOLDER/<version>/sensor.toml   the calibrated sensor
-    FOLDER/<version>/calibration.json    parameters, errors, correlations, quantities that cannot be identified
+    FOLDER/<version>/calibration.json    parameters, errors, correlations, and quantities of the film
     FOLDER/<version>/presses.csv   the presses; missing if the calibration was only moved to another temperature
     FOLDER/<version>/pretensions.npz     weights for `serve stream --follow`, with four electrodes or more
     FOLDER/<version>/film_directions.npz    further uncertainty of the film, for `serve stream --follow`
@@ -11,8 +11,9 @@
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the files of the last version
 
 A further calibration in the same folder becomes its next version. A server loads the new version when it reloads its
-models. Programs only read the version folders. The copies above them are for people. Before each calibration, the
-copies are written again from the last version, because an earlier process may have been killed before it wrote them.
+models. Programs only read the version folders, and the copies above the version folders are for people. Before each
+calibration, the copies are written again from the last version, because an earlier process may have been killed before
+it wrote the copies.
 """
 
 import json
@@ -62,14 +63,14 @@ CARD = "card.md"
 
 
 def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
-    """Raise ModelError if a calibration cannot be written to a folder because of its name or its content.
+    """Raise ModelError if a folder cannot be used for a calibration because of the folder's name or content.
 
     A calibration can be written to a new folder, to an empty folder, or to a folder of earlier calibrations. Hidden
-    files are ignored.
+    files in the folder are ignored.
 
     Args:
         folder: The folder, which need not exist.
-        electrodes: Names of the electrodes.
+        electrodes: Names of the electrodes of the calibrated sensor.
     """
     versions = version_folders(folder)
     next_version = max(versions, default=0) + 1
@@ -84,18 +85,18 @@ def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
 
 @contextmanager
 def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[None]:
-    """Lock a folder for a calibration as long as the `with` block runs.
+    """Lock a folder for a calibration while a `with` block runs (context manager).
 
-    Before the block, drafts of a process that was killed are removed, and the readable files of the last version are
-    copied to the folder again. After the block, the folder and the parents that were created for it are removed if they
-    are empty.
+    Before the block runs, drafts that a killed process left behind are removed. The readable files of the last version
+    are also copied to the folder again. After the block, the folder and its newly created parent folders are removed if
+    they are empty.
 
     Args:
-        folder: The folder.
-        problem: Problem of the calibration.
+        folder: The folder, which is created if it does not exist.
+        problem: The calibration problem, which defines the electrodes.
 
     Raises:
-        ModelError: If a calibration cannot be written to a folder with this name or content.
+        ModelError: If the folder cannot be used for a calibration because of its name or content.
         OutputExists: If another process writes a calibration to the folder.
         OutputError: If the folder cannot be written.
     """
@@ -106,8 +107,8 @@ def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[No
         try:
             with locked(folder):
                 for draft in folder.glob(".*.draft"):
-                    shutil.rmtree(draft, ignore_errors=True)  # removes a folder, and ignores a file
-                    draft.unlink(missing_ok=True)  # removes a file
+                    shutil.rmtree(draft, ignore_errors=True)  # removes the draft if it is a folder
+                    draft.unlink(missing_ok=True)  # removes the draft if it is a file
                 _copy_last_version(folder)
                 yield
         finally:
@@ -115,7 +116,7 @@ def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[No
 
 
 def _copy_last_version(folder: Path) -> None:
-    """Copy the readable files of the last version to the folder above it, if they differ.
+    """Copy the readable files of the last version to the folder of the calibration, unless the copies are up to date.
 
     Args:
         folder: Folder of the calibration, which contains the version folders.
@@ -133,23 +134,29 @@ def _copy_last_version(folder: Path) -> None:
 
 
 def _calibrated_versions(folder: Path) -> list[Path]:
-    """Return the version folders that contain a calibration, in ascending order."""
+    """Return the version folders that contain a calibration, in ascending order of the version.
+
+    Args:
+        folder: Folder of the calibration, which contains the version folders.
+    """
     return [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
 
 
 def write_calibration(result: CalibrationResult, folder: Path, command: str = "") -> Path:
-    """Write a calibrated film as the next version of a model folder, and copy its readable files to the folder itself.
+    """Write a calibrated film as the next version of a model folder.
+
+    The readable files of the version are also copied to the folder itself.
 
     Args:
-        result: The calibration.
+        result: Result of the calibration.
         folder: A new folder, or the folder of an earlier calibration.
-        command: Command that makes this calibration again, for the card.
+        command: Command that repeats this calibration, for the card.
 
     Returns:
         The version folder.
 
     Raises:
-        ModelError: If the folder has other content.
+        ModelError: If the folder cannot be used for a calibration because of its name or content.
         OutputError: If the folder cannot be written.
     """
     check_calibration_folder(folder, result.problem.electrodes)
@@ -160,17 +167,19 @@ def write_calibration(result: CalibrationResult, folder: Path, command: str = ""
 
 
 def _write_version(result: CalibrationResult, folder: Path, command: str) -> Path:
-    """Write the model and all files of a calibration into the next version folder.
+    """Write the model and all files of a calibration to the next version folder, and return this version folder.
 
     The presses are not written if the calibration was moved to another temperature, because no presses were made at
-    this temperature. The files for following the pretension are written only if the pretension can be followed.
+    this temperature. The files with which a service follows the pretension are written only if the pretension can be
+    followed.
 
     Args:
-        result: The calibration.
+        result: Result of the calibration.
         folder: Folder of the calibration.
-        command: Command that makes this calibration again, for the card.
+        command: Command that repeats this calibration, for the card.
     """
-    # Imported late, because matplotlib takes long to import and `train fit` does not need it.
+    # These modules are imported late, because they import matplotlib. Its import is slow, and `train fit` does not need
+    # it.
     from isocharge.simulate.plots.figure import picture_bytes
     from isocharge.train.calibration.picture import calibration_picture
 
@@ -202,9 +211,10 @@ def _write_version(result: CalibrationResult, folder: Path, command: str) -> Pat
 
 
 def result_table(result: CalibrationResult) -> dict[str, Any]:
-    """Return a calibration as a table for JSON."""
+    """Convert a calibration result into the content of calibration.json."""
     film = film_table(result.problem.prior, result.posterior)
     return {
+        # These two entries of `film` come first in the file, and the others come later.
         "format_version": film.pop("format_version"),
         "sensor": film.pop("sensor"),
         "probe": result.problem.prior.probe.notation,
@@ -224,14 +234,14 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
 
 
 def friction_table(result: CalibrationResult) -> dict[str, float] | None:
-    """Return the coefficient of friction of the presses for JSON; None if friction is not an unknown."""
+    """Return the estimated coefficient of friction for JSON, or None if friction was not an unknown of the fit."""
     if result.side_forces is None or result.problem.friction == 0.0:
         return None
     return result.side_forces.friction._asdict()
 
 
 def held_out_table(result: CalibrationResult) -> dict[str, float] | None:
-    """Return the errors of the cross-validation for JSON; None if there are too few presses."""
+    """Return the errors of the cross-validation for JSON, or None if no cross-validation was possible."""
     if result.held_out is None:
         return None
     return {"presses": len(result.held_out.presses), "folds": FOLD_COUNT, **result.held_out.errors}
@@ -243,31 +253,33 @@ def error_table(error: ContactError) -> dict[str, float]:
 
 
 def read_earlier(folder: Path, problem: CalibrationProblem, *, knows_temperature: bool = False) -> FilmEstimate:
-    """Read the film of an earlier calibration, and add the uncertainty of its drift since then.
+    """Read the film of an earlier calibration, and increase its uncertainty by the possible drift since then.
 
     Args:
         folder: Folder that `write_calibration` wrote, or one of its version folders.
-        problem: Films of the new calibration.
+        problem: Problem of the new calibration.
         knows_temperature: Whether the temperatures of the new presses are known.
 
     Raises:
-        PressError: If the folder has no calibration, or a calibration with other parameters.
+        PressError: If the folder contains no calibration, or a calibration with other parameters.
     """
     _, film = _read_last_film(folder, problem)
     return film.drifted(problem.prior, knows_temperature=knows_temperature)
 
 
 def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> CalibrationResult:
-    """Read an earlier calibration, and move it to another temperature without presses and without drift.
+    """Read an earlier calibration, and compute the film at another temperature without new presses.
+
+    The uncertainty is not increased by a possible drift of the film.
 
     Args:
         folder: Folder that `write_calibration` wrote, or one of its version folders.
-        problem: Films of the calibration.
+        problem: The calibration problem.
         to_C: The other temperature, degrees Celsius.
 
     Raises:
-        PressError: If the folder has no calibration or a calibration with other parameters, or if the change of this
-            film with temperature is unknown.
+        PressError: If the folder contains no calibration or a calibration with other parameters, or if the earlier
+            presses did not determine how the film changes with temperature.
     """
     path, film = _read_last_film(folder, problem)
     if film.warming is None or not film.warming.identified:
@@ -275,30 +287,30 @@ def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> Calibr
             f"{path}: expected a calibration that contains the change of the film with temperature, got one without; "
             "calibrate with presses that have a column temperature_C and cover a few degrees"
         )
-    # The path is FOLDER/VERSION/calibration.json, and the text names the folder and the version.
+    # The path is FOLDER/VERSION/calibration.json. The text contains the last two folders, FOLDER/VERSION.
     version_folder = path.parent
     version = "/".join(version_folder.parts[-2:])
     moved = f"moved from {film.warming.at_C:.1f} C, {version}, to {to_C:.1f} C by the change in its calibration"
     moved_film = film.at_temperature(to_C, problem.prior)
-    # The result compares the moved film with the film before the move.
+    # The film before the move is passed as the earlier estimate, so that the result compares both films.
     return film_without_presses(replace(problem, earlier=film), moved_film, moved)
 
 
 def _read_last_film(folder: Path, problem: CalibrationProblem) -> tuple[Path, FilmEstimate]:
-    """Find the file of an earlier calibration, and read the film from this file.
+    """Find the file calibration.json of an earlier calibration, and read the film from this file.
 
-    If the folder is a version folder, its own file is used. Otherwise, the file of the last version in the folder is
-    used.
+    If the given folder contains version folders, the file of the last version is read. Otherwise, the given folder is
+    expected to be a version folder, which contains the file itself.
 
     Args:
         folder: Folder of an earlier calibration, or one of its version folders.
-        problem: Films of the new calibration.
+        problem: The calibration problem for which the film is read.
 
     Returns:
         Path of the file, and the estimate of the film.
 
     Raises:
-        PressError: If the folder has no calibration, or a calibration with other parameters.
+        PressError: If the folder contains no calibration, or a calibration with other parameters.
     """
     versions = _calibrated_versions(folder)
     version_folder = versions[-1] if versions else folder
@@ -307,10 +319,10 @@ def _read_last_film(folder: Path, problem: CalibrationProblem) -> tuple[Path, Fi
 
 
 def _card(result: CalibrationResult, about: ModelMetadata) -> str:
-    """Return the text of the card of a calibrated model, in Markdown.
+    """Return the Markdown text of the card of a calibrated model.
 
     Args:
-        result: The calibration.
+        result: Result of the calibration.
         about: Metadata of the model.
     """
     sensor, probe = result.film
@@ -353,12 +365,13 @@ combinations above are known; `calibration.json` has their correlations.
 
 
 def _errors_section(result: CalibrationResult, about: ModelMetadata) -> str:
-    """Return a table of errors, and sentences about the presses on which these errors were measured.
+    """Return the section of the card about the errors of the model, in Markdown.
 
-    The errors were measured on held-out presses if there are enough of them, and on simulated presses otherwise.
+    The section contains a table of errors, and sentences about the presses on which the errors were measured. The
+    errors are those of a cross-validation if it was possible, and those on simulated presses otherwise.
 
     Args:
-        result: The calibration.
+        result: Result of the calibration.
         about: Metadata of the model, which contain the errors.
     """
     if result.held_out is None:

@@ -1,7 +1,8 @@
-"""Weights with which a service follows the pretension of a calibrated film: the file `pretensions.npz`.
+"""Content of the file `pretensions.npz`, with which a service follows the pretension of a calibrated film.
 
-The file contains networks of the film at several pretensions. All other parameters are those of the calibration. Each
-network is adapted to the discrepancy and to the remaining uncertainty of the film, as the model itself is.
+The file contains the weights of networks for the film at several pretensions. Apart from the pretension, the networks
+use the parameters of the calibrated film. Like the network of the model, each network is adapted to the discrepancy and
+to the remaining uncertainty of the film.
 """
 
 from dataclasses import replace
@@ -20,10 +21,12 @@ from isocharge.train.model_release.onnx_graph import write_graph
 from isocharge.train.training.folded_network import MISFIT_UNIT, FoldedNetwork
 
 N_NODES = 6
-"""Number of pretensions for which the file has weights."""
+"""Number of pretensions for which the file contains weights."""
 
 MAX_PRETENSION_CHANGE_MPa = 1.4
-"""Largest difference from the calibrated pretension, MPa, which corresponds to three or four degrees of temperature."""
+"""Largest difference from the calibrated pretension for which the file contains weights, MPa.
+
+This difference corresponds to a change of the temperature by three or four degrees."""
 
 N_TOUCHES = 300
 """Number of simulated touches from which the typical misfit is computed."""
@@ -36,17 +39,18 @@ MAX_TYPICAL_MISFIT = 1.5
 
 
 def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretensions | None:
-    """Compute the weights of the network of a calibrated film at other pretensions.
+    """Compute the networks of a calibrated film at several pretensions.
 
-    One network is computed for each of several pretensions. The service interpolates between these networks.
+    A service interpolates between these networks in order to follow the pretension of the film.
 
     Args:
-        result: The calibration.
-        network: The network of the model.
+        result: Result of the calibration.
+        network: The network of the model, which is that of the calibrated pretension.
 
     Returns:
-        The weights; None if the pretension cannot be followed. This is the case with three electrodes, whose charges
-        only suffice for the contact, and if the misfits of the network are too inaccurate on this film.
+        The weights of the networks, or None if the pretension cannot be followed. It cannot be followed with three
+        electrodes, because three charges only determine the contact. It also cannot be followed if the misfits of good
+        touches on this film are too large.
     """
     problem = result.problem
     posterior = result.posterior
@@ -59,7 +63,8 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
     lower, upper = (float(bound[pretension]) for bound in prior.bounds)
     nodes = _pretension_nodes(calibrated_MPa, lower, upper)
 
-    # The networks have the same layers. Each array of weights is stacked over the nodes, shape (N_NODES, ...).
+    # All networks have the same layers. The arrays of the N_NODES networks that belong to the same layer are stacked,
+    # shape (N_NODES, ...).
     arrays_of_networks = [_weight_arrays(node_network) for node_network in _networks_at(nodes, result, network)]
     stacked_weights = [np.stack(arrays) for arrays in zip(*arrays_of_networks, strict=True)]
 
@@ -77,7 +82,7 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
         weights=dict(zip(_weight_names(network), stacked_weights, strict=True)),
     )
 
-    # The misfits of the networks are computed with `misfit_rms` = 1, and determine its final value.
+    # So far, `misfit_rms` is 1. Its final value is computed from the misfits of simulated touches.
     typical_misfit = _typical_misfit(pretensions, result)
     if typical_misfit > MAX_TYPICAL_MISFIT:
         return None
@@ -85,18 +90,18 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
 
 
 def _networks_at(pretensions_MPa: Array, result: CalibrationResult, network: FoldedNetwork) -> list[FoldedNetwork]:
-    """Return one network for each pretension, with the other parameters of the calibrated film.
+    """Return the network of the calibrated film at each of several pretensions.
 
     Args:
         pretensions_MPa: The pretensions, shape (n,), MPa.
-        result: The calibration.
+        result: The calibration, which defines the other parameters of the film.
         network: Network of the model, which is returned for the calibrated pretension.
     """
     calibrated_parameters = result.posterior.parameters
     pretension = result.problem.prior.index("pretension")
     networks = []
     for pretension_MPa in pretensions_MPa:
-        if pretension_MPa == calibrated_parameters[pretension]:  # one of the pretensions is exactly the calibrated one
+        if pretension_MPa == calibrated_parameters[pretension]:  # exactly equal, because one node was set to this value
             networks.append(network)
             continue
         parameters = calibrated_parameters.copy()
@@ -110,12 +115,13 @@ def _typical_misfit(pretensions: Pretensions, result: CalibrationResult) -> floa
     """Return the root mean square of the misfits of simulated touches on the calibrated film, in units of the noise.
 
     Args:
-        pretensions: Weights of the network at several pretensions.
-        result: The calibration.
+        pretensions: Weights of the networks at several pretensions.
+        result: Result of the calibration.
     """
     problem = result.problem
     rng = np.random.default_rng(SEED)
     touches = draw_contacts(rng, problem.domain, N_TOUCHES)
+    # Charges of the calibrated film: those of its parameters times the factor of its coefficients and of friction
     film = problem.charges.forward_map(result.posterior.parameters)
     exact_charge = film.charges(touches) * result.charge_factor(result.posterior.unknowns, touches)
     charge = problem.noise.add(exact_charge, rng)
@@ -124,50 +130,56 @@ def _typical_misfit(pretensions: Pretensions, result: CalibrationResult) -> floa
     return rms(np.array(misfits))
 
 
-def _pretension_nodes(calibrated: float, lower: float, upper: float) -> Array:
+def _pretension_nodes(calibrated_MPa: float, lower_MPa: float, upper_MPa: float) -> Array:
     """Return Chebyshev nodes around the calibrated pretension, shape (N_NODES,), MPa.
 
-    The nodes are stretched so that the first and the last of them lie at the ends of the range. The node that is
-    closest to the calibrated pretension is moved to the calibrated pretension.
+    The nodes are stretched, so that the first and the last node lie at the ends of their range. The node that is
+    closest to the calibrated pretension is replaced by the calibrated pretension.
 
     Args:
-        calibrated: The calibrated pretension, MPa.
-        lower: Smallest pretension that a film may have, MPa.
-        upper: Largest pretension that a film may have, MPa.
+        calibrated_MPa: The calibrated pretension, MPa.
+        lower_MPa: Smallest pretension that a film may have, MPa.
+        upper_MPa: Largest pretension that a film may have, MPa.
     """
-    low = max(lower, calibrated - MAX_PRETENSION_CHANGE_MPa)
-    high = min(upper, calibrated + MAX_PRETENSION_CHANGE_MPa)
+    low = max(lower_MPa, calibrated_MPa - MAX_PRETENSION_CHANGE_MPa)
+    high = min(upper_MPa, calibrated_MPa + MAX_PRETENSION_CHANGE_MPa)
     angle = np.pi * (np.arange(N_NODES) + 0.5) / N_NODES
     centre = 0.5 * (low + high)
     half_width = 0.5 * (high - low)
     nodes = centre - half_width * np.cos(angle) / np.cos(angle[0])  # the division stretches the nodes to both ends
-    closest_node = np.abs(nodes - calibrated).argmin()
-    nodes[closest_node] = calibrated
+    closest_node = np.abs(nodes - calibrated_MPa).argmin()
+    nodes[closest_node] = calibrated_MPa
     return np.asarray(nodes)
 
 
-def _with_correlations_of(network: FoldedNetwork, other: FoldedNetwork) -> FoldedNetwork:
-    """Return a network with the correlations of the model, because correlations hardly change with the pretension.
+def _with_correlations_of(model_network: FoldedNetwork, film_network: FoldedNetwork) -> FoldedNetwork:
+    """Copy the outputs for the correlations of a contact from the network of the model to another network.
+
+    The correlations are not computed again, because they hardly change with the pretension.
 
     Args:
-        network: Network of the model.
-        other: Network of the film with another pretension, without correlations.
+        model_network: Network of the model. If it has no outputs for correlations, nothing is copied.
+        film_network: Network of the film with another pretension, without outputs for correlations.
+
+    Returns:
+        The other network with outputs for the correlations.
     """
-    if not network.n_angle:
-        return other
-    # The network computes the correlations as angles. These outputs are the `angle_columns` of the last layer and of
-    # the skip connection.
-    columns = network.angle_columns
-    last = network.layers.last
-    angle_layer = Layer(last.weight[:, columns], last.bias[columns])
-    angle_skip = network.layers.skip[:, columns]
-    return other.with_angles(angle_layer, angle_skip)
+    if not model_network.n_angle:
+        return film_network
+    # The network computes correlations as angles. Their outputs are columns of the last layer and of the skip
+    # connection.
+    columns = model_network.angle_columns
+    last_layer = model_network.layers.last
+    angle_layer = Layer(last_layer.weight[:, columns], last_layer.bias[columns])
+    angle_skip = model_network.layers.skip[:, columns]
+    return film_network.with_angles(angle_layer, angle_skip)
 
 
 def _weight_arrays(network: FoldedNetwork) -> list[np.ndarray]:
-    """Return the weights of a network as single-precision arrays, in the order of `Pretensions`.
+    """Return the weights of a network as single-precision arrays, in the order that `Pretensions` expects.
 
-    The order is: weight and bias of each hidden layer, the skip connection, and bias and weight of the last layer.
+    The weight and the bias of each hidden layer come first. The skip connection follows, and then the bias and the
+    weight of the last layer.
 
     Args:
         network: The network.
@@ -181,12 +193,12 @@ def _weight_arrays(network: FoldedNetwork) -> list[np.ndarray]:
 
 
 def _weight_names(network: FoldedNetwork) -> list[str]:
-    """Return the names of the constants of the ONNX graph that contain the weights, in the order of `_weight_arrays`.
+    """Return the names of the ONNX constants that contain the weights of a network, in the order of `_weight_arrays`.
 
-    The constants are recognised by their values, because the names depend on how the graph is written.
+    The constants are recognised by their values, because their names depend on how the ONNX graph is written.
 
     Args:
-        network: The network.
+        network: The network, for which an ONNX graph is created.
     """
     graph = onnx.load_from_string(write_graph(network, {})).graph
     constants = {str(constant.name): numpy_helper.to_array(constant) for constant in graph.initializer}
@@ -199,25 +211,25 @@ def _weight_names(network: FoldedNetwork) -> list[str]:
 
 
 def _lasting_std_MPa(result: CalibrationResult) -> float:
-    """Compute the standard deviation of the followed pretension that no number of touches reduces, MPa.
+    """Compute the standard deviation of the followed pretension that remains after many touches, MPa.
 
-    The service estimates the pretension from the misfits of touches, by least squares. It takes all other parameters of
-    the film from the calibration. Their errors therefore cause an error of the pretension that remains after any number
-    of touches.
+    The service estimates the pretension from the misfits of touches by least squares. All other unknowns of the film
+    keep their calibrated values. The errors of the calibrated values cause an error of the estimated pretension, which
+    further touches do not reduce. The error of the calibrated pretension is one of these errors. Its factor is 1.
 
     Args:
-        result: The calibration.
+        result: Result of the calibration.
     """
     prior = result.problem.prior
     pretension = prior.index("pretension")
     misfit_jacobian = result.sensitivity.misfit_jacobian
     pretension_jacobian = misfit_jacobian[:, :, pretension]  # shape (n_touch, n_misfit)
 
-    # Error of the least-squares estimate of the pretension for a unit error of each unknown p. The sums are over the
-    # touches n and the misfits k of a touch.
+    # Error of the least-squares estimate of the pretension for a unit error of each unknown p. The sums extend over the
+    # touches n and the misfits k of each touch.
     projection = np.einsum("nk,nkp->p", pretension_jacobian, misfit_jacobian)
     error_per_unknown = projection / (pretension_jacobian**2).sum()
 
-    # The unknowns are in units of the standard deviations of the prior, and so is this variance.
+    # Parameters are in units of their prior standard deviations, and so is the error of the pretension.
     scaled_variance = error_per_unknown @ result.posterior.joint @ error_per_unknown
     return float(np.sqrt(scaled_variance) * prior.std[pretension])

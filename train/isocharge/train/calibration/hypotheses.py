@@ -1,10 +1,13 @@
-"""Hypotheses about further effects on the presses of a session, and the probabilities of these hypotheses.
+"""Hypotheses about effects that the parameters of a film do not describe, and the probabilities of these hypotheses.
 
-The film may have imperfections (modes), a discrepancy of some size, and traces that are missing in the sensor file. The
-session may have nuisances, and the stated forces may scatter. Each combination of these effects is a hypothesis. Traces
-are only combined with modes and a discrepancy. The probability of each hypothesis follows from the evidence of the
-presses for a linear model with Gaussian noise (MacKay 1992). The estimate of the film is the mixture of the estimates
-of all hypotheses.
+A film may have imperfections (modes), a discrepancy, and traces that are missing in the sensor file. A session may have
+nuisances, such as an offset of the charges. The stated forces may also scatter. A hypothesis is a combination of such
+effects. Traces are considered only together with modes and a discrepancy.
+
+The probability of a hypothesis follows from its evidence, which is the probability density of the presses under the
+hypothesis (MacKay 1992). The evidence is computed from a linear model of the residuals with Gaussian noise. The
+estimate of the film is the average of the estimates under all hypotheses, weighted by the probabilities of the
+hypotheses.
 """
 
 import math
@@ -29,7 +32,7 @@ DISCREPANCY_SIZES = {0.0: 0.5, 0.003: 0.1, 0.01: 0.15, 0.03: 0.15, 0.1: 0.1}
 """Considered relative sizes of the discrepancy of the charges, each with its prior probability."""
 
 TRACES_PROBABILITY = 0.01
-"""Prior probability that traces collect charge and are not described in the sensor file."""
+"""Prior probability that the film has traces that collect charge and are missing in the sensor file."""
 
 FORCE_SCATTERS = {0.0: 0.95, 0.03: 0.03, 0.1: 0.02}
 """Considered standard deviations of an additional scatter of the forces, each with its prior probability.
@@ -37,7 +40,7 @@ FORCE_SCATTERS = {0.0: 0.95, 0.03: 0.03, 0.1: 0.02}
 The standard deviations are relative to the force. They are added in quadrature to the standard deviation of the rig."""
 
 NEGLIGIBLE_PROBABILITY = 1e-7
-"""Probability up to which a hypothesis is left out of the mixture."""
+"""Probability up to which a hypothesis is ignored in the average over the hypotheses."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +48,12 @@ class Hypothesis:
     """A combination of effects on the presses of a session that the parameters of the film do not describe.
 
     Attributes:
-        modes: Size of the modes, relative to the modes of typical films, dimensionless.
+        modes: Size of the modes of imperfections, relative to typical films, dimensionless.
         discrepancy: Relative size of the discrepancy of the charges, dimensionless.
         nuisance_stds: Standard deviation of each nuisance before the presses, in the unit of the nuisance and in the
-            order of `NUISANCES`. The part that known temperatures add is not included.
-        force_scatter: Relative standard deviation of the forces in addition to that of the rig.
-        prior_probability: Probability before the presses.
+            order of `NUISANCES`. The variance that a nuisance gets from known temperatures is not included.
+        force_scatter: Standard deviation of the forces in addition to that of the rig, relative to the force.
+        prior_probability: Probability of the hypothesis before the presses.
         traces: Size of the traces that the sensor file does not describe, relative to typical films, dimensionless.
     """
 
@@ -62,13 +65,14 @@ class Hypothesis:
     traces: float = 0.0
 
     def covariance(self, layout: UnknownLayout) -> Array:
-        """Return the prior covariance of the unknowns that describe the effects of the hypothesis.
+        """Return the prior covariance that the hypothesis adds to the unknowns.
 
         Args:
             layout: Layout of the unknowns.
 
         Returns:
-            Covariance, shape (n_unknown, n_unknown). The entries of the parameters of the film are zero.
+            Covariance, shape (n_unknown, n_unknown). The entries of the parameters of the film are zero, because a
+            hypothesis describes only other effects.
         """
         # Modes, traces and nuisances are independent, so their part of the matrix is diagonal.
         variance = np.zeros(layout.count)
@@ -77,8 +81,9 @@ class Hypothesis:
         variance[layout.nuisances] = np.square(self.nuisance_stds)
         covariance = np.diag(variance)
 
-        # The coefficients of one term of the discrepancy are correlated, because part of a discrepancy is common to all
-        # electrodes. Different terms are independent, so their covariance has one equal block for each term.
+        # The coefficients of one term for different electrodes are correlated, because a part of the discrepancy is
+        # common to all electrodes. Different terms are independent. Therefore, the covariance of all coefficients is
+        # block diagonal, with the same block for each term.
         electrode_count = len(layout.electrode_names)
         electrode_covariance = np.eye(electrode_count) + COMMON**2
         term_covariance = np.kron(np.eye(term_count()), electrode_covariance)
@@ -86,7 +91,7 @@ class Hypothesis:
         return covariance
 
     def has(self, effect: str) -> bool:
-        """Return whether the hypothesis includes an effect.
+        """Return whether the hypothesis includes an effect, that is, whether the size of the effect is not zero.
 
         Args:
             effect: "modes", "discrepancy", "traces", "force_scatter", or the name of a nuisance.
@@ -101,13 +106,13 @@ class Hypothesis:
 
 
 def hypotheses() -> Iterator[Hypothesis]:
-    """Yield all hypotheses that are considered.
+    """Yield all hypotheses that are considered (generator).
 
-    The first hypotheses are all combinations of modes, discrepancy, nuisances and force scatter. A hypothesis with
-    modes always has a discrepancy as well, because the modes are computed to first order and never explain the charges
-    completely. The last hypotheses have traces, together with modes and each size of the discrepancy.
+    The first hypotheses are the combinations of modes, discrepancy, nuisances and force scatter. A hypothesis with
+    modes always includes a discrepancy, because the modes are computed to first order and never explain the charges
+    completely. The last hypotheses combine traces with modes and with each size of the discrepancy except zero.
     """
-    # Each effect has several possible sizes. A combination contains one pair (size, probability) of each effect.
+    # Each effect has several possible sizes. A combination contains one pair (size, probability) for each effect.
     nuisance_stds_and_probabilities = [nuisance.probabilities for nuisance in NUISANCES]
     combinations = product(
         MODE_SIZES.items(), DISCREPANCY_SIZES.items(), *nuisance_stds_and_probabilities, FORCE_SCATTERS.items()
@@ -139,13 +144,14 @@ def hypotheses() -> Iterator[Hypothesis]:
 class LinearModel(NamedTuple):
     """Normal equations of a linear model of the residuals of presses.
 
-    If u is the deviation of the unknowns from their mean before the presses, the sum of squared residuals is
-    `square` + 2 `moment` u + u `normal` u.
+    Let u be the deviation of the unknowns from their mean before the presses. In the linear model, the sum of squared
+    residuals is u' normal u + 2 moment' u + square.
 
     Attributes:
         normal: Matrix of the normal equations, shape (n_unknown, n_unknown).
         moment: Half the gradient of the sum of squares at u = 0, shape (n_unknown,).
-        square: Sum of squares at u = 0, plus the logarithm of the determinant of the covariance of the residuals.
+        square: Sum of squares at u = 0. If noise was added to the model, this value also includes the logarithm of the
+            determinant of the covariance of the residuals.
     """
 
     normal: Array
@@ -171,17 +177,20 @@ class LinearModel(NamedTuple):
     def with_added_noise(
         self, jacobian: Array, residual: Array, deviation: Array, noise_variance: Array
     ) -> "LinearModel":
-        """Add noise along some orthogonal directions to the residuals of the model.
+        """Return a model whose residuals have additional noise along some orthogonal directions.
 
-        Noise of the variance v reduces the weight of the squared residual along its direction from 1 to 1 / (1 + v).
+        If noise with the variance v is added along a direction, the weight of the squared residual along this direction
+        decreases from 1 to 1 / (1 + v).
 
         Args:
-            jacobian: Derivatives of the residuals along the directions, shape (n_direction, n_unknown).
-            residual: Residuals along the directions, shape (n_direction,).
+            jacobian: Derivatives of the components of the residuals along the directions, shape (n_direction,
+                n_unknown).
+            residual: Components of the residuals along the directions, shape (n_direction,).
             deviation: Difference of the unknowns from their mean before the presses, as in `of`, shape (n_unknown,).
             noise_variance: Variance of the additional noise along each direction, shape (n_direction,).
         """
-        # The noise removes the share v / (1 + v) of each squared residual. The root scales the residual itself.
+        # The weight decreases by the share v / (1 + v). A residual that is multiplied by the square root of this share
+        # contributes the share to the sum of squares, which is then subtracted.
         root_share = np.sqrt(noise_variance / (1.0 + noise_variance))
         removed = LinearModel.of(root_share[:, None] * jacobian, root_share * residual, deviation)
         log_determinant = float(np.log1p(noise_variance).sum())
@@ -192,11 +201,15 @@ class LinearModel(NamedTuple):
         )
 
     def log_evidence(self, prior_covariance: Array) -> float:
-        """Return the logarithm of the evidence of the presses, up to a constant.
+        """Return the logarithm of the evidence, up to a constant.
+
+        The evidence is the probability density of the presses for a given prior covariance.
 
         Args:
             prior_covariance: Covariance of the unknowns before the presses, shape (n_unknown, n_unknown).
         """
+        # The part of the sum of squares that the unknowns explain is subtracted. The determinant is that of the
+        # precision, and the product of the diagonal of its Cholesky factor is the root of this determinant.
         solution = self._solve(prior_covariance)
         explained_square = solution.moment @ solution.step
         half_log_determinant = np.log(np.diag(solution.precision_factor)).sum()
@@ -212,14 +225,15 @@ class LinearModel(NamedTuple):
             Change of the mean by the presses, shape (n_unknown,), and covariance after the presses, shape (n_unknown,
             n_unknown). The mean of unknowns without a variance before the presses does not change.
         """
-        # The solution is in units of the root L of the prior covariance L L'. It contains only active unknowns, which
-        # have a variance before the presses.
+        # The solution contains only the active unknowns, which have a variance before the presses. The solution is in
+        # units of the root L of their covariance L L' before the presses.
         solution = self._solve(prior_covariance)
         active = solution.active
         mean_change = np.zeros(len(active))
         mean_change[active] = -solution.prior_root @ solution.step
 
-        # Covariance L P^-1 L' with the precision P, whose Cholesky factor is a lower triangular matrix (True)
+        # Covariance L P^-1 L' with the precision P. The argument True states that the Cholesky factor of P is a lower
+        # triangular matrix.
         covariance = np.zeros_like(prior_covariance)
         whitened_covariance = cho_solve((solution.precision_factor, True), solution.prior_root.T)
         covariance[np.ix_(active, active)] = solution.prior_root @ whitened_covariance
@@ -235,8 +249,8 @@ class LinearModel(NamedTuple):
         active_block = np.ix_(active, active)  # rows and columns of the active unknowns
         prior_root = np.asarray(np.linalg.cholesky(prior_covariance[active_block]), np.float64)
 
-        # In units of this root L, the unknowns have the covariance 1 before the presses. With the normal matrix N, the
-        # inverse of their covariance after the presses is therefore the precision 1 + L' N L.
+        # In units of the root L, the covariance of the unknowns before the presses is the identity matrix. Their
+        # precision after the presses (the inverse of the covariance) is then 1 + L' N L, where N is the normal matrix.
         precision = np.eye(len(prior_root)) + prior_root.T @ self.normal[active_block] @ prior_root
         precision_factor = np.asarray(np.linalg.cholesky(precision), np.float64)
         moment = prior_root.T @ self.moment[active]
@@ -245,16 +259,20 @@ class LinearModel(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """Solution of normal equations for unknowns whose covariance before the presses is the identity matrix.
+    """Solution of the normal equations for scaled unknowns.
+
+    The active unknowns are those that have a variance before the presses. They equal the prior root times the scaled
+    unknowns. The covariance of the scaled unknowns before the presses is the identity matrix.
 
     Attributes:
-        active: Which unknowns have a variance before the presses, shape (n_unknown,).
-        prior_root: Cholesky factor of the covariance of the active unknowns before the presses. It is the unit of the
-            active unknowns in the attributes below.
-        precision_factor: Cholesky factor of the inverse of the covariance of the active unknowns after the presses.
-        moment: Half the gradient of the sum of squares with respect to the active unknowns, shape (n_active,).
-        step: Inverse of the precision times `moment`, shape (n_active,). The presses change the mean by minus this
-            step.
+        active: Whether each unknown is active, shape (n_unknown,).
+        prior_root: Cholesky factor of the covariance of the active unknowns before the presses, shape (n_active,
+            n_active).
+        precision_factor: Cholesky factor of the precision, which is the inverse of the covariance of the scaled
+            unknowns after the presses, shape (n_active, n_active).
+        moment: Half the gradient of the sum of squares with respect to the scaled unknowns, shape (n_active,).
+        step: Inverse of the precision times `moment`, shape (n_active,). The presses change the mean of the scaled
+            unknowns by minus this step.
     """
 
     active: Booleans
@@ -265,13 +283,13 @@ class _Solution(NamedTuple):
 
 
 class Mixture(NamedTuple):
-    """Estimate of the unknowns over all hypotheses.
+    """Estimate of the unknowns as an average over all hypotheses.
 
     Attributes:
-        mean: Change of the mean by the presses, shape (n_unknown,).
-        covariance: Covariance after the presses, shape (n_unknown, n_unknown).
+        mean: Change of the mean of the unknowns by the presses, shape (n_unknown,).
+        covariance: Covariance of the unknowns after the presses, shape (n_unknown, n_unknown).
         probabilities: Probability of each hypothesis after the presses.
-        log_evidence: Logarithm of the evidence of the presses, up to a constant.
+        log_evidence: Logarithm of the evidence of all hypotheses together, up to a constant.
     """
 
     mean: Array
@@ -287,35 +305,35 @@ class Mixture(NamedTuple):
 
 def mix_hypotheses(
     models: Mapping[float, LinearModel],
-    prior_covariance: Callable[[Hypothesis], Array],
+    prior_covariance_of: Callable[[Hypothesis], Array],
     considered: Iterable[Hypothesis] | None = None,
 ) -> Mixture:
-    """Compute the probability of each hypothesis, and return the mixture of their estimates.
+    """Compute the probability of each hypothesis, and average the estimates of the unknowns over the hypotheses.
 
-    Hypotheses with a probability below `NEGLIGIBLE_PROBABILITY` are left out of the mixture.
+    Hypotheses with a probability of at most `NEGLIGIBLE_PROBABILITY` are ignored in the average.
 
     Args:
         models: Linear model of the residuals for each value of `Hypothesis.force_scatter`.
-        prior_covariance: Function that returns the covariance of the unknowns before the presses for a hypothesis.
-        considered: The hypotheses; by default all.
+        prior_covariance_of: Function that returns the covariance of the unknowns before the presses for a hypothesis.
+        considered: The hypotheses to consider; by default those that `hypotheses` yields.
     """
     all_hypotheses = list(considered or hypotheses())
     log_weights = []  # logarithms of evidence times prior probability
     for hypothesis in all_hypotheses:
         model = models[hypothesis.force_scatter]
-        log_hypothesis_evidence = model.log_evidence(prior_covariance(hypothesis))
+        log_hypothesis_evidence = model.log_evidence(prior_covariance_of(hypothesis))
         log_weights.append(log_hypothesis_evidence + np.log(hypothesis.prior_probability))
     log_evidence = float(logsumexp(log_weights))  # of all hypotheses together
     probabilities = np.exp(np.array(log_weights) - log_evidence)
 
-    # Estimates of the hypotheses that are not negligible
+    # Estimates under the hypotheses that are not negligible
     relevant = np.flatnonzero(probabilities > NEGLIGIBLE_PROBABILITY)
     means = []
     covariances = []
     for index in relevant:
         hypothesis = all_hypotheses[index]
         model = models[hypothesis.force_scatter]
-        hypothesis_mean, hypothesis_covariance = model.posterior(prior_covariance(hypothesis))
+        hypothesis_mean, hypothesis_covariance = model.posterior(prior_covariance_of(hypothesis))
         means.append(hypothesis_mean)
         covariances.append(hypothesis_covariance)
 
@@ -327,12 +345,13 @@ def mix_hypotheses(
 def _mixture_moments(probabilities: Array, means: Sequence[Array], covariances: Sequence[Array]) -> tuple[Array, Array]:
     """Return the mean and the covariance of a mixture of normal distributions.
 
-    By the law of total covariance, the covariance is the mean of the covariances plus the covariance of the means.
+    By the law of total covariance, the covariance of the mixture is the mean of the covariances of the distributions
+    plus the covariance of their means.
 
     Args:
-        probabilities: Probability of each distribution, shape (n,).
-        means: Mean of each distribution, shape (n_unknown,).
-        covariances: Covariance of each distribution, shape (n_unknown, n_unknown).
+        probabilities: Probability of each distribution, shape (n_distribution,).
+        means: Mean of each distribution, each of shape (n_unknown,).
+        covariances: Covariance of each distribution, each of shape (n_unknown, n_unknown).
     """
     mean = np.einsum("h,hu->u", probabilities, means)  # sum over the distributions h
     covariance = np.zeros((len(mean), len(mean)))

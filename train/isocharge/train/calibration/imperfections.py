@@ -1,8 +1,8 @@
 """Effects of traces and of an uneven tension on the charges of a film.
 
-A trace that the sensor file does not describe collects charge beyond the pad of its electrode. Such a trace is modelled
-by several lines of unknown width. The lines lead from the edge of the pad to the rim of the film. To second order, an
-uneven tension acts like a smaller even tension.
+A trace that is missing in the sensor file collects charge outside the pad of its electrode. Such a trace is modelled by
+several lines of unknown width, which lead from the edge of the pad to the rim of the film. The second-order effect of
+an uneven tension is the effect of a smaller, uniform tension.
 """
 
 from typing import NamedTuple
@@ -18,31 +18,31 @@ from isocharge.simulate.numerics.polygon import area_of
 from isocharge.train.calibration.discrepancy import TRACE_ANGLES
 
 TRACE_STD_MM = 0.5
-"""Prior standard deviation of the width of a trace that is not described, mm."""
+"""Prior standard deviation of the width of a trace that is missing in the sensor file, mm."""
 
 TRACE_END = 0.93
-"""Distance from the centre at which such traces end, relative to the film's radius.
+"""Distance from the centre at which the modelled traces end, relative to the radius of the film.
 
 The last millimetres before the rim contribute little charge.
 """
 
 LARGEST_SQUARED_RATIO = 0.9
-"""Largest squared ratio of the uneven part of the tension to the mean tension."""
+"""Upper limit of the squared ratio of the uneven part of the tension to the mean tension."""
 
 SLACKENING = 1.75
 """Exponent in `log_unevenness`, which was fitted to full simulations."""
 
 MIN_TENSION = 1e-3
-"""Lower bound for the pretension to which the uneven part is related, MPa."""
+"""Lower limit of the mean tension by which the uneven part of the tension is divided, MPa."""
 
 
 class ModeCharges(NamedTuple):
     """Effects of the modes of a film on the charges of presses.
 
     Attributes:
-        modes: The modes of the film; None in a family without modes.
+        modes: The modes of the film; None if no modes were computed for the family of films.
         sensor: The sensor to which the charges belong.
-        contact: Contacts of the presses, shape (n, 3), mm and N.
+        contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
         mode_jacobian: Derivatives of the charges with respect to the coefficients of the modes, shape (n, n_electrode,
             n_mode), pC.
         log_unevenness: Derivative of ln Q with respect to the unevenness of the tension, shape (n, n_electrode); see
@@ -57,17 +57,17 @@ class ModeCharges(NamedTuple):
 
 
 def trace_lines(sensor: Sensor) -> Array:
-    """Return both ends of the straight lines along which traces may lie.
+    """Return both ends of each straight line along which a trace may lie.
 
-    A line begins at the edge of a pad, which is treated as a circle of the same area. The line ends near the rim, on a
-    circle whose radius is `TRACE_END` times that of the film. The lines of a pad have the angles `TRACE_ANGLES` to the
-    direction from the centre of the film to the pad.
+    Each line begins at the edge of the pad of an electrode. The pad is treated as a circle of the same area. The line
+    ends near the rim, on a circle whose radius is `TRACE_END` times the radius of the film. Each pad has one line for
+    each angle in `TRACE_ANGLES`. A line with the angle 0 has the direction from the centre of the film to the pad.
 
     Args:
-        sensor: Sensor with the pads.
+        sensor: Sensor with the film and the pads of the electrodes.
 
     Returns:
-        Points (x, y), shape (n_electrode, n_line, 2, 2), mm.
+        Points (x, y), shape (n_electrode, n_line, 2, 2), mm. The third axis is the start and the end of the line.
     """
     end_radius = TRACE_END * sensor.film.radius
     # Points and directions in the plane are complex numbers x + i y, with one row for each electrode and one column for
@@ -77,8 +77,8 @@ def trace_lines(sensor: Sensor) -> Array:
     pad_radius = np.sqrt(np.array(areas) / np.pi)[:, None]
     direction = np.exp(1j * (np.angle(centre) + np.deg2rad(TRACE_ANGLES)))
 
-    # Distance s from the centre c of the pad to the circle with `end_radius`, along the direction d of the line: the
-    # positive solution of |c + s d| = end_radius. The projection is the scalar product of c and d.
+    # The distance s from the centre c of the pad to the circle with `end_radius` along the direction d of the line is
+    # the positive solution of |c + s d| = end_radius. The projection is the scalar product of c and d.
     projection = (centre.conj() * direction).real
     distance_to_end = np.sqrt(projection**2 + end_radius**2 - np.abs(centre) ** 2) - projection
     # Start and end of each line, shape (n_electrode, n_line, 2)
@@ -91,76 +91,81 @@ def trace_charges(forward_map: ForwardMap, lines: Array, contact: Array) -> Arra
 
     Args:
         forward_map: Forward map of the film.
-        lines: Ends of the lines, as `trace_lines` returns them.
+        lines: Both ends of each line, as `trace_lines` returns them.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
     Returns:
-        Charges, shape (n, n_electrode, n_electrode * n_line), pC. A line adds charge to its own electrode only.
+        Charges, shape (n, n_electrode, n_electrode * n_line), pC. The second axis is the electrode that receives the
+        charge, and the last axis is the line. A line adds charge only to its own electrode.
     """
     n_electrode = len(lines)
     points = ReadoutPoints.along(forward_map.sensor, lines)
     charge_per_mm = forward_map.field_charges(contact, EVEN_FIELD, points)
-    line_charge = TRACE_STD_MM * charge_per_mm.reshape(len(contact), n_electrode, 1, -1)  # (n, electrode, 1, line)
+    # Axes: contact, electrode of the line, an axis of length 1, line
+    line_charge = TRACE_STD_MM * charge_per_mm.reshape(len(contact), n_electrode, 1, -1)
 
-    # The first axis is the electrode that receives the charge, and the second axis is the electrode of the line.
+    # The matrix is 1 if the electrode that receives the charge (first axis) is the electrode of the line (second axis).
     is_own_electrode = np.eye(n_electrode)[:, :, None]
     charge_by_line = line_charge * is_own_electrode  # shape (n, n_electrode, n_electrode, n_line)
     return np.asarray(charge_by_line.reshape(len(contact), n_electrode, -1))
 
 
 def trace_widths(coefficients: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return the total width of the traces of each electrode, and its standard deviation.
+    """Return the total width of the traces of each electrode, and the standard deviation of this width.
 
     Args:
-        coefficients: Coefficients of the lines, shape (n_electrode * n_line,).
-        covariance: Covariance of the coefficients.
+        coefficients: Coefficients of the lines, shape (n_electrode * n_line,). A coefficient is the width of a line
+            divided by `TRACE_STD_MM`.
+        covariance: Covariance of the coefficients, shape (n_electrode * n_line, n_electrode * n_line).
 
     Returns:
         Widths and standard deviations, each of shape (n_electrode,), mm.
     """
     n_electrode = coefficients.size // len(TRACE_ANGLES)
-    # The matrix adds the widths of all lines of an electrode.
+    # This matrix converts coefficients to widths and adds the widths of all lines of an electrode, shape (n_electrode,
+    # n_electrode * n_line).
     width_matrix = TRACE_STD_MM * np.eye(n_electrode).repeat(len(TRACE_ANGLES), axis=1)
     width_covariance = width_matrix @ covariance @ width_matrix.T
     return width_matrix @ coefficients, np.sqrt(np.diag(width_covariance))
 
 
 def tension_unevenness(pretension: float, tension_stds: Array, coefficients: Array) -> tuple[float, Array]:
-    """Compute the unevenness 1 - sqrt(1 - (e / T)^2) of the tension.
+    """Compute the unevenness of the tension, 1 - sqrt(1 - (e / T)^2), and its derivatives.
 
-    A membrane with the tensions T + e and T - e along two axes deflects like a membrane with the uniform tension
-    sqrt(T^2 - e^2).
+    Here T is the mean tension, and e is the uneven part of the tension. A membrane with the tensions T + e and T - e
+    along two perpendicular axes deflects like a membrane with the uniform tension sqrt(T^2 - e^2).
 
     Args:
-        pretension: Mean pretension T, MPa.
-        tension_stds: Standard deviation of the uneven tension of each mode, shape (n_mode,), MPa; zero for other modes.
+        pretension: Mean tension T, MPa.
+        tension_stds: Standard deviation of the uneven tension of each mode, shape (n_mode,), MPa; zero for a mode that
+            is no uneven tension.
         coefficients: Coefficients of the modes, in standard deviations, shape (n_mode,).
 
     Returns:
         Unevenness, dimensionless, and its derivatives with respect to the coefficients, shape (n_mode,). The derivative
-        for a coefficient c with the standard deviation s is (s / T)^2 c / sqrt(1 - (e / T)^2).
+        with respect to a coefficient c with the standard deviation s is (s / T)^2 c / sqrt(1 - (e / T)^2).
     """
     relative_stds = tension_stds / max(pretension, MIN_TENSION)
-    squared_ratio = float(((relative_stds * coefficients) ** 2).sum())  # (e / T)^2, summed over independent modes
+    squared_ratio = float(((relative_stds * coefficients) ** 2).sum())  # (e / T)^2, the sum over all modes
     root = np.sqrt(1.0 - min(squared_ratio, LARGEST_SQUARED_RATIO))
     unevenness = 1.0 - root
-    if squared_ratio >= LARGEST_SQUARED_RATIO:  # the unevenness is limited here and no longer changes
+    if squared_ratio >= LARGEST_SQUARED_RATIO:  # beyond the limit, the unevenness is constant
         return unevenness, np.zeros_like(coefficients)
     return unevenness, relative_stds**2 * coefficients / root
 
 
 def log_unevenness(log_tension_derivative: Array) -> Array:
-    """Compute the derivative of ln Q with respect to the unevenness of the tension.
+    """Compute the derivative of ln Q with respect to the unevenness of the tension, where Q is the charge.
 
-    The derivative is x (1 - (1 - x / 2)^SLACKENING), where x = -d ln Q / d ln T. The effect of the tension is smaller
-    if the press itself stretches the film.
+    The derivative is s (1 - (1 - s / 2)^SLACKENING). Here s = -d ln Q / d ln T is the sensitivity of the charge to the
+    mean tension T. The sensitivity is small if the press itself stretches the film strongly.
 
     Args:
         log_tension_derivative: Derivatives d ln Q / d ln T, shape (n, n_electrode), dimensionless.
 
     Returns:
-        Derivatives, shape (n, n_electrode), dimensionless.
+        Derivatives of ln Q with respect to the unevenness, shape (n, n_electrode), dimensionless.
     """
-    x = -log_tension_derivative
-    base = np.clip(1.0 - 0.5 * x, 0.0, 1.0)
-    return np.asarray(x * (1.0 - base**SLACKENING))
+    sensitivity = -log_tension_derivative
+    base = np.clip(1.0 - 0.5 * sensitivity, 0.0, 1.0)  # the power is defined only for a base that is not negative
+    return np.asarray(sensitivity * (1.0 - base**SLACKENING))

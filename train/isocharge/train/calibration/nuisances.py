@@ -1,11 +1,11 @@
-"""Nuisances of a session, which are unknowns of the fit that are not properties of the film.
+"""Nuisances of a session: unknowns of a fit that are not properties of the film.
 
-`NUISANCES` declares each nuisance once: its name and unit, its standard deviation before the presses, and its effect on
-the charges or on the pretension. All effects are proportional to the value of the nuisance, so that the derivatives
-follow from the effect of the value 1.
+Each nuisance in `NUISANCES` defines its name, its unit, its prior standard deviation, and its effect on the charges or
+on the pretension. The effect of a nuisance is proportional to its value. Therefore, the derivative with respect to a
+nuisance is the effect of the value 1.
 
-Nuisances are not stored after the session. The only exception is the change of the pretension with temperature
-(`problem.Warming`), which the next calibration needs.
+Nuisances are not stored after the session, with one exception. The change of the pretension with temperature is stored
+as `problem.Warming`, because the next calibration needs it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,13 +32,13 @@ class NuisanceEstimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Nuisance:
-    """Declaration of a nuisance. Each kind of nuisance is a subclass that defines the effect of the nuisance.
+    """Declaration of a nuisance. Each subclass defines the effect of one kind of nuisance.
 
     Attributes:
         name: Name of the nuisance.
-        unit: Unit of the nuisance.
-        probabilities: Considered standard deviations before the presses, each with its prior probability. The presses
-            determine which of these hypotheses is probable (`hypotheses`). By default, only zero is considered.
+        unit: Unit of the value of the nuisance.
+        probabilities: Pairs of a standard deviation before the presses and its prior probability. Each standard
+            deviation is considered as a hypothesis (see `hypotheses`). By default, only zero is considered.
         std_with_temperatures: Standard deviation before the presses if the temperatures of the presses are known; zero
             for a nuisance that does not depend on temperature.
     """
@@ -49,22 +49,48 @@ class Nuisance:
     std_with_temperatures: float = 0.0
 
     def charge_error(self, data: PressData, value: float) -> Array:
-        """Return the charges that the nuisance adds to the measured charges, shape (n, n_electrode), pC."""
-        del value
+        """Return the charges that the nuisance adds to the measured charges; zero by default.
+
+        Args:
+            data: The measured presses.
+            value: Value of the nuisance.
+
+        Returns:
+            Added charges, shape (n, n_electrode), pC.
+        """
+        del value  # not used by a nuisance that adds no charge
         return np.zeros_like(data.charge)
 
     def tension_change(self, data: PressData, value: float) -> Array:
-        """Return the change of the pretension during each press, shape (n,), MPa."""
-        del value
+        """Return the change of the pretension that the nuisance causes during each press; zero by default.
+
+        Args:
+            data: The measured presses.
+            value: Value of the nuisance.
+
+        Returns:
+            Changes of the pretension, shape (n,), MPa.
+        """
+        del value  # not used by a nuisance that does not change the pretension
         return np.zeros(len(data))
 
     def gain_std(self, estimate: NuisanceEstimate) -> float:
-        """Return the relative standard deviation that the nuisance adds to all gains when the film is used later."""
-        del estimate
+        """Return the relative standard deviation that the nuisance adds to all gains when the film is used later.
+
+        By default, a nuisance does not affect the later use of the film.
+
+        Args:
+            estimate: Estimate of the nuisance.
+        """
+        del estimate  # not used by a nuisance without an effect on the later use
         return 0.0
 
     def caution(self, estimate: NuisanceEstimate) -> str:
-        """Return the warning for the user if the session probably has this nuisance."""
+        """Return the text that warns the user that the session probably has this nuisance.
+
+        Args:
+            estimate: Estimate of the nuisance.
+        """
         return f"the session has {self.name}: {estimate.value:.2g} +- {estimate.std:.2g} {self.unit}; it is subtracted"
 
 
@@ -72,18 +98,21 @@ class PretensionPerKelvin(Nuisance):
     """Change of the pretension with temperature, which occurs because film and ring expand differently."""
 
     def tension_change(self, data: PressData, value: float) -> Array:
-        """Return the change of the pretension relative to that at the mean temperature of the presses."""
+        """Return the pretension during each press minus the pretension at the mean temperature, shape (n,), MPa."""
         return value * data.warming_K
 
 
 class PretensionPerFilmExcess(Nuisance):
     """Change of the pretension for each kelvin by which the film is warmer than its ring.
 
-    A film that is warmer than its ring slackens.
+    If the film is warmer than its ring, the pretension decreases.
     """
 
     def tension_change(self, data: PressData, value: float) -> Array:
-        """Return the change of the pretension relative to that at the mean temperature difference."""
+        """Return the pretension during each press minus the pretension at the mean excess, shape (n,), MPa.
+
+        The excess is the temperature of the film minus the temperature of its ring.
+        """
         return value * data.film_excess_K
 
 
@@ -91,11 +120,11 @@ class ChargeOffset(Nuisance):
     """Common offset of all charges, for example because of a wrong tare."""
 
     def charge_error(self, data: PressData, value: float) -> Array:
-        """Return the offset for every charge."""
+        """Return the offset as the error of every charge, shape (n, n_electrode), pC."""
         return np.full_like(data.charge, value)
 
     def caution(self, estimate: NuisanceEstimate) -> str:
-        """Return the warning about the tare."""
+        """Return a warning that the tare may be wrong."""
         return (
             f"the charges are {estimate.value:.2g} +- {estimate.std:.2g} pC too large in all presses and electrodes: "
             "is the tare right? The offset is subtracted"
@@ -103,18 +132,25 @@ class ChargeOffset(Nuisance):
 
 
 class ChargeDrift(Nuisance):
-    """Proportional drift of all charges from the first press to the last."""
+    """Relative drift of all charges during a session, for example because the gain of an amplifier changes."""
 
     def charge_error(self, data: PressData, value: float) -> Array:
-        """Return the drift of each charge, from minus half the drift at the first press to plus half at the last."""
+        """Return the error of each charge that the drift causes, shape (n, n_electrode), pC.
+
+        The relative error changes from minus half of the drift at the first press to plus half of the drift at the last
+        press.
+        """
         return value * data.session_time[:, None] * data.charge
 
     def gain_std(self, estimate: NuisanceEstimate) -> float:
-        """Return the standard deviation of a uniform distribution over the range of the drift."""
+        """Return the standard deviation of a uniform distribution whose width is the drift.
+
+        All gains that occurred during the session are assumed to be equally probable at a later time.
+        """
         return float(np.hypot(estimate.value, estimate.std) / np.sqrt(12.0))
 
     def caution(self, estimate: NuisanceEstimate) -> str:
-        """Return the warning about the drift."""
+        """Return a warning that the charges drift."""
         return (
             f"the charges are {100.0 * estimate.value:.2g} +- {100.0 * estimate.std:.2g} % larger at the end than at "
             "the beginning: does an amplifier drift? The drift is subtracted"
@@ -122,10 +158,10 @@ class ChargeDrift(Nuisance):
 
 
 class Friction(Nuisance):
-    """Coefficient of friction of the tip, if the presses were made on a vertical stage; see `side_forces`."""
+    """Coefficient of friction between tip and film, for presses on a vertical stage; see `side_forces`."""
 
     def charge_error(self, data: PressData, value: float) -> Array:
-        """Return the charges that friction adds."""
+        """Return the charges that friction adds, shape (n, n_electrode), pC."""
         return value * data.friction_charge
 
 
@@ -136,7 +172,7 @@ Its standard deviation before the presses is E da / (1 - nu), which is 0.3 to 0.
 """
 
 PRETENSION_PER_FILM_EXCESS = PretensionPerFilmExcess("pretension_per_film_K", "MPa/K", std_with_temperatures=0.6)
-"""Change of the pretension per kelvin of the film above its ring.
+"""Change of the pretension per kelvin by which the film is warmer than its ring.
 
 Its standard deviation before the presses exceeds E a / (1 - nu), which is 0.4 to 0.55 MPa/K.
 """
@@ -159,12 +195,16 @@ NUISANCES: tuple[Nuisance, ...] = (
 
 
 def film_warming_sentences(estimates: Mapping[str, NuisanceEstimate]) -> Iterator[str]:
-    """Yield a sentence about the effect of a film that is warmer than its ring, if the presses determine the effect.
+    """Yield a sentence on how the pretension changes if the film is warmer than its ring (generator).
+
+    Nothing is yielded if the presses hardly determine this change.
 
     Args:
         estimates: Estimates of the nuisances by name.
     """
     estimate = estimates[PRETENSION_PER_FILM_EXCESS.name]
+    # A standard deviation of zero means that the temperatures are unknown. The presses determine the change if they at
+    # least halve its standard deviation.
     if 0.0 < estimate.std <= 0.5 * PRETENSION_PER_FILM_EXCESS.std_with_temperatures:
         yield (
             f"The pretension changes by {estimate.value:.3g} +- {estimate.std:.2g} MPa per kelvin that the film is "
@@ -173,11 +213,14 @@ def film_warming_sentences(estimates: Mapping[str, NuisanceEstimate]) -> Iterato
 
 
 def without_nuisances(data: PressData, values: Sequence[float] | Array) -> PressData:
-    """Subtract the charges of the nuisances from presses, and set the pretension during each press.
+    """Subtract the charges of the nuisances from measured presses, and set the change of the pretension of each press.
 
     Args:
         data: The presses as they were measured.
         values: Value of each nuisance, in the order of `NUISANCES`.
+
+    Returns:
+        A copy of the presses with corrected `charge` and with `tension_change`.
     """
     charge = data.charge
     tension_change = np.zeros(len(data))
@@ -190,8 +233,8 @@ def without_nuisances(data: PressData, values: Sequence[float] | Array) -> Press
 def nuisance_derivatives(data: PressData, pretension_derivative: Array) -> Array:
     """Compute the derivatives of the residuals with respect to the nuisances.
 
-    A nuisance adds charge, or changes the pretension, in proportion to its value. The effects of a value of 1 are
-    therefore the derivatives.
+    A nuisance adds charge or changes the pretension in proportion to its value. Therefore, the derivatives are the
+    effects of the value 1.
 
     Args:
         data: The presses as they were measured.
@@ -205,7 +248,7 @@ def nuisance_derivatives(data: PressData, pretension_derivative: Array) -> Array
     derivatives = []
     for nuisance in NUISANCES:
         charge_derivative = data.weight * nuisance.charge_error(data, 1.0)
-        by_charge = np.column_stack([charge_derivative, rig_derivative])
-        by_tension = pretension_derivative * nuisance.tension_change(data, 1.0)[:, None]
-        derivatives.append(by_charge + by_tension)
+        effect_by_charge = np.column_stack([charge_derivative, rig_derivative])
+        effect_by_pretension = pretension_derivative * nuisance.tension_change(data, 1.0)[:, None]
+        derivatives.append(effect_by_charge + effect_by_pretension)
     return np.stack(derivatives, axis=2)

@@ -1,4 +1,4 @@
-"""Picture of a calibration with maps of the contact error, intervals of the quantities, and residuals."""
+"""Picture of a calibration, with maps of the contact error, intervals of the quantities, and residuals."""
 
 from typing import Any
 
@@ -15,14 +15,18 @@ from isocharge.train.calibration.quantities import NORMAL_95
 from isocharge.train.calibration.result import CalibrationResult
 
 LEVELS_MM = (0.02, 5.0)
-"""Errors at the ends of the colours, mm."""
+"""Position errors at both ends of the colour scale, mm."""
 
 ASSUMED = "#b9c4cf"
+"""Colour of the estimates before the presses."""
+
 FITTED = "#3a7ca5"
-"""Colours of the estimates before and after the presses."""
+"""Colour of the estimates after the presses, and of the residuals of good presses."""
 
 NEIGHBOURS = 12
-"""Number of contacts over which the map of the error is smoothed, because neighbours have different forces."""
+"""Number of neighbouring contacts over which the map of the error is averaged.
+
+The map is averaged, because neighbouring contacts have different forces."""
 
 MAX_DRAWN_RESIDUAL = 10.0
 """Height of the largest bar of a residual, relative to the expected size of the residual."""
@@ -32,10 +36,13 @@ MAX_TICKS = 20
 
 
 def calibration_picture(result: CalibrationResult) -> Figure:
-    """Draw maps of the remaining error, the quantities in units of their prior, and the residuals of the presses.
+    """Draw the picture of a calibration.
+
+    The picture contains maps of the position error before and after the presses, the intervals of the quantities, and
+    the residuals of the presses.
 
     Args:
-        result: The calibration.
+        result: Result of the calibration.
     """
     figure = new_figure(11.0, 8.8)
     (before_axes, after_axes), (quantity_axes, residual_axes) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
@@ -46,11 +53,11 @@ def calibration_picture(result: CalibrationResult) -> Figure:
         before_title = "before the presses"
         after_title = f"after {len(result.presses)} presses"
     _draw_error(before_axes, result, result.error_left_before, before_title)
-    shades = _draw_error(after_axes, result, result.error_left, after_title)
+    error_areas = _draw_error(after_axes, result, result.error_left, after_title)
     _draw_presses(after_axes, result)
     label = "position error by the film (rms), mm"
     figure.colorbar(
-        shades, ax=[before_axes, after_axes], label=label, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g"
+        error_areas, ax=[before_axes, after_axes], label=label, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g"
     )
 
     _draw_quantities(quantity_axes, result)
@@ -65,7 +72,7 @@ def _draw_presses(axes: Any, result: CalibrationResult) -> None:
 
     Args:
         axes: Axes of matplotlib.
-        result: The calibration.
+        result: Result of the calibration.
     """
     x, y, _ = result.posterior.contact.T
     is_bad = result.posterior.bad
@@ -81,47 +88,49 @@ def _draw_error(axes: Any, result: CalibrationResult, error: ContactError, title
 
     Args:
         axes: Axes of matplotlib.
-        result: The calibration, which contains the positions of the map.
-        error: Errors at these positions.
+        result: The calibration, which defines the contacts of the map.
+        error: Errors of these contacts.
         title: Beginning of the title.
 
     Returns:
         The coloured areas, for which a colour bar can be drawn.
     """
-    # Neighbouring contacts have different forces, so that the map shows the rms error of several neighbours.
+    # Neighbouring contacts have different forces. Therefore, the map shows the rms error over several neighbours.
     x, y, _ = result.sensitivity.contact.T
     distance = np.hypot(x[:, None] - x, y[:, None] - y)  # between all pairs of contacts, shape (n, n)
     nearest = np.argsort(distance, axis=1)[:, :NEIGHBOURS]
     rms_error = np.sqrt((error.each_mm[nearest] ** 2).mean(axis=1))
 
     levels = np.geomspace(*LEVELS_MM, 25)
-    shades = axes.tricontourf(
+    error_areas = axes.tricontourf(
         Triangulation(x, y), np.clip(rms_error, *LEVELS_MM), levels, norm=LogNorm(), cmap="viridis"
     )
     sensor, _ = result.film
-    title = f"{title}:\n{error.position_mm:.2g} mm, {error.force_percent:.2g} % of force (rms)"
-    draw_layout(axes, sensor, result.problem.domain.radius, title)
-    return shades
+    full_title = f"{title}:\n{error.position_mm:.2g} mm, {error.force_percent:.2g} % of force (rms)"
+    draw_layout(axes, sensor, result.problem.domain.radius, full_title)
+    return error_areas
 
 
 def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
     """Draw the 95 % intervals of the quantities before and after the presses.
 
-    The horizontal axis is the difference from the prior mean, in prior standard deviations.
+    The horizontal axis shows the difference of each quantity from its prior mean, in prior standard deviations.
 
     Args:
         axes: Axes of matplotlib.
-        result: The calibration.
+        result: Result of the calibration.
     """
-    quantities = list(result.quantities.values())[::-1]  # rows are numbered from the bottom to the top
-    # Change of the parameters by the presses. A quantity is a weighted sum of parameters, and so is its change.
+    quantities = list(result.quantities.values())[::-1]  # reversed, because rows are numbered from the bottom
+    # Change of the parameters by the presses, in prior standard deviations. The change of a quantity is a weighted sum
+    # of these changes, because the quantity is a weighted sum of the parameters.
     scaled_change = (result.posterior.parameters - result.problem.before.parameters) / result.problem.prior.std
     centre = np.array([quantity.weights @ scaled_change / quantity.before_std for quantity in quantities])
     half_width = np.array([NORMAL_95 * quantity.std / quantity.before_std for quantity in quantities])
     row = np.arange(len(quantities))
     is_identified = np.array([quantity.identified for quantity in quantities])
 
-    # The interval before the presses is from -2 to 2 standard deviations.
+    # The 95 % interval before the presses reaches from about -2 to 2 prior standard deviations. The estimate after the
+    # presses is a white mark in the middle of its interval.
     axes.barh(row, 4.0, left=-2.0, color=ASSUMED, height=0.72, label="before the presses")
     for is_drawn, colour, label in (
         (is_identified, FITTED, "identified"),
@@ -151,13 +160,13 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
 
 
 def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
-    """Draw the residual of each press as a bar, relative to its expected size.
+    """Draw the residual of each press as a bar, relative to the expected size of the residual.
 
-    Residuals above `MAX_DRAWN_RESIDUAL` are drawn with this height. Presses that were left out are red.
+    The height of a bar is limited to `MAX_DRAWN_RESIDUAL`. The bars of presses that were left out have another colour.
 
     Args:
         axes: Axes of matplotlib.
-        result: The calibration.
+        result: Result of the calibration.
     """
     posterior = result.posterior
     lines = result.presses.lines

@@ -1,4 +1,4 @@
-"""Measured presses in the form in which the least-squares fit of a film uses them."""
+"""Measured presses in the form that the least-squares fit of a film uses."""
 
 from dataclasses import dataclass, replace
 
@@ -11,31 +11,38 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 UNKNOWN_FORCE_STD = 1.5
-"""Standard deviation of the logarithm of a force that was not measured, about the middle of the force range."""
+"""Assumed standard deviation of the logarithm of a force that was not measured.
+
+The assumed mean is the middle of the logarithmic range of forces."""
 
 NODE_DISTANCE_MPa = 0.5
-"""Largest distance between pretensions at which charges are computed if the pretension differs between presses."""
+"""Approximate distance between the pretensions at which charges are computed, MPa.
+
+Several pretensions are used only if the pretension differs between the presses."""
 
 
 @dataclass(frozen=True)
 class PressData:
     """Measured presses with the weights of their charges and contacts.
 
-    The residuals of a press are one for each electrode, followed by three for the rig: x, y and ln F.
+    Each press has one residual for each electrode, followed by three residuals of the contact (x, y, ln F) that the rig
+    measured.
 
     Attributes:
-        charge: Charges, shape (n, n_electrode), pC, 0 where unknown.
-        weight: Inverse of the standard deviation of each charge, 1/pC, 0 where unknown.
-        contact: (x, y, ln F), shape (n, 3); the middle of the domain where unknown.
-        contact_weight: Inverse of the standard deviation of each coordinate, shape (n, 3); small where unknown.
-        measured: Which charges and coordinates were measured, shape (n, n_electrode + 3).
-        session_time: Time of each press, from -1/2 for the first press to 1/2 for the last, shape (n,), dimensionless.
-        warming_K: Temperature of each press less the mean temperature, shape (n,), K.
+        charge: Measured charges, shape (n, n_electrode), pC; 0 where unknown.
+        weight: Inverse of the standard deviation of each charge, shape (n, n_electrode), 1/pC; 0 where unknown.
+        contact: Measured contacts (x, y, ln F), shape (n, 3); the middle of the domain where unknown.
+        contact_weight: Inverse of the standard deviation of each coordinate of the contact, shape (n, 3); small where
+            unknown.
+        measured: Whether each charge and each coordinate was measured, shape (n, n_electrode + 3).
+        session_time: Time of each press, from -1/2 for the first press to 1/2 for the last press, shape (n,),
+            dimensionless.
+        warming_K: Temperature of each press minus the mean temperature of all presses, shape (n,), K.
         film_excess_K: Temperature difference between film and ring during each press, minus the mean of this
             difference, shape (n,), K. Zero if the temperature of the film was not measured.
-        tension_change: Pretension during each press less that of the film, shape (n,), MPa.
-        friction_charge: Charges by friction over the coefficient of friction, shape (n, n_electrode), pC; zero for
-            presses without friction.
+        tension_change: Pretension during each press minus the pretension of the film, shape (n,), MPa.
+        friction_charge: Charges that friction adds, divided by the coefficient of friction, shape (n, n_electrode), pC;
+            zero for presses without friction.
     """
 
     charge: Array
@@ -51,15 +58,15 @@ class PressData:
 
     @classmethod
     def of(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
-        """Return the data of measured presses.
+        """Convert measured presses into data for a fit.
 
-        A missing charge has the weight 0. A missing coordinate of a contact is replaced by the centre of the domain,
-        with a standard deviation as large as the domain.
+        A missing charge gets the weight 0. A missing coordinate of a contact is replaced by the centre of the domain,
+        and gets a standard deviation as large as the domain.
 
         Args:
-            presses: The presses.
+            presses: The measured presses.
             noise: Noise of the charges.
-            domain: Contacts for which the films have charges.
+            domain: Range of contacts for which the charges of the films are known.
         """
         has_charge = ~np.isnan(presses.charge_pC)
         charge = np.where(has_charge, presses.charge_pC, 0.0)
@@ -68,7 +75,7 @@ class PressData:
         rig_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
         unknown_std = [domain.radius, domain.radius, UNKNOWN_FORCE_STD]
         temperature_C = temperatures(presses)
-        # Time from the first to the last press, from -0.5 to 0.5; a single press has the time 0.
+        # The presses are assumed to be made at equal intervals. A single press has the time 0.
         session_time = np.linspace(-0.5, 0.5, len(presses)) if len(presses) > 1 else np.zeros(1)
         return cls(
             charge=charge,
@@ -84,7 +91,7 @@ class PressData:
         )
 
     def __getitem__(self, rows: Integers | Booleans) -> "PressData":
-        """Return the data of some presses. Every attribute has one row for each press."""
+        """Return the data of selected presses. Every attribute is an array with one row for each press."""
         return PressData(**{name: column[rows] for name, column in vars(self).items()})
 
     def __len__(self) -> int:
@@ -92,21 +99,21 @@ class PressData:
 
     @property
     def has_charge(self) -> Booleans:
-        """Which charges were measured, shape (n, n_electrode)."""
+        """Whether each charge was measured, shape (n, n_electrode)."""
         return self.measured[:, : self.charge.shape[1]]
 
     @property
     def has_place(self) -> Booleans:
-        """Which positions were measured, shape (n,)."""
+        """Whether both coordinates of each position were measured, shape (n,)."""
         electrode_count = self.charge.shape[1]
         position = self.measured[:, electrode_count : electrode_count + 2]
         return np.asarray(position.all(axis=1))
 
     def with_force_scatter(self, share: float) -> "PressData":
-        """Return the presses with a larger uncertainty of their forces.
+        """Return a copy of the presses in which the forces have a larger uncertainty.
 
         Args:
-            share: Standard deviation of the scatter, relative to the force. It is added in quadrature to that of the
+            share: Standard deviation of the scatter, relative to the force. Its square is added to the variance of the
                 rig.
         """
         x_weight, y_weight, force_weight = self.contact_weight.T
@@ -117,7 +124,7 @@ class PressData:
     def force_derivative(self) -> Array:
         """Return the derivatives of the residuals with respect to the logarithm of the measured force.
 
-        Only the last residual of each press, which is that of the force, depends on the measured force.
+        Only the last residual of each press, the residual of the force, depends on the measured force.
 
         Returns:
             Derivatives, shape (n, n_electrode + 3).
@@ -128,20 +135,21 @@ class PressData:
         return derivative
 
     def pretension_nodes(self, pretension: float, bounds: tuple[float, float]) -> tuple[Array, Array]:
-        """Return the pretensions at which charges are computed, and the weights for the interpolation between them.
+        """Return the pretensions at which charges are computed, and the weights for an interpolation at each press.
 
-        The pretensions are Chebyshev nodes in the range that the presses cover, with weights for Lagrange's
-        interpolation. If all presses have the same pretension, this pretension is the only node.
+        The returned pretensions are Chebyshev nodes over the range of the pretensions during the presses. The weights
+        are those of Lagrange's interpolation. If all presses have the same pretension, this pretension is the only
+        node.
 
         Args:
             pretension: Pretension of the film, MPa.
             bounds: Smallest and largest pretension that a film may have, MPa.
 
         Returns:
-            Pretensions, shape (k,), MPa, and the weight of each pretension for each press, shape (n, k).
+            Nodes, shape (k,), MPa, and the weight of each node for each press, shape (n, k).
         """
         press_pretensions = np.clip(pretension + self.tension_change, *bounds)  # shape (n,)
-        low = float(press_pretensions.min(initial=np.inf))
+        low = float(press_pretensions.min(initial=np.inf))  # infinite if there are no presses
         high = float(press_pretensions.max(initial=-np.inf))
         if high <= low:  # all presses have the same pretension, or there are no presses
             return np.array([low]), np.ones((len(self), 1))
@@ -152,14 +160,18 @@ class PressData:
         return nodes, weights
 
     def residual(self, charge: Array, contact: Array) -> Array:
-        """Return the residuals in units of their standard deviations, shape (n, n_electrode + 3).
+        """Return the residuals of the presses for given contacts, divided by their standard deviations.
 
         Args:
-            charge: Charges that a film has under the contacts, shape (n, n_electrode), pC.
+            charge: Charges of a film at these contacts, shape (n, n_electrode), pC.
             contact: Contacts (x, y, ln F), shape (n, 3).
+
+        Returns:
+            Residuals, shape (n, n_electrode + 3).
         """
         charge_residual = self.weight * (charge - self.charge)
-        return np.column_stack([charge_residual, self.contact_weight * (contact - self.contact)])
+        rig_residual = self.contact_weight * (contact - self.contact)
+        return np.column_stack([charge_residual, rig_residual])
 
     def residual_slopes(self, charge_slopes: Array) -> Array:
         """Return the derivatives of the residuals with respect to the contact (x, y, ln F).
@@ -171,15 +183,19 @@ class PressData:
             Derivatives, shape (n, n_electrode + 3, 3).
         """
         charge_residual_slopes = self.weight[:, :, None] * charge_slopes
-        # Each residual of the rig depends only on its own coordinate: a diagonal matrix for each press.
+        # Each residual of the rig depends only on its own coordinate, so its derivatives form a diagonal matrix.
         rig_residual_slopes = self.contact_weight[:, :, None] * np.eye(3)
         return np.concatenate([charge_residual_slopes, rig_residual_slopes], axis=1)
 
 
 def temperatures(presses: MeasuredPresses) -> Array:
-    """Return the temperature of every press, shape (n,), degrees Celsius; 0 if no temperature was measured.
+    """Return the temperature of each press, shape (n,), degrees Celsius.
 
-    Missing temperatures are interpolated between those of the presses before and after.
+    A missing temperature is interpolated between the temperatures of the previous and the next press. If no temperature
+    was measured, zeros are returned.
+
+    Args:
+        presses: The measured presses.
     """
     if presses.temperature_C is None or not presses.knows_temperature:
         return np.zeros(len(presses))
@@ -187,7 +203,14 @@ def temperatures(presses: MeasuredPresses) -> Array:
 
 
 def _film_excess(presses: MeasuredPresses) -> Array:
-    """Return the temperature differences between film and ring, minus their mean over the presses, shape (n,), K."""
+    """Return the temperature difference between film and ring for each press, minus the mean difference.
+
+    Args:
+        presses: The measured presses.
+
+    Returns:
+        Differences, shape (n,), K. Zeros if the temperature of the film was not measured.
+    """
     if presses.film_temperature_C is None or not presses.knows_film_temperature:
         return np.zeros(len(presses))
     excess = _without_gaps(presses.film_temperature_C) - temperatures(presses)
@@ -195,14 +218,21 @@ def _film_excess(presses: MeasuredPresses) -> Array:
 
 
 def _without_gaps(temperature_C: Array) -> Array:
-    """Interpolate missing temperatures between those of the presses before and after, shape (n,), degrees Celsius."""
-    press = np.arange(len(temperature_C))
+    """Interpolate each missing temperature between the temperatures of the previous and the next press.
+
+    Args:
+        temperature_C: Temperatures, shape (n,), degrees Celsius; NaN where missing. At least one is measured.
+
+    Returns:
+        Temperatures without gaps, shape (n,), degrees Celsius.
+    """
+    press_index = np.arange(len(temperature_C))
     is_measured = np.isfinite(temperature_C)
-    return np.interp(press, press[is_measured], temperature_C[is_measured])
+    return np.interp(press_index, press_index[is_measured], temperature_C[is_measured])
 
 
 def no_presses(electrodes: tuple[str, ...]) -> MeasuredPresses:
-    """Return an empty list of presses for electrodes of these names."""
+    """Create an empty list of presses for electrodes with the given names."""
     return MeasuredPresses(
         contact=np.empty((0, 3)),
         charge_pC=np.empty((0, len(electrodes))),

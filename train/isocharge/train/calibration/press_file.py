@@ -1,11 +1,11 @@
-"""CSV file of a press session, with a second file that states on which sensor the presses are made.
+"""CSV file of a press session, with a hidden second file that contains the sensor and the probe of the session.
 
-The file `presses.csv` contains the measured presses, and is replaced as a whole after each press. The file is therefore
-complete at any time, so that an interrupted session can be continued.
+The file `presses.csv` contains the measured presses. After each press, the whole file is replaced. Therefore, the file
+is complete at any time, and an interrupted session can be continued.
 
-The file `.presses.csv.session.json` contains the sensor and the probe of the session. The content of this file prevents
-a session from being continued with another sensor or probe. The process that takes presses locks this file, so that no
-other process writes to the file of presses.
+The hidden file `.presses.csv.session.json` contains the sensor and the probe of the session. Before a session is
+continued, its sensor and probe are compared with the content of the hidden file. The process that runs the session
+locks the hidden file. Therefore, no other process can write to `presses.csv` at the same time.
 """
 
 import json
@@ -24,10 +24,10 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 
 
 class PressFile:
-    """File of the presses of one sensor and one probe; `open_press_file` creates it.
+    """File of presses that are made on one sensor with one probe, as `open_press_file` opens it.
 
     Attributes:
-        path: The file of presses.
+        path: Path of the file of presses.
     """
 
     def __init__(self, path: Path, sensor: Sensor) -> None:
@@ -38,11 +38,13 @@ class PressFile:
         """Return the presses of an earlier session, or None if there are none.
 
         Args:
-            position_std_mm: Standard deviation of x and y of presses for which the file states none, mm.
-            force_std: Standard deviation of the force of such presses, relative to the force.
+            position_std_mm: Standard deviation of x and y of a press if the file does not contain it, mm.
+            force_std: Standard deviation of the force of a press if the file does not contain it, relative to the
+                force.
 
         Raises:
-            PressError: If the file is not a file of presses, or if it has further columns, which would be lost.
+            PressError: If the file is not a file of presses, or if it has further columns. These columns would be lost
+                when the file is written again.
         """
         if not self.path.exists():
             return None
@@ -63,7 +65,7 @@ class PressFile:
             presses: All presses of the session.
 
         Raises:
-            OutputError: If the file cannot be written. The previous file then remains.
+            OutputError: If the file cannot be written. The previous file is then kept.
         """
         if len(presses):
             write_presses(self.path, presses)
@@ -74,10 +76,10 @@ class PressFile:
 
 @contextmanager
 def open_press_file(path: Path, sensor: Sensor, probe: Probe, *, fresh: bool = False) -> Iterator[PressFile]:
-    """Open a file of presses for one session, and lock it until the `with` block ends.
+    """Open a file of presses for one session, and lock the file until a `with` block ends (context manager).
 
-    A hidden file beside the presses states the sensor and the probe, and carries the lock. The hidden file is removed
-    if no presses were written.
+    A hidden file beside the file of presses contains the sensor and the probe, and is locked. After the block, the
+    hidden file is removed if there is no file of presses.
 
     Args:
         path: The file, in the format CSV, or Parquet if its name ends in `.parquet`. It may contain the presses of an
@@ -88,14 +90,15 @@ def open_press_file(path: Path, sensor: Sensor, probe: Probe, *, fresh: bool = F
 
     Raises:
         PressError: If the presses in the file were made on another sensor or with another probe.
-        OutputExists: If another process takes presses into this file.
+        OutputExists: If another process writes presses to this file.
         OutputError: If the file cannot be written.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
         raise OutputError(f"{path}: expected a file for the presses, got a folder or a device; choose another output")
     content = json.dumps({"sensor": sensor_to_dict(sensor), "probe": probe.notation}).encode()
-    subject = json.loads(content)  # with the types of JSON, for the comparison with the file of an earlier session
+    # Decoded again, so that the values have the types of JSON, as those in the file of an earlier session
+    sensor_and_probe = json.loads(content)
     session_path = path.with_name(f".{path.name}.session.json")
 
     with as_output_errors(path):
@@ -107,22 +110,30 @@ def open_press_file(path: Path, sensor: Sensor, probe: Probe, *, fresh: bool = F
                 if fresh:
                     path.unlink(missing_ok=True)
                 if path.exists():
-                    _check_same_subject(path, session_path, subject)
+                    _check_same_sensor_and_probe(path, session_path, sensor_and_probe)
                 else:
-                    session_path.write_bytes(content)  # in place, because a new file would not be locked
+                    # The hidden file may contain another sensor or probe. It is written in place, because a new file
+                    # that replaces it would not be locked.
+                    session_path.write_bytes(content)
                 yield PressFile(path, sensor)
             finally:
                 if not path.exists():
                     session_path.unlink(missing_ok=True)
 
 
-def _check_same_subject(path: Path, session_path: Path, subject: dict[str, Any]) -> None:
-    """Raise PressError if the presses of a file were made on another sensor or with another probe."""
+def _check_same_sensor_and_probe(path: Path, session_path: Path, sensor_and_probe: dict[str, Any]) -> None:
+    """Raise PressError if the presses of a file were made on another sensor or with another probe.
+
+    Args:
+        path: The file of presses, for the error message.
+        session_path: The hidden file with the sensor and the probe of the earlier presses.
+        sensor_and_probe: The present sensor and probe, in the form of the hidden file.
+    """
     earlier = read_json(session_path, "the sensor and the probe of a press session", PressError, dict[str, Any])
-    differing = [name for name, value in subject.items() if earlier.get(name) != value]
-    if differing:
+    differing_names = [name for name, value in sensor_and_probe.items() if earlier.get(name) != value]
+    if differing_names:
         raise PressError(
             f"{path}: expected presses of this sensor and probe, got presses of another "
-            f"{' and another '.join(differing)}; continue with the same sensor and probe, choose another output, or "
-            "delete the presses with --fresh"
+            f"{' and another '.join(differing_names)}; continue with the same sensor and probe, choose another "
+            "output, or delete the presses with --fresh"
         )

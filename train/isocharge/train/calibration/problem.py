@@ -1,4 +1,4 @@
-"""Problem of a calibration, which contains the prior of the films and the network for all of these films."""
+"""Problem of a calibration: the prior distribution of the films, and the network for all films."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -32,7 +32,7 @@ DRIFT = {
     "probe_radius": 0.03,
     "gain": 0.1,
 }
-"""Standard deviation of the change of each parameter since an earlier calibration, relative to the prior.
+"""Standard deviation of the change of each parameter since an earlier calibration, in prior standard deviations.
 
 The keys are fields of `FilmSpread`.
 
@@ -44,28 +44,29 @@ COEFFICIENT_DRIFT_STD = 0.002
 """Standard deviation of the change of the coefficients of a discrepancy since an earlier calibration."""
 
 CREEP = 0.1
-"""Standard deviation of the change of the pretension, relative to the prior, between two known temperatures.
+"""Standard deviation of the change of the pretension by creep, in prior standard deviations.
 
-If both temperatures are known, the effect of the temperature is subtracted, and only creep remains."""
+It replaces the value in `DRIFT` if the temperatures of both calibrations are known. The effect of the temperature is
+then computed, and only creep remains."""
 
 PLANNED_IMPERFECTIONS = Hypothesis(modes=0.5, discrepancy=0.01)
-"""Imperfections that are assumed when presses are planned: half as large as on typical imperfect films.
+"""Imperfections that are assumed when presses are planned. They are half as large as on typical imperfect films.
 
 If smaller imperfections are assumed, the remaining errors on imperfect films are 1.5 times as large. On a film without
 imperfections, the assumption does not change the error after eight presses, and increases it by 7 % after five."""
 
 MAX_IDENTIFIED_STD_RATIO = 0.5
-"""Largest ratio of the standard deviations after and before the presses at which a quantity counts as identified."""
+"""Ratio of the standard deviation after the presses to that before, up to which a quantity counts as identified."""
 
 
 class Warming(NamedTuple):
     """Change of the pretension of a film with temperature.
 
     Attributes:
-        MPa_per_K: Change of the pretension per kelvin.
-        std: Standard deviation of this change, MPa/K.
-        at_C: Temperature of the film for which its parameters are given, degrees Celsius.
-        covariance: Covariance of this change with the unknowns of the film, shape (n_unknown,), MPa/K. Parameters are
+        MPa_per_K: Change of the pretension per kelvin, MPa/K.
+        std: Standard deviation of `MPa_per_K`, MPa/K.
+        at_C: Temperature at which the film has its estimated parameters, degrees Celsius.
+        covariance: Covariance of `MPa_per_K` with each unknown of the film, shape (n_unknown,), MPa/K. Parameters are
             in units of their prior standard deviations.
     """
 
@@ -76,17 +77,20 @@ class Warming(NamedTuple):
 
     @property
     def identified(self) -> bool:
-        """Whether presses have at least halved the standard deviation of the change."""
+        """Whether presses have at least halved the standard deviation of the change per kelvin."""
         return self.std <= MAX_IDENTIFIED_STD_RATIO * PRETENSION_PER_KELVIN.std_with_temperatures
 
     def with_unknowns(self, count: int) -> "Warming":
-        """Return the change of the pretension with covariances for another number of unknowns.
+        """Return a copy whose covariance refers to another number of unknowns.
 
         Args:
-            count: Number of unknowns. The last unknowns are removed, or unknowns without a covariance are added.
+            count: New number of unknowns. If it is smaller, the last unknowns are removed. If it is larger, unknowns
+                with a covariance of zero are appended.
         """
-        extended = np.pad(self.covariance, (0, count))
-        return self._replace(covariance=extended[:count])
+        shared_count = min(count, self.covariance.size)
+        covariance = np.zeros(count)
+        covariance[:shared_count] = self.covariance[:shared_count]
+        return self._replace(covariance=covariance)
 
 
 @dataclass(frozen=True)
@@ -97,9 +101,10 @@ class FilmEstimate:
         parameters: Best parameters, as in `FilmPrior`, shape (n_parameter,).
         covariance: Covariance of the parameters in units of their prior standard deviations, shape
             (n_parameter, n_parameter).
-        coefficients: Coefficients of the discrepancy, shape (n_coefficient,); empty if there is none.
-        joint: Covariance of parameters and coefficients, shape (n_parameter + n_coefficient, n_parameter +
-            n_coefficient); empty if there is no discrepancy.
+        coefficients: Coefficients of imperfections, traces and discrepancy, shape (n_coefficient,); empty if the
+            estimate has no coefficients.
+        joint: Covariance of parameters and coefficients together, shape (n_parameter + n_coefficient, n_parameter +
+            n_coefficient); empty if the estimate has no coefficients.
         warming: Change of the pretension with temperature; None if the temperatures of the presses are not known.
     """
 
@@ -111,21 +116,22 @@ class FilmEstimate:
 
     @property
     def unknowns(self) -> Array:
-        """Parameters and coefficients, as `FilmCharges.film` takes them."""
+        """Parameters in their own units, followed by the coefficients if the estimate has any."""
         return np.concatenate([self.parameters, self.coefficients])
 
     @property
     def unknown_covariance(self) -> Array:
-        """Covariance of parameters and coefficients."""
+        """Covariance of `unknowns`, in which parameters are in units of their prior standard deviations."""
         return self.joint if self.coefficients.size else self.covariance
 
     def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> "FilmEstimate":
-        """Return the estimate for a later time, with the drift that the film may have had in its covariance.
+        """Return the estimate for a later time, with a larger covariance that includes the possible drift of the film.
 
-        The drift of each parameter is independent. If both temperatures are known, only creep changes the pretension.
+        The parameters drift independently of each other. If the temperatures at both times are known, only creep
+        contributes to the drift of the pretension.
 
         Args:
-            prior: Distribution of the films.
+            prior: Distribution of the films, with the bounds of the parameters.
             knows_temperature: Whether the temperature at the later time is known.
         """
         drift_std = np.array([DRIFT[parameter.spread] for parameter in prior.parameters])
@@ -133,7 +139,7 @@ class FilmEstimate:
             drift_std[prior.index("pretension")] = CREEP
         covariance = self.covariance + np.diag(drift_std**2)
 
-        # The coefficients of imperfections and discrepancy change as well, if the estimate has them.
+        # The coefficients also drift, if the estimate has coefficients.
         joint = self.joint
         if joint.size:
             coefficient_drift_std = np.full(self.coefficients.size, COEFFICIENT_DRIFT_STD)
@@ -145,15 +151,15 @@ class FilmEstimate:
     def at_temperature(self, at_C: float, prior: FilmPrior) -> "FilmEstimate":
         """Return the estimate of the film at another temperature.
 
-        Only the pretension changes, in proportion to the change of the temperature. If `warming` is None, the
-        temperature of the estimate is unknown. The estimate is then returned unchanged.
+        Only the pretension changes, in proportion to the change of the temperature. If `warming` is None, the estimate
+        is returned unchanged, because the temperature of the film is unknown.
 
         Args:
             at_C: The other temperature, degrees Celsius.
-            prior: Distribution of the films.
+            prior: Distribution of the films, with the bounds of the parameters.
 
         Raises:
-            PressError: If the pretension would be outside the bounds of the films.
+            PressError: If the pretension at the other temperature would be outside its bounds.
         """
         if self.warming is None:
             return self
@@ -169,10 +175,10 @@ class FilmEstimate:
                 f"{upper:g} MPa: a temperature nearer to that of the presses"
             )
 
-        # The new pretension T + k w is the sum of the old pretension T and the change k w, with the difference k of the
-        # temperatures and the change w per kelvin. The covariance with another unknown u becomes
-        # cov(T, u) + k cov(w, u). It replaces first the row of the pretension, then cov(w, T), and then the column of
-        # the pretension.
+        # The new pretension is T + k w, where T is the old pretension, k is the change of the temperature, and w is the
+        # change of the pretension per kelvin. Its covariance with an unknown u is cov(T, u) + k cov(w, u). The terms
+        # with k are added first to the row of the pretension, then to cov(w, T), and then to the column of the
+        # pretension. The last step uses the new cov(w, T), as the variance of the new pretension requires.
         scaled_change = change_K / prior.std[pretension]
         covariance = self.unknown_covariance.copy()
         warming_covariance = self.warming.covariance.copy()
@@ -192,18 +198,18 @@ class FilmEstimate:
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """Films that a sensor may have, and the contacts for which the sensor is calibrated.
+    """Problem of a calibration: the films that a sensor may have, and the range of contacts.
 
     Attributes:
         sensor: The sensor as described in its file.
         probe: The probe as described.
-        films: The network for all films of the layout.
-        earlier: Estimate of the film from an earlier calibration, as `read_earlier` returns it; None for the sensor as
-            described.
-        stress_limit: Largest stress of the film in a proposed press, MPa.
+        films: The network for all films with the layout of the sensor.
+        earlier: Estimate of the film from an earlier calibration, as `read_earlier` returns it. If it is None, the
+            sensor file is the estimate before the presses.
+        stress_limit: Largest stress of the film that a proposed press may cause, MPa.
         friction: Expected coefficient of friction between tip and film, for presses on a vertical stage; 0 if the
             presses have no friction.
-        side_force: Largest side force over the force that contacts of the calibrated model may have in any direction.
+        side_force: Largest side force of later contacts in any direction, divided by the force of the contact.
 
     Example:
         >>> problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))  # doctest: +SKIP
@@ -246,51 +252,56 @@ class CalibrationProblem:
 
     @cached_property
     def prior(self) -> FilmPrior:
-        """Distribution of the films, with the electrodes and traces of the sensor."""
+        """Prior distribution of the films, with the electrodes of the sensor and their traces."""
         return _with_electrodes(self.films.prior, self.sensor)
 
     @cached_property
     def charges(self) -> FilmCharges:
-        """Charges of the films."""
+        """Model of the charges of all films."""
         return FilmCharges(self.prior, self.films.family)
 
     def fitted(
         self,
         parameters: Array,
         added_variance: AddedVariance,
-        factor: Callable[[Array], Array],
+        film_factor_of: Callable[[Array], Array],
         *,
         release: bool = True,
     ) -> Fitted:
-        """Return the network of a film, adapted to the charges of this film and sensor.
+        """Return the network of a film, adapted to the charges of the film and to the electrodes of the sensor.
 
-        The charges that follow from the parameters of the film are multiplied by a given factor. If the sensor has
-        other electrodes than the network for all films, the ratio of the charges of both is a further factor.
+        The charges that follow from the parameters of the film are multiplied by given factors. If the electrodes of
+        the sensor differ from those of the network for all films, the charges are also multiplied by the ratio of the
+        charges with both kinds of electrodes.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
             added_variance: Variances that are added to those of the network.
-            factor: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns factors on the charges, shape (n,
-                n_electrode).
+            film_factor_of: Function that converts contacts (x, y, F), shape (n, 3), mm and N, into factors on the
+                charges, shape (n, n_electrode).
             release: Whether the network will be released. Only a network that will be released learns correlations and
                 gets presses on which its errors are measured.
         """
         options: dict[str, Any] = {} if release else {"correlation": False, "n_test": 0}
         sensor_map = self.charges.forward_map(parameters)
         network_map = self.films.forward_map(parameters)
-
-        has_same_electrodes = self.prior is self.films.prior  # otherwise, the electrodes of the prior were replaced
+        # `prior` is a new object if and only if the electrodes of the network's prior were replaced.
+        has_same_electrodes = self.prior is self.films.prior
 
         def charge_factor(contact: Array) -> Array:
-            """Return the ratio of the film's charges to those of the training, shape (n, n_electrode).
+            """Return the ratio of the charges of this film to those for which the network for all films was trained.
 
             Args:
                 contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+            Returns:
+                Ratios, shape (n, n_electrode).
             """
+            film_factor = film_factor_of(contact)
             if has_same_electrodes:
-                return factor(contact)
+                return film_factor
             electrode_factor = sensor_map.charges(contact) / network_map.charges(contact)
-            return np.asarray(factor(contact) * electrode_factor)
+            return np.asarray(film_factor * electrode_factor)
 
         fitted = self.films.film(parameters, added_variance=added_variance, charge_factor=charge_factor, **options)
         return replace(fitted, sensor=sensor_map.sensor)
@@ -302,10 +313,10 @@ class CalibrationProblem:
 
     @cached_property
     def proposed_forces(self) -> tuple[float, float]:
-        """Smallest and largest force of a proposed press, N, which are within the domain and the stress limit.
+        """Smallest and largest force of a proposed press, N. Both are within the domain and the stress limit.
 
         Raises:
-            SceneError: If the smallest force already exceeds the limit.
+            SceneError: If the smallest force of the domain already exceeds the stress limit.
         """
         force_range = self.domain.force_range
         smallest_force, _ = force_range
@@ -318,12 +329,15 @@ class CalibrationProblem:
 
     @cached_property
     def before(self) -> FilmEstimate:
-        """Estimate of the film before the presses: the earlier calibration, or the film of the sensor file."""
+        """Estimate of the film before the presses.
+
+        An earlier estimate is used if there is one. Otherwise, the estimate is the film of the sensor file.
+        """
         if self.earlier:
             return self.earlier
         parameters = self.prior.parameters_of(self.sensor, self.probe)
         pretension = self.prior.index("pretension")
-        # A sensor file without a pretension has the value 0, but its film is not necessarily slack.
+        # A pretension of 0 means that the sensor file does not state one. The film is not necessarily slack.
         if parameters[pretension] <= 0.0:
             parameters[pretension] = self.prior.mean[pretension]
         prior_covariance = np.eye(parameters.size)  # in units of the prior standard deviations
@@ -331,9 +345,9 @@ class CalibrationProblem:
 
     @cached_property
     def expected(self) -> FilmEstimate:
-        """Estimate of the film with which presses are planned.
+        """Estimate of the film that is used to plan presses before any press is made.
 
-        Without an earlier calibration, the estimate includes the imperfections of `PLANNED_IMPERFECTIONS`.
+        Without an earlier calibration, the covariance of this estimate includes `PLANNED_IMPERFECTIONS`.
         """
         if self.earlier:
             return self.before
@@ -346,11 +360,12 @@ class CalibrationProblem:
 def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> FilmsModel:
     """Find the network that was trained for all films with the electrodes of a sensor.
 
-    The networks are tried in order until one fits. The name of the sensor does not matter.
+    The installed networks are tried one after the other until one fits. Networks whose names begin with the name of the
+    sensor are tried first, but networks with other names may also fit.
 
     Args:
-        sensor: The sensor. The pads, the radius of the film and the readout must be the same as in the training of the
-            network. All other properties may differ within the spread of the films, and the electrodes may have traces
+        sensor: The sensor. Its pads, the radius of its film and its readout must be the same as in the training of the
+            network. All other properties may differ within the spread of the films. The electrodes may also have traces
             and patterned backs.
         probe: The probe. Its radius must be within the spread of the films.
         models: Folder of models that is searched first.
@@ -361,7 +376,7 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
     Raises:
         ModelError: If no network was trained for this layout; the message says how to train one.
     """
-    reasons = []
+    reasons = []  # why each network does not fit, for the error message
     for folder in _network_folders(models, sensor.name):
         films = read_films(folder)
         try:
@@ -387,9 +402,14 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
 
 
 def _with_electrodes(prior: FilmPrior, sensor: Sensor) -> FilmPrior:
-    """Return a prior with the electrodes of a sensor, if the pads of both are equal; otherwise, return the given prior.
+    """Replace the electrodes of a prior by those of a sensor if both have the same pads.
 
-    The electrodes of the sensor may have traces and patterned backs.
+    The electrodes of the sensor may have traces and patterned backs. The given prior itself is returned if the pads
+    differ, or if all electrodes are equal.
+
+    Args:
+        prior: Distribution of the films for which a network was trained.
+        sensor: Sensor whose electrodes are used.
     """
     has_other_pads = _pad_corners(prior.sensor) != _pad_corners(sensor)
     has_equal_electrodes = prior.sensor.electrodes == sensor.electrodes
@@ -399,14 +419,14 @@ def _with_electrodes(prior: FilmPrior, sensor: Sensor) -> FilmPrior:
 
 
 def _pad_corners(sensor: Sensor) -> dict[str, list[list[float]]]:
-    """Return the corners of the pads by the names of the electrodes, rounded to 1e-6 mm."""
+    """Return the corners of each pad, rounded to 1e-6 mm, by the name of its electrode."""
     return {electrode.name: np.round(electrode.corners, 6).tolist() for electrode in sensor.electrodes}
 
 
 def _network_folders(models: Path | None, name: str) -> list[Path]:
     """Return the version folders that contain a network for all films.
 
-    The folders of models that have the name of the sensor come first.
+    Models whose names begin with the name of the sensor come first.
 
     Args:
         models: Folder of models that is searched first.

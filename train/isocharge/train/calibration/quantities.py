@@ -1,10 +1,10 @@
 """Quantities of a film that presses can identify, such as products and ratios of parameters.
 
-The charges depend on Young's modulus E, the piezoelectric coefficients and the gains almost only through their product.
-Similarly, they depend on E and the thickness h almost only through E h. After the calibration, a single parameter may
-therefore be as uncertain as before, although the product is accurate to 0.1 %. For this reason, such products and
-ratios are reported with their standard deviations. A quantity counts as not identified if the presses hardly reduced
-its standard deviation.
+The charges depend on Young's modulus E, the piezoelectric coefficients and the gains almost only through the product of
+these parameters. Similarly, the charges depend on E and the thickness h almost only through the product E h. Therefore,
+a calibration may determine a product of parameters accurately although each single parameter remains uncertain. For
+this reason, products and ratios of parameters are reported with their own standard deviations. A quantity counts as
+identified if the presses at least halved its standard deviation.
 """
 
 from collections.abc import Mapping
@@ -18,13 +18,13 @@ from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.train.calibration.problem import MAX_IDENTIFIED_STD_RATIO, FilmEstimate
 
 RELATIVE = " relative to the sensor file"
-"""Text that is appended to the meaning of quantities that are given relative to the sensor file."""
+"""Text that is appended to the description of a quantity whose value is relative to the sensor file."""
 
 SINGLE_PARAMETERS = ("young_percent", "thickness_percent", "d31_percent", "d32_percent", "mean_gain_percent")
-"""Quantities of single parameters, which presses identify only in products with others."""
+"""Names of quantities that consist of a single parameter, which presses often identify only in products with others."""
 
 SHOWN_IN_SENTENCE = 5
-"""Largest number of quantities in a sentence; the model card has a table of all."""
+"""Largest number of quantities in a sentence. The model card has a table of all quantities."""
 
 NORMAL_95 = 1.959964
 """Half width of a 95 % interval of the normal distribution, in standard deviations."""
@@ -32,12 +32,12 @@ NORMAL_95 = 1.959964
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity of the film with its standard deviations before and after the presses.
+    """A quantity of the film, with its standard deviations before and after the presses.
 
     Attributes:
-        name: Name with its unit, such as "pretension_MPa".
-        meaning: Description in words.
-        value: Best estimate.
+        name: Name of the quantity with its unit, such as "pretension_MPa".
+        meaning: Description of the quantity in words.
+        value: Best estimate after the presses.
         std: Standard deviation after the presses.
         before_std: Standard deviation before the presses.
         weights: Derivatives of the quantity with respect to the parameters in units of their prior standard
@@ -53,17 +53,17 @@ class Quantity:
 
     @property
     def identified(self) -> bool:
-        """Whether the presses have at least halved the standard deviation."""
+        """Whether the presses have at least halved the standard deviation of the quantity."""
         return self.std <= MAX_IDENTIFIED_STD_RATIO * self.before_std
 
     @property
     def interval_95(self) -> tuple[float, float]:
-        """Lower and upper end of the 95 % interval."""
+        """Lower and upper end of the 95 % interval after the presses."""
         half_width = NORMAL_95 * self.std
         return self.value - half_width, self.value + half_width
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the quantity as a table for JSON."""
+        """Convert the quantity into a dictionary for JSON, without its name and its weights."""
         table = {key: value for key, value in asdict(self).items() if key not in ("name", "weights")}
         return table | {"interval_95": list(self.interval_95), "identified": self.identified}
 
@@ -72,9 +72,9 @@ class _Definition(NamedTuple):
     """Definition of a quantity as a linear function of the parameters.
 
     Attributes:
-        meaning: Description in words.
+        meaning: Description of the quantity in words.
         weights: Derivatives with respect to the parameters in their own units, shape (n_parameter,).
-        offset: Value at parameters of zero.
+        offset: Value of the quantity if all parameters are zero.
     """
 
     meaning: str
@@ -85,42 +85,41 @@ class _Definition(NamedTuple):
 def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
     """Return the quantities of a film by name, each with its standard deviations before and after the presses.
 
-    A quantity is a weighted sum of the parameters.
-
     Args:
-        prior: The films, with the standard deviations of their parameters before the presses.
+        prior: Distribution of the films, with the standard deviations of the parameters before the presses.
         film: The estimate of the film.
     """
-    table = {}
+    quantity_of_name = {}
     for name, definition in _definitions(prior).items():
-        # Weights of the parameters in units of their prior standard deviations, as the covariances are.
+        # A quantity is a weighted sum of the parameters. The covariance is in units of the prior standard deviations of
+        # the parameters, so the weights are converted to these units.
         scaled_weights = definition.weights * prior.std
-        table[name] = Quantity(
+        quantity_of_name[name] = Quantity(
             name,
             definition.meaning,
             value=float(definition.offset + definition.weights @ film.parameters),
             std=float(np.sqrt(scaled_weights @ film.covariance @ scaled_weights)),
-            before_std=float(np.sqrt(scaled_weights @ scaled_weights)),  # the parameters have the prior covariance 1
+            before_std=float(np.sqrt(scaled_weights @ scaled_weights)),  # the prior covariance is the identity matrix
             weights=scaled_weights,
         )
-    return table
+    return quantity_of_name
 
 
 def _definitions(prior: FilmPrior) -> dict[str, _Definition]:
     """Return the definitions of all quantities by name.
 
-    The parameters contain the logarithms of Young's modulus, of the thickness, of the piezoelectric coefficients and of
-    the gains. The logarithm of a product is the sum of these logarithms.
+    The parameters include the logarithms of Young's modulus, the thickness, the piezoelectric coefficients and the
+    gains. Therefore, the logarithm of a product of such properties is a weighted sum of parameters.
 
     Args:
-        prior: The films, with the names of their parameters and electrodes.
+        prior: Distribution of the films, with the names of the parameters and electrodes.
     """
-    # A quantity is defined by the weights of the parameters. The weights of a parameter alone are a unit vector.
+    # A quantity is defined by the weights of the parameters. The weights of a single parameter are a unit vector.
     unit = dict(zip(prior.names, np.eye(len(prior.names)), strict=True))
     gains = {name: unit[f"gain {name}"] for name in prior.sensor.electrode_names}
     mean_gain = sum(gains.values(), np.zeros(len(unit))) / len(gains)
-    piezo_times_gain = 0.5 * (unit["d31"] + unit["d32"]) + mean_gain
-    # Without pretension, the charge of a press is proportional to E^(1/3) h^(-2/3) sqrt(d31 d32).
+    piezo_times_gain = 0.5 * (unit["d31"] + unit["d32"]) + mean_gain  # sqrt(d31 d32) times the mean gain
+    # Without pretension, the charge of a press is proportional to E^(1/3) h^(-2/3) sqrt(d31 d32) and to the gain.
     slack_response = (unit["young"] - 2.0 * unit["thickness"]) / 3.0 + piezo_times_gain
     # The parameters of shift and rotation are differences from those in the sensor file.
     file_calibration = prior.sensor.calibration
@@ -157,10 +156,10 @@ def _definitions(prior: FilmPrior) -> dict[str, _Definition]:
 
 
 def _relative(meaning: str, log_weights: Array) -> _Definition:
-    """Return the definition of a quantity whose unit is percent of the value in the sensor file.
+    """Return the definition of a quantity in percent, as a difference from its value in the sensor file.
 
     Args:
-        meaning: Description in words.
+        meaning: Description of the quantity in words.
         log_weights: Derivatives of the logarithm of the quantity with respect to the parameters, shape (n_parameter,).
     """
     return _Definition(f"{meaning}{RELATIVE}, %", 100.0 * log_weights)
@@ -169,7 +168,8 @@ def _relative(meaning: str, log_weights: Array) -> _Definition:
 def summarise(table: Mapping[str, Quantity]) -> tuple[str, ...]:
     """Return sentences about the identified and the unidentified quantities.
 
-    If single parameters are not identified, a further sentence states how well their combination is known.
+    If several single parameters are not identified, a further sentence states how accurately the charge of a press is
+    known. The charge of a press depends on a combination of these parameters.
 
     Args:
         table: The quantities by name, as `quantities` returns them.

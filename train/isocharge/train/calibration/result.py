@@ -23,25 +23,25 @@ from isocharge.train.films.films_model import AddedVariance
 from isocharge.train.training.fitted import Fitted
 
 PLANNED_PRESSES = 30
-"""Number of further presses whose benefit is stated if the film has a discrepancy."""
+"""Number of planned further presses whose benefit the summary states if the film has a discrepancy."""
 
 VISIBLE_TRACE = 2.0
-"""Smallest width of a trace, in its standard deviations, for which the trace is named."""
+"""Ratio of the width of a trace to its standard deviation above which the summary names the trace."""
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """Calibration of a film, with its estimate and the results that are derived from it.
+    """Result of a calibration: the estimate of the film, and values that are derived from this estimate.
 
     Attributes:
-        problem: The films that were considered.
-        presses: The presses that were fitted.
+        problem: The calibration problem, which defines the possible films.
+        presses: The presses of the calibration, including those that were left out as bad.
         posterior: Estimate of the film from the presses.
-        cautions: Warnings for the user. Each warning is one sentence.
+        cautions: Warnings for the user, each as one string.
         moved: Words that describe how an earlier calibration was moved to another temperature without presses; empty
             for a calibration by presses.
-        side_force_map: Effect of side forces on the charges of the film; None if neither the presses have friction nor
-            the contacts a declared side force.
+        side_force_map: Effect of side forces on the charges of the film. None if the presses have no friction and no
+            side force of later contacts was declared.
     """
 
     problem: CalibrationProblem
@@ -63,37 +63,40 @@ class CalibrationResult:
 
     @cached_property
     def sensitivity(self) -> ContactSensitivity:
-        """Effects of noise and of errors of the film on estimated contacts, linearised at the calibrated film."""
+        """Linearised effects of noise, and of errors in the unknowns of the film, on estimated contacts."""
         return ContactSensitivity.at(self.problem, self.posterior.unknowns)
 
     @cached_property
     def error_left(self) -> ContactError:
-        """Errors of contacts that are caused by the remaining uncertainty of the film."""
+        """Errors of estimated contacts that the remaining uncertainty of the film causes."""
         return self.sensitivity.contact_error(self.posterior.joint)
 
     @cached_property
     def error_left_before(self) -> ContactError:
-        """Errors of contacts before the presses, or before the estimate was moved to another temperature."""
+        """Errors of estimated contacts that the uncertainty of the film caused before the calibration.
+
+        If the film was moved to another temperature, the errors are those before the move.
+        """
         before = self.problem.before
         unknown_count = len(self.posterior.joint)
-        # The estimate before the presses has the first of the unknowns, or all of them. The others are zero.
+        # The earlier estimate may have only the first of the unknowns. The other unknowns are zero, without variance.
         estimated = slice(0, len(before.unknowns))
         covariance = np.zeros((unknown_count, unknown_count))
         covariance[estimated, estimated] = before.unknown_covariance
         if not self.moved:
             return self.sensitivity.contact_error(covariance)
 
-        # The contacts of a moved film depend on the unknowns differently, so the sensitivity is computed again.
+        # The sensitivity of the film before the move differs from that of the moved film, so it is computed again.
         unknowns = np.zeros(unknown_count)
         unknowns[estimated] = before.unknowns
         return ContactSensitivity.at(self.problem, unknowns).contact_error(covariance)
 
     @property
     def fitted(self) -> Fitted:
-        """The network of this film, for `evaluate` and `release`.
+        """The network of the calibrated film, in the form that `evaluate` and `release` expect.
 
-        The standard deviations of the network include the uncertainty of the film. If there are enough presses, the
-        errors of the network are measured by cross-validation; see `held_out`.
+        The standard deviations that the network reports include the uncertainty of the film. If there are enough
+        presses, the errors of the network are measured by cross-validation; see `held_out`.
         """
         fitted = self.fitted_film(self.posterior.parameters, release=True)
         if self.held_out is None:
@@ -102,10 +105,10 @@ class CalibrationResult:
 
     @cached_property
     def held_out(self) -> HeldOutAnswers | None:
-        """Contacts estimated by cross-validation; None if there are too few presses, or if the film was moved.
+        """Contacts that were estimated by cross-validation; see `cross_validate`.
 
-        See `cross_validate`. The contacts are computed when they are first used, which takes about as long as the
-        calibration.
+        The value is None if there are too few presses, or if the film was moved to another temperature without presses.
+        The contacts are computed at the first access, which takes about as long as the calibration.
         """
         if self.moved:
             return None
@@ -116,8 +119,9 @@ class CalibrationResult:
             """Return the network of a film that was fitted to some of the presses."""
             return self._network_of(film.unknowns, film.joint)
 
+        # If a side force is declared only for later contacts, the presses themselves have no friction.
         data = PressData.of(self.presses, self.problem.noise, self.problem.charges.domain)
-        has_friction = self.problem.friction > 0.0  # side forces may also be those of later contacts alone
+        has_friction = self.problem.friction > 0.0
         if self.side_force_map is not None and has_friction:
             friction = self.posterior.nuisances[FRICTION.name].value
             data = with_friction(data, self.problem.charges, self.side_force_map, self.posterior.contact, friction)
@@ -125,7 +129,7 @@ class CalibrationResult:
 
     @cached_property
     def side_forces(self) -> SideForces | None:
-        """Side forces that contacts may have; None if none are expected."""
+        """Side forces that later contacts may have; None if no side forces are expected."""
         if self.side_force_map is None:
             return None
         return SideForces(
@@ -139,7 +143,7 @@ class CalibrationResult:
         """Compute the factors by which imperfections, the discrepancy and friction change the charges of a film.
 
         Args:
-            unknowns: Parameters and coefficients of a film near this one.
+            unknowns: Parameters and coefficients of a film that is similar to the calibrated film.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
@@ -152,7 +156,9 @@ class CalibrationResult:
         return factor * self.side_forces.charge_factor(contact)
 
     def fitted_film(self, parameters: Array, *, release: bool = False) -> Fitted:
-        """Return the network of a similar film, with the coefficients and the uncertainty of this film.
+        """Return the network of a film with other parameters.
+
+        The film has the coefficients and the uncertainty of the calibrated film.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -162,9 +168,10 @@ class CalibrationResult:
         return self._network_of(unknowns, self.posterior.joint, release=release)
 
     def _network_of(self, unknowns: Array, covariance: Array, *, release: bool = False) -> Fitted:
-        """Return the network of a film, whose stated variances include the uncertainty of the film and the side forces.
+        """Return the network of a film that is similar to the calibrated film.
 
-        The effects of the uncertainty are linearised at the calibrated film.
+        The variances that the network reports include the effects of the uncertainty of the film and of side forces.
+        Both effects are linearised at the calibrated film.
 
         Args:
             unknowns: Unknowns of the film, shape (n_unknown,).
@@ -182,7 +189,11 @@ class CalibrationResult:
 
     @property
     def reduced_chi2(self) -> float:
-        """Mean squared residual of the fitted presses over its expected value, about 1; NaN without any redundancy."""
+        """Sum of the squared residuals of the fitted presses, divided by the degrees of freedom.
+
+        The ratio is about 1 if the stated errors of the presses are correct. The ratio is NaN if no measurement is
+        redundant.
+        """
         chi2, degrees_of_freedom = self.posterior.total
         if degrees_of_freedom == 0.0:
             return np.nan
@@ -190,20 +201,20 @@ class CalibrationResult:
 
     @property
     def bad_lines(self) -> tuple[int, ...]:
-        """Lines of the presses that were left out because they do not agree with the others."""
+        """Line numbers of the presses that were left out because they do not agree with the other presses."""
         return self.presses[self.posterior.bad].lines
 
     @cached_property
     def summary(self) -> tuple[str, ...]:
-        """The result in sentences.
+        """Sentences that describe the result for the user.
 
-        The sentences are computed only once, because the plan of further presses takes time.
+        The sentences are computed only once, because the planning of further presses is slow.
         """
         after = self.error_left
         before = self.error_left_before
         noise = self.sensitivity.noise_error
 
-        # Errors before and after the presses, or before and after the film was moved to another temperature
+        # The errors are compared with those before the presses, or before the film was moved to another temperature.
         event = "it was moved" if self.moved else "these presses"
         film_errors = (
             f"The uncertainty of the film causes errors of {after.position_mm:.2g} mm and {after.force_percent:.2g} % "
@@ -231,7 +242,7 @@ class CalibrationResult:
         )
 
     def _held_out_sentences(self) -> Iterator[str]:
-        """Yield the errors on presses that were held out, if there are enough."""
+        """Yield a sentence about the errors on held-out presses, if a cross-validation was possible."""
         if self.held_out is None:
             return
         held_out_errors = self.held_out.errors
@@ -242,7 +253,7 @@ class CalibrationResult:
         )
 
     def _temperature_sentences(self) -> Iterator[str]:
-        """Yield a sentence on how the pretension changes with the temperature, if temperatures are known."""
+        """Yield a sentence on how the pretension changes with temperature, if temperatures were measured."""
         warming = self.posterior.warming
         if warming is None:
             return
@@ -258,7 +269,7 @@ class CalibrationResult:
         )
 
     def _side_force_sentences(self) -> Iterator[str]:
-        """Yield sentences on the friction of the presses and the side forces of contacts, if there are any."""
+        """Yield sentences about the friction of the presses and the side forces of later contacts, if there are any."""
         if self.side_forces is None:
             return
         error = ContactError.of(self.side_forces.contact_covariance(self.sensitivity))
@@ -279,21 +290,24 @@ class CalibrationResult:
         )
 
     def _discrepancy_sentences(self) -> Iterator[str]:
-        """Yield sentences on the discrepancy, if there is one, and on the benefit of further presses."""
+        """Yield sentences about the discrepancy and the benefit of further presses.
+
+        Nothing is yielded if the film probably has neither imperfections nor a discrepancy.
+        """
         if not self.posterior.imperfect:
             return
         factor = self.problem.charges.factor(self.posterior.unknowns, self.sensitivity.contact)
-        percent = 100.0 * rms(np.log(factor))
+        discrepancy_percent = 100.0 * rms(np.log(factor))
 
-        # Each press of the plan contains the error that is expected after it.
+        # Each planned press states the error that is expected after this press and all earlier ones.
         plan = next_presses(self.problem, PLANNED_PRESSES, self.posterior)
         error_after_plan_mm = plan[-1].position_mm
         places = ", ".join(f"{press.force_N:.2f} N at ({press.x_mm:g}, {press.y_mm:g}) mm" for press in plan[:3])
         yield (
-            f"The charges of this film differ from those of its parameters by {percent:.2g} % (root mean square), "
-            f"smoothly over the film. The remaining error is {self.error_left.position_mm:.2g} mm. {PLANNED_PRESSES} "
-            f"more presses would reduce it to {error_after_plan_mm:.2g} mm. The first of them are {places}; --next "
-            "lists more."
+            f"The charges of this film differ from those of its parameters by {discrepancy_percent:.2g} % (root mean "
+            f"square), smoothly over the film. The remaining error is {self.error_left.position_mm:.2g} mm. "
+            f"{PLANNED_PRESSES} more presses would reduce it to {error_after_plan_mm:.2g} mm. The first of them are "
+            f"{places}; --next lists more."
         )
         if self.posterior.probability("traces") > PROBABLE:
             widths = self.problem.charges.trace_widths(self.posterior.unknowns, self.posterior.joint)
@@ -308,20 +322,21 @@ class CalibrationResult:
 
 
 def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved: str) -> CalibrationResult:
-    """Return an estimate of a film as a calibration result without presses.
+    """Create a calibration result without presses from an estimate of a film.
 
     Args:
-        problem: The calibration.
-        film: The estimate.
+        problem: The calibration problem.
+        film: The estimate of the film.
         moved: Words that describe how an earlier calibration was moved to another temperature.
     """
     layout = problem.charges.layout
-    # Unknowns that the estimate does not have are zero, with a variance of zero.
+    # The estimate may have only the first of the unknowns. The other unknowns are zero, with a variance of zero.
     joint = np.zeros((layout.film_count, layout.film_count))
     estimated = slice(0, len(film.unknowns))
     joint[estimated, estimated] = film.unknown_covariance
     has_coefficients = film.coefficients.size > 0
-    hypothesis = Hypothesis(modes=float(has_coefficients))  # a film with coefficients counts as imperfect
+    # A film with coefficients counts as imperfect, so its only hypothesis includes modes.
+    hypothesis = Hypothesis(modes=1.0 if has_coefficients else 0.0)
     warming = film.warming
     if warming is not None:
         warming = warming.with_unknowns(layout.film_count)
@@ -342,5 +357,5 @@ def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved:
     side_force_map = None
     if problem.side_force > 0.0:
         side_force_map = solve_side_forces(problem.charges, film.parameters)
-    no_press = no_presses(problem.electrodes)
-    return CalibrationResult(problem, no_press, posterior, moved=moved, side_force_map=side_force_map)
+    empty_presses = no_presses(problem.electrodes)
+    return CalibrationResult(problem, empty_presses, posterior, moved=moved, side_force_map=side_force_map)

@@ -1,7 +1,8 @@
-"""Session in which a person or a machine makes presses one after the other, at proposed contacts.
+"""Session in which a person or a machine makes presses one after the other, at contacts that the session proposes.
 
-After each press, the film is fitted again, and the next press is proposed. A session has no port, no screen and no
-clock. The caller shows the proposed press, measures the charges, and passes on the answer of the person.
+After each press, the film is fitted again, and the next press is proposed. A session does not access a serial port, a
+screen or a clock. The caller shows the proposed press, measures the charges, and passes the answer of the person to the
+session.
 """
 
 import math
@@ -22,12 +23,12 @@ from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.result import CalibrationResult
 
 MIN_PRESSES = 2
-"""Smallest number of presses after which the remaining error is reported. One press does not determine it."""
+"""Smallest number of presses after which the remaining error is reported. One press does not determine this error."""
 
 ENOUGH = 0.5
-"""Ratio of two position errors at which a session is complete.
+"""Ratio of two position errors up to which a session is complete.
 
-The first error is caused by the uncertainty of the film, and the second error by noise."""
+The ratio is that of the error by the uncertainty of the film to the error by noise."""
 
 EXPECTED_ANSWER = (
     'Enter for "as proposed", the real "x y force" in mm and N (? for a value that is unknown), s to skip the place, '
@@ -35,26 +36,27 @@ EXPECTED_ANSWER = (
 )
 
 Reply = Literal["take", "skip", "undo", "quit"]
-"""Action that a person asks for."""
+"""Action that a person requests."""
 
 REPLIES: dict[str, Reply] = {"": "take", "take": "take", "s": "skip", "skip": "skip", "q": "quit", "quit": "quit"}
-"""Actions by the word that is typed for them."""
+"""Actions by the word that a person types to request the action."""
 
 UNDO = re.compile(r"(?:u|undo)\s*(\d*)")
-"""Word that undoes a press, with the number of the press or without."""
+"""Text that a person types to undo a press. The number of the press may follow the word."""
 
 UNKNOWN_CELLS = ("", "?")
-"""Words for a value that is unknown."""
+"""Texts that a person types for an unknown value."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Answer of a person about a press.
+    """Answer of a person to a proposed press.
 
     Attributes:
-        reply: Action to take.
-        contact: Contact (x_mm, y_mm, force_N) of the press to take, shape (3,), NaN where unknown.
-        number: Number of the press to undo, from 1.
+        reply: The requested action.
+        contact: Contact (x_mm, y_mm, force_N) of the press that is added, shape (3,), NaN where unknown; "as proposed"
+            if the press was made at the proposed contact.
+        number: Number of the press to undo, counted from 1; "last" for the last press.
     """
 
     reply: Reply
@@ -63,13 +65,13 @@ class Answer:
 
 
 def read_answer(text: str) -> Answer:
-    """Return the answer that a person typed.
+    """Convert the text that a person typed into an answer.
 
     Args:
-        text: Empty, three values with blanks or commas between them, `u`, `u 3`, `s` or `q`.
+        text: Empty, a question mark, three values with blanks or commas between them, `u`, `u 3`, `s` or `q`.
 
     Raises:
-        PressError: If the text is something else.
+        PressError: If the text has none of these forms.
     """
     word = text.strip().lower()
     if word in REPLIES:
@@ -81,25 +83,37 @@ def read_answer(text: str) -> Answer:
     if word == "?":  # a press with an unknown place and an unknown force
         return Answer("take", np.full(len(CONTACT), np.nan))
 
-    cells = word.split(",") if "," in word else word.split()
-    refusal = PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")  # at most 60 characters of the text
-    if len(cells) != len(CONTACT):
-        raise refusal
     try:
-        contact = np.array([_cell_value(cell.strip()) for cell in cells])
+        contact = _typed_contact(word)
     except ValueError:
-        raise refusal from None
+        # The message repeats at most 60 characters of the text.
+        raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}") from None
     return Answer("take", contact)
 
 
-def _with_unknown(temperatures_C: Array | None) -> Array | None:
+def _typed_contact(text: str) -> Array:
+    """Return the contact (x_mm, y_mm, force_N) that a person typed, shape (3,). Unknown values are NaN.
+
+    Args:
+        text: Three values with blanks or commas between them.
+
+    Raises:
+        ValueError: If the text does not consist of three values.
+    """
+    cells = text.split(",") if "," in text else text.split()
+    if len(cells) != len(CONTACT):
+        raise ValueError(f"expected {len(CONTACT)} values, got {len(cells)}")
+    return np.array([_cell_value(cell.strip()) for cell in cells])
+
+
+def _with_unknown_temperature(temperatures_C: Array | None) -> Array | None:
     """Append an unknown temperature to the temperatures of earlier presses.
 
     Args:
         temperatures_C: Temperatures, shape (n,), degrees Celsius; None if no temperatures are measured.
 
     Returns:
-        Temperatures, shape (n + 1,). The last one is NaN. None if no temperatures are measured.
+        Temperatures, shape (n + 1,), degrees Celsius, of which the last is NaN. None if no temperatures are measured.
     """
     if temperatures_C is None:
         return None
@@ -107,13 +121,13 @@ def _with_unknown(temperatures_C: Array | None) -> Array | None:
 
 
 def _cell_value(cell: str) -> float:
-    """Return the number in a cell; NaN if the value is unknown.
+    """Convert the text of one value into a number, which is NaN if the value is unknown.
 
     Args:
-        cell: Text of the cell without blanks.
+        cell: Text of the value, without blanks at the ends.
 
     Raises:
-        ValueError: If the cell is not a finite number.
+        ValueError: If the text is neither a finite number nor one of `UNKNOWN_CELLS`.
     """
     if cell in UNKNOWN_CELLS:
         return math.nan
@@ -124,13 +138,13 @@ def _cell_value(cell: str) -> float:
 
 
 class PressSession:
-    """Presses of one film in the order in which they are made, and the present estimate of this film.
+    """Session of presses on one film: the presses so far, and the present estimate of the film.
 
     Attributes:
-        problem: Films that the sensor may be, and the estimate before the presses.
-        presses: Presses so far; their lines are numbered from 1.
-        result: Calibration by these presses; None without presses, or if no film explains them.
-        refusal: Reason why no film explains the presses; empty if a film explains them.
+        problem: The calibration problem, which defines the possible films and their estimate before the presses.
+        presses: All presses so far, in the order in which they were made. Their line numbers begin at 1.
+        result: Result of the calibration by these presses; None without presses, or if no film explains the presses.
+        refusal: Reason why no film explains the presses; empty if a film explains the presses or if there are none.
     """
 
     presses: MeasuredPresses
@@ -148,16 +162,17 @@ class PressSession:
         force_std: float = FORCE_STD,
         until: float = ENOUGH,
     ) -> None:
-        """Begin a session, or continue an earlier one.
+        """Begin a session, or continue an earlier session.
 
         Args:
-            problem: Films that the sensor may be.
-            save: Function that stores the presses. It is called with all presses after each change, before the film is
-                fitted.
-            presses: Presses of an earlier session to continue.
-            position_std_mm: Standard deviation of the places of further presses, mm.
-            force_std: Standard deviation of the forces of further presses, as a share of the force.
-            until: Ratio of position errors at which the session is complete, as `ENOUGH`; 0 for never.
+            problem: The calibration problem.
+            save: Function that stores the presses. It is called with all presses after each change of the presses,
+                before the film is fitted.
+            presses: Presses of an earlier session that is continued; None to begin without presses.
+            position_std_mm: Standard deviation of the positions of further presses, mm.
+            force_std: Standard deviation of the forces of further presses, relative to the force.
+            until: Ratio of position errors up to which the session is complete, as `ENOUGH`. With 0, the session is
+                never complete.
         """
         self.problem = problem
         self._save = save
@@ -171,22 +186,24 @@ class PressSession:
 
     @property
     def proposed(self) -> ProposedPress:
-        """The press that would reduce the remaining error most.
+        """The proposed next press, which is expected to reduce the remaining error most.
+
+        The proposal is computed at the first access after each change, and is then stored.
 
         Raises:
-            PressError: If every place was skipped.
+            PressError: If every position was rejected.
         """
         if self._proposed is not None:
             return self._proposed
 
-        skipped_mm = np.reshape(self._skipped_places, (-1, 2))  # shape (0, 2) if no place was skipped
+        skipped_mm = np.reshape(self._skipped_places, (-1, 2))  # shape (0, 2) if no position was rejected
         film: FilmEstimate
         if self.result is not None:
             film = self.result.posterior
             count = 1
         else:
-            # There are no presses, or no film explains them. The presses for the film of the sensor file are planned
-            # from the beginning, and each press so far counts as one of the plan.
+            # There are no presses, or no film explains them. Then all presses are planned from the beginning for the
+            # expected film. The presses so far count as the first presses of this plan, and the next one is proposed.
             film = self.problem.expected
             count = len(self) + 1
         plan = next_presses(self.problem, count, film, avoid_mm=skipped_mm, **self._stds)
@@ -195,41 +212,41 @@ class PressSession:
 
     @property
     def enough(self) -> bool:
-        """Whether the uncertainty of the film causes a small position error, compared with the error by noise."""
+        """Whether the position error by the uncertainty of the film is small compared with the error by noise."""
         if self.result is None or len(self) < FEW:
             return False
         noise_mm = self.result.sensitivity.noise_error.position_mm
         return self.result.error_left.position_mm <= self._until * noise_mm
 
     def take(self, charge: Array, contact: Array) -> None:
-        """Add a press, save all presses, and fit the film.
+        """Add a press, save all presses, and fit the film to them.
 
         Args:
-            charge: Touch charges, shape (n_electrode,), pC.
-            contact: Contact (x, y, F), shape (3,), mm and N, NaN where unknown.
+            charge: Touch charges of the press, shape (n_electrode,), pC.
+            contact: Contact (x, y, F) of the press, shape (3,), mm and N, NaN where unknown.
 
         Raises:
-            PressError: If the press is not one that a calibration accepts. The session is then unchanged.
+            PressError: If a calibration does not accept a press with this contact. The session is then unchanged.
         """
         self.check(contact)
         presses = self.presses
-        presses_with_new_one = replace(
+        extended_presses = replace(
             presses,
             contact=np.vstack([presses.contact, contact]),
             charge_pC=np.vstack([presses.charge_pC, charge]),
             position_std_mm=np.append(presses.position_std_mm, self._stds["position_std_mm"]),
             force_std=np.append(presses.force_std, self._stds["force_std"]),
-            temperature_C=_with_unknown(presses.temperature_C),
-            film_temperature_C=_with_unknown(presses.film_temperature_C),
+            temperature_C=_with_unknown_temperature(presses.temperature_C),
+            film_temperature_C=_with_unknown_temperature(presses.film_temperature_C),
             lines=(*presses.lines, len(presses) + 1),
         )
-        self._change(presses_with_new_one)
+        self._change(extended_presses)
 
     def check(self, contact: Array) -> None:
-        """Raise PressError if no calibration accepts a press.
+        """Raise PressError if a calibration would not accept a press with a given contact.
 
         Args:
-            contact: Contact (x, y, F), shape (3,), mm and N, NaN where unknown.
+            contact: Contact (x, y, F) of the press, shape (3,), mm and N, NaN where unknown.
         """
         x, y, _ = contact.tolist()
         has_one_coordinate = math.isnan(x) != math.isnan(y)
@@ -250,7 +267,7 @@ class PressSession:
             number: Number of the press, counted from 1; "last" for the last press.
 
         Raises:
-            PressError: If there is no such press.
+            PressError: If there is no press with this number.
         """
         count = len(self)
         if not count:
@@ -264,20 +281,20 @@ class PressSession:
         return removed_number
 
     def skip(self) -> None:
-        """Reject the proposed position, and propose another one. A rejected position is never proposed again."""
+        """Reject the proposed position. A rejected position is never proposed again."""
         self._skipped_places.append((self.proposed.x_mm, self.proposed.y_mm))
         self._proposed = None
 
     def _change(self, presses: MeasuredPresses) -> None:
-        """Save a new list of presses, and fit the film."""
+        """Save a changed list of presses, and fit the film to these presses."""
         self._save(presses)
         self._fit(presses)
 
     def _fit(self, presses: MeasuredPresses) -> None:
-        """Number the presses from 1, and fit the film to them.
+        """Number the presses from 1, and fit the film to the presses.
 
-        If no film explains the presses, `result` is None and `refusal` is the reason. Without presses, `result` is None
-        and `refusal` is empty.
+        If no film explains the presses, `result` becomes None, and `refusal` becomes the reason. Without presses,
+        `result` becomes None, and `refusal` becomes empty.
 
         Args:
             presses: All presses of the session.
@@ -295,7 +312,11 @@ class PressSession:
 
     @property
     def summary(self) -> tuple[str, ...]:
-        """Sentences about the errors that the film causes, and about presses that disagree with the others."""
+        """Sentences about the errors that the film causes, and about presses that do not agree with the others.
+
+        If no film explains the presses, the only sentence states the reason. There are no sentences if fewer than
+        `MIN_PRESSES` presses were made.
+        """
         if self.refusal:
             return (f"No film explains these presses: {self.refusal}",)
         if self.result is None or len(self) < MIN_PRESSES:
@@ -316,7 +337,11 @@ class PressSession:
 
 
 def describe_press(contact: Array) -> str:
-    """Describe a contact (x, y, F), shape (3,), mm and N, as in "1.65 N at (3.0, 2.5) mm". Unknown values are NaN."""
+    """Describe the contact of a press in words, such as "1.65 N at (3.0, 2.5) mm".
+
+    Args:
+        contact: Contact (x, y, F), shape (3,), mm and N, NaN where unknown.
+    """
     x, y, force = contact.tolist()
     force_text = "an unknown force" if math.isnan(force) else f"{force:.2f} N"
     place_text = "an unknown place" if math.isnan(x) else f"({x:.1f}, {y:.1f}) mm"

@@ -1,15 +1,15 @@
-"""Side forces of the presses of a calibration, and of the contacts that its model estimates.
+"""Side forces of the presses of a calibration, and of later contacts on the calibrated film.
 
-A tip on a vertical stage pulls the film inwards by friction while it presses beside the centre
-(`simulate.solver.friction`). The coefficient of friction is a nuisance of the session. Friction changes the charges of
-the presses by about dQ = coefficient * friction_charge. Here `friction_charge` is computed for the film that the
-presses determine (`simulate.forward.side_force`). The fit is repeated, because this film and the coefficient depend on
-each other.
+If a tip on a vertical stage presses beside the centre, friction pulls the film inwards (`simulate.solver.friction`).
+The coefficient of friction is a nuisance of the session. Friction changes the charges of a press by about
+coefficient * friction_charge, where `friction_charge` is computed for the estimated film
+(`simulate.forward.side_force`). The fit is repeated, because the estimated film and the coefficient depend on each
+other.
 
-The contacts on the calibrated film may have the same friction as the presses, for example if a robot moves vertically.
-The contacts may also have no friction, for example if a probe moves freely. The model assumes half of the friction of
-the presses. The standard deviations of the model include the differences from both cases. The standard deviations also
-include the side forces of any direction that the user declares.
+Later contacts may have the same friction as the presses, for example if a robot moves vertically. Later contacts may
+also have no friction, for example if a probe moves freely. The model of the calibrated film assumes half of the
+friction of the presses. The standard deviations of the model include the error of this assumption in both cases. They
+also include any side force that the user declares.
 """
 
 from dataclasses import dataclass, replace
@@ -29,26 +29,33 @@ from isocharge.train.calibration.press_data import PressData
 from isocharge.train.data.charge_field import fit_series
 
 MAX_SIDE_FORCE = 0.5
-"""Largest side force that can be declared, over the force of the contact. The charges are computed to first order."""
+"""Largest side force that can be declared, divided by the force of the contact.
+
+The side force is limited, because its effect on the charges is computed to first order."""
 
 MIN_REFERENCE = 0.02
 """Smallest coefficient of friction at which the effect of friction is computed.
 
-Friction is proportional to the coefficient except where the film sticks to the tip.
+For a smaller coefficient, the effect is scaled in proportion, because the friction is proportional to the coefficient
+except where the film sticks to the tip.
 """
 
 CONTACTS = 400
-"""Number of contacts to which the effect of friction on the charges is fitted."""
+"""Number of contacts at which the effect of friction is computed in order to fit a series to it."""
 
 DEGREE = 8
-"""Largest total degree in x and y of the fitted series."""
+"""Largest total degree in x and y of the series that is fitted to the effect of friction."""
 
 FORCE_DEGREE = 3
-"""Largest degree in ln F of the fitted series."""
+"""Largest degree in ln F of the series that is fitted to the effect of friction."""
 
 
 def check_side_force(share: float) -> None:
-    """Raise an error if a share of the force is not between 0 and `MAX_SIDE_FORCE`."""
+    """Raise SceneError if a declared side force is not between 0 and `MAX_SIDE_FORCE` times the force.
+
+    Args:
+        share: Side force divided by the force of the contact.
+    """
     if not 0.0 <= share <= MAX_SIDE_FORCE:
         raise SceneError(
             f"side force: expected a share of the force from 0 to {MAX_SIDE_FORCE:g}, such as 0.1, got {share}"
@@ -56,10 +63,10 @@ def check_side_force(share: float) -> None:
 
 
 def solve_side_forces(charges: FilmCharges, parameters: Array) -> SideForceMap:
-    """Compute the effect of side forces on one film, which takes about ten seconds.
+    """Compute the effect of side forces on the charges of one film, which takes several seconds.
 
     Args:
-        charges: The films.
+        charges: Model of the charges of all films.
         parameters: Parameters of the film, shape (n_parameter,).
     """
     return SideForceMap.build(charges.forward_map(parameters))
@@ -68,29 +75,29 @@ def solve_side_forces(charges: FilmCharges, parameters: Array) -> SideForceMap:
 def with_friction(
     data: PressData, charges: FilmCharges, side_force_map: SideForceMap, contact: Array, coefficient: float
 ) -> PressData:
-    """Return presses with the effect of friction on their charges.
+    """Return a copy of the presses in which `friction_charge` is the effect of friction on their charges.
 
     Args:
-        data: The presses.
-        charges: The films.
-        side_force_map: Effect of side forces on the film.
+        data: The measured presses.
+        charges: Model of the charges of all films, with their domain.
+        side_force_map: Effect of side forces on the charges of the estimated film.
         contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
         coefficient: Estimated coefficient of friction, at which the effect is computed.
     """
     reference = float(np.clip(coefficient, MIN_REFERENCE, MAX_FRICTION))
-    friction_charge = side_force_map.friction_charges(charges.into_domain(contact), reference) / reference
-    return replace(data, friction_charge=friction_charge)
+    charge_at_reference = side_force_map.friction_charges(charges.into_domain(contact), reference)
+    return replace(data, friction_charge=charge_at_reference / reference)  # per unit of the coefficient
 
 
 @dataclass(frozen=True)
 class SideForces:
-    """Side forces that contacts on a calibrated film may have.
+    """Side forces that later contacts on a calibrated film may have.
 
     Attributes:
         side_force_map: Effect of side forces on the charges of the film.
-        domain: Contacts that the model answers.
-        friction: Coefficient of friction of the presses, with its standard deviation.
-        share: Largest further side force, which may have any direction, relative to the force.
+        domain: Range of contacts that the model can estimate.
+        friction: Estimated coefficient of friction of the presses, with its standard deviation.
+        share: Declared side force in any direction, divided by the force of the contact.
     """
 
     side_force_map: SideForceMap
@@ -104,25 +111,29 @@ class SideForces:
 
     @property
     def _coefficient(self) -> float:
-        """Coefficient of friction, limited to possible values."""
+        """Estimated coefficient of friction, limited to the range from 0 to `MAX_FRICTION`."""
         return float(np.clip(self.friction.value, 0.0, MAX_FRICTION))
 
     def charge_factor(self, contact: Array) -> Array:
-        """Return the factors by which half of the friction changes the charges, shape (n, n_electrode).
+        """Compute the factors by which half of the friction of the presses changes the charges.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Factors, shape (n, n_electrode), dimensionless.
         """
         if self._coefficient == 0.0:
             return np.ones((len(contact), len(self.side_force_map.film.electrodes)))
         unit_contact = self.domain.to_unit(contact)
-        return np.asarray(np.exp(self._log_factor.values(unit_contact)[:, 0]))
+        log_factor = self._log_factor.values_and_derivatives(unit_contact)[:, 0]  # the values without the derivatives
+        return np.asarray(np.exp(log_factor))
 
     @cached_property
     def _log_factor(self) -> Series:
-        """Logarithm of the factor by which half of the friction changes the charges, as a series of the contact.
+        """Series in the contact for the logarithm of the factor by which half of the friction changes the charges.
 
-        The series is fitted to `CONTACTS` contacts, because it is faster to evaluate than the effect of friction.
+        The series is used because its evaluation is faster than the computation of the effect of friction.
         """
         contact = spread_contacts(self.domain, CONTACTS)
         unit_contact = self.domain.to_unit(contact)
@@ -131,25 +142,28 @@ class SideForces:
         return Series(fit_series(unit_contact, log_factor, DEGREE, FORCE_DEGREE))
 
     def contact_covariance(self, sensitivity: ContactSensitivity) -> Array:
-        """Compute the covariances of (x, y, ln F), shape (n, 3, 3), that the side forces of contacts cause.
+        """Compute the covariances of estimated contacts that the side forces of these contacts cause.
 
-        Contacts with the friction of the presses and contacts without friction are equally probable. A side force that
-        the user declares has the declared size and an unknown direction.
+        Contacts with the friction of the presses and contacts without friction are assumed to be equally probable. A
+        declared side force is assumed to have the declared size and a random direction.
 
         Args:
-            sensitivity: The contacts, and their dependence on charges.
+            sensitivity: The contacts, and the derivatives of the estimated contacts with respect to the charges.
+
+        Returns:
+            Covariances of (x, y, ln F), shape (n, 3, 3).
         """
         contact = sensitivity.contact
         covariance = np.zeros((len(contact), 3, 3))
         if self._coefficient > 0.0:
             friction_charge = self.side_force_map.friction_charges(contact, self._coefficient)
-            # Contacts have the friction charge f (1 + e) with the relative error e of the coefficient, or none. Each
-            # case has the probability 0.5, and the model assumes f / 2. The mean squared difference is
-            # 0.5 ((1/2)^2 + e^2) f^2 + 0.5 (1/2)^2 f^2 = (0.25 + 0.5 e^2) f^2.
+            # The charge by friction is f (1 + e) or 0, each with the probability 0.5. Here f is `friction_charge`, and
+            # e is the relative error of the coefficient. The model assumes f / 2. The mean squared difference from this
+            # assumption is 0.5 ((1/2)^2 + e^2) f^2 + 0.5 (1/2)^2 f^2 = (0.25 + 0.5 e^2) f^2.
             relative_std = float(np.sqrt(0.25 + 0.5 * (self.friction.std / self._coefficient) ** 2))
             covariance += _covariance_of_charge_error(sensitivity.charge_gain, relative_std * friction_charge)
         if self.share > 0.0:
-            # A force in an unknown direction has half of its variance along each of the two axes.
+            # The mean square of each component of a force with a random direction is half of the squared force.
             side_force_std = self.share * contact[:, 2, None] / np.sqrt(2.0)  # shape (n, 1), N
             charge_per_newton = self.side_force_map.jacobian(contact)  # last axis: along x and along y
             for axis in range(2):
@@ -159,17 +173,19 @@ class SideForces:
 
 
 def _covariance_of_charge_error(charge_gain: Array, charge_error: Array) -> Array:
-    """Compute the covariances of contacts that an error of their charges causes.
+    """Compute the covariances of estimated contacts that an error of their charges causes.
 
-    The errors of all charges of a contact are fully correlated, because they have one common cause.
+    The errors of all charges of a contact are fully correlated, because all of them have the same cause.
 
     Args:
-        charge_gain: Derivatives of (x, y, ln F) with respect to the charges, shape (n, 3, n_electrode), mm/pC, mm/pC
-            and 1/pC.
-        charge_error: One standard deviation of the error, shape (n, n_electrode), pC.
+        charge_gain: Derivatives of the estimated (x, y, ln F) with respect to the charges, shape (n, 3, n_electrode),
+            mm/pC, mm/pC and 1/pC.
+        charge_error: Errors of the charges if their common cause has the size of one standard deviation, shape (n,
+            n_electrode), pC.
 
     Returns:
         Covariances of (x, y, ln F), shape (n, 3, 3).
     """
-    contact_error = np.einsum("nie,ne->ni", charge_gain, charge_error)  # sums over the electrodes e, shape (n, 3)
+    # Error of (x, y, ln F) for one standard deviation of the common cause, shape (n, 3): sums over the electrodes e
+    contact_error = np.einsum("nie,ne->ni", charge_gain, charge_error)
     return np.asarray(contact_error[:, :, None] * contact_error[:, None, :])  # outer products

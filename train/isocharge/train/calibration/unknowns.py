@@ -1,8 +1,9 @@
-"""Layout of the vector of unknowns of a calibration: a named slice for each kind of unknown.
+"""Layout of the vector of unknowns of a calibration, with a named slice for each kind of unknown.
 
-The first unknowns are the parameters of the film (`film_prior.PARAMETERS` and the gains). The next unknowns are
-coefficients of modes of imperfections, of traces, and of the terms of the discrepancy. The last unknowns are the
-nuisances of the session (`nuisances.NUISANCES`). In a fit, parameters are in units of their prior standard deviations.
+The first unknowns are the parameters of the film (`film_prior.PARAMETERS` and the gains). After the parameters come
+three kinds of coefficients: those of the modes of imperfections, of the traces, and of the terms of the discrepancy.
+The last unknowns are the nuisances of the session (`nuisances.NUISANCES`). During a fit, parameters are in units of
+their prior standard deviations.
 """
 
 from dataclasses import dataclass
@@ -38,15 +39,17 @@ class UnknownLayout:
 
     @cached_property
     def traces(self) -> slice:
-        """Coefficients of traces that the sensor file does not describe: one for each electrode and each of
-        `TRACE_ANGLES`."""
+        """Coefficients of traces that are missing in the sensor file.
+
+        Each electrode has one coefficient for each angle in `TRACE_ANGLES`.
+        """
         return _after(self.modes, len(TRACE_ANGLES) * len(self.electrode_names))
 
     @cached_property
     def terms(self) -> slice:
-        """Coefficients of the discrepancy, one for each pair of a term and an electrode.
+        """Coefficients of the discrepancy: one for each pair of a term and an electrode.
 
-        The index of the electrode changes fastest.
+        In the order of these coefficients, the index of the electrode changes fastest.
         """
         return _after(self.traces, term_count() * len(self.electrode_names))
 
@@ -57,32 +60,32 @@ class UnknownLayout:
 
     @cached_property
     def coefficients(self) -> slice:
-        """Modes, traces and terms together."""
+        """All coefficients: those of the modes, the traces and the terms of the discrepancy."""
         return slice(self.modes.start, self.terms.stop)
 
     @cached_property
     def imperfections(self) -> slice:
-        """Modes and traces together: the coefficients of physical imperfections."""
+        """Coefficients of physical imperfections: those of the modes and the traces."""
         return slice(self.modes.start, self.traces.stop)
 
     @cached_property
     def film(self) -> slice:
-        """Parameters and coefficients together: all unknowns of the film."""
+        """All unknowns of the film: its parameters and its coefficients."""
         return slice(self.parameters.start, self.terms.stop)
 
     @property
     def parameter_count(self) -> int:
-        """Number of parameters."""
+        """Number of parameters of the film."""
         return _count(self.parameters)
 
     @property
     def coefficient_count(self) -> int:
-        """Number of coefficients."""
+        """Number of coefficients of the film."""
         return _count(self.coefficients)
 
     @property
     def film_count(self) -> int:
-        """Number of parameters and coefficients."""
+        """Number of parameters and coefficients of the film together."""
         return _count(self.film)
 
     @property

@@ -1,8 +1,9 @@
 """Estimation of the noise of measured presses from the presses themselves.
 
 For each press, a plane is fitted to the charges of the presses with the most similar positions and forces. The plane
-predicts the charges of the press. The residuals are the noise of the channels. The residuals include the effect of the
-rig's errors in position and force. The variance of each channel is modelled as s^2 = white^2 + (gain * Q)^2.
+predicts the charges of the press. The residuals of the prediction are attributed to the noise of the channels, although
+they also contain the errors of the measured positions and forces. The variance of the noise of a channel is modelled as
+white^2 + (gain * Q)^2, with the charge Q and two parameters, white and gain.
 """
 
 from dataclasses import dataclass
@@ -15,25 +16,25 @@ from isocharge.common.arrays import Array
 from isocharge.simulate import NoiseModel
 
 NEIGHBOURS = 16
-"""Number of presses to which a plane is fitted: four for each of its coefficients."""
+"""Number of presses to which a plane is fitted, which is four times the number of its coefficients."""
 
 ROUNDS = 10
-"""Number of weighted least-squares fits. The weights of each fit follow from the variances of the previous fit."""
+"""Number of weighted least-squares fits. The variances of each fit determine the weights of the next fit."""
 
 TINY = 1e-30
 """Smallest divisor, so that no division by zero occurs."""
 
 OUTLIER = 3.0
-"""Number of standard deviations to which residuals are clipped, because larger residuals have other causes."""
+"""Number of standard deviations to which residuals are clipped, because larger residuals are not due to noise."""
 
 LEAST_SHARE = 0.01
-"""Smallest ratio of white noise to gain, relative to the usual size of the charges of a channel.
+"""Smallest white noise of a channel, relative to the noise of its gain at a charge of the usual size.
 
-If no charge is small, the presses do not determine the white noise.
+The lower limit is needed because the presses do not determine the white noise if no charge is small.
 """
 
 BOTH_SIGNS = 0.01
-"""Fraction of presses with the rarer sign, above which a channel is treated as having charges of both signs."""
+"""Fraction of the charges with the rarer sign above which a channel counts as one with charges of both signs."""
 
 MIN_TRANSITION_RATIO = 0.5
 """Smallest `ChannelNoise.transition_charge` of a channel with both signs, relative to the usual size of its charges.
@@ -42,21 +43,21 @@ With a smaller value, the features of charges with little noise would have a kin
 """
 
 LARGEST_EXPONENT = 50.0
-"""Largest exponent in the conversion of levels to charges. It limits charges to 1e21 times white noise over gain."""
+"""Largest argument of the hyperbolic sine in the conversion of levels to charges, which limits the charges."""
 
 LEAST_GAIN = 1e-4
-"""Smallest noise of the gain, which is that of a good amplifier.
+"""Smallest relative noise of the gain, which is that of a good amplifier.
 
-With a smaller value, the level asinh(gain Q / white) / gain would practically be Q / white.
+With a smaller value, the level asinh(gain Q / white) / gain would be practically equal to Q / white.
 """
 
 CANDIDATES = 8
-"""Number of planes among which the nearest one is searched."""
+"""Number of planes that are compared in the search for the nearest point of all planes."""
 
 
 @dataclass(frozen=True)
 class ChannelNoise:
-    """A noise model with parameters for each channel.
+    """A noise model with separate parameters for each channel.
 
     Attributes:
         white: Constant part of the standard deviation, shape (n_electrode,), pC.
@@ -72,8 +73,8 @@ class ChannelNoise:
     def of(cls, charge: Array, unit: Array) -> "ChannelNoise":
         """Estimate the noise of each channel from measured presses.
 
-        A plane through the neighbours of each press gives the charge without noise and the residual. The white noise
-        and the noise of the gain are fitted to the residuals. Both have lower limits.
+        A plane through the neighbours of each press gives estimates of the charges without noise, and residuals. The
+        white noise and the noise of the gain are fitted to these residuals. Both kinds of noise have lower limits.
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.
@@ -88,7 +89,7 @@ class ChannelNoise:
         ]
         white_std, gain_std = np.sqrt(np.array(channel_variances)).T  # each of shape (n_electrode,)
         gain = np.maximum(gain_std, LEAST_GAIN)
-        # Presses with large charges alone do not determine the white noise, so it gets a share of the other noise.
+        # The presses do not determine the white noise if all charges are large, so it has a lower limit.
         smallest_white = LEAST_SHARE * gain * usual_size(charge)
         white = np.maximum(white_std, smallest_white)
         return cls(white, gain)
@@ -120,7 +121,7 @@ class ChannelNoise:
         return np.asarray(np.arcsinh(charge * self.gain / self.white) / self.gain)
 
     def charge(self, level: Array) -> Array:
-        """Return the charges that correspond to levels, pC; the inverse of `level`."""
+        """Return the charges, pC, that correspond to levels. This method is the inverse of `level`."""
         exponent = np.clip(level * self.gain, -LARGEST_EXPONENT, LARGEST_EXPONENT)
         return np.asarray(np.sinh(exponent) * self.white / self.gain)
 
@@ -160,8 +161,9 @@ class LocalPlanes:
 
     Attributes:
         value: Value of the plane at the press, shape (n, k).
-        slope: Derivatives with respect to the unit coordinates, shape (n, k, 3).
-        residual: Residual of the press, divided by the square root of 1 + the variance of the plane, shape (n, k).
+        slope: Derivatives of the values with respect to the unit coordinates, shape (n, k, 3).
+        residual: Difference between the values of the press and of the plane, shape (n, k). It is divided by sqrt(1 +
+            v), where v is the variance of the plane if the values of the neighbours have the variance 1.
         reach: Distance of the farthest neighbour in unit coordinates, shape (n,).
     """
 
@@ -201,13 +203,13 @@ class LocalPlanes:
         return cls(value, slope, residual, reach)
 
     def residuals(self, values: Array) -> Array:
-        """Compute the difference of each value from the nearest point of all planes.
+        """Compute the difference between each set of k values and the nearest point of all planes.
 
-        Each value is compared with the `CANDIDATES` planes whose centres are nearest to the value. A plane ends at the
-        distance of its farthest neighbour.
+        Each set of values is compared with the `CANDIDATES` planes whose centres are nearest to it. A plane extends as
+        far as the farthest neighbour of its press.
 
         Args:
-            values: The values, shape (m, k).
+            values: m sets of values, shape (m, k).
 
         Returns:
             Differences, shape (m, k).
@@ -215,9 +217,9 @@ class LocalPlanes:
         _, candidate_planes = cKDTree(self.value).query(values, CANDIDATES)  # indices, shape (m, CANDIDATES)
         inverse_slope = np.linalg.pinv(self.slope)  # shape (n, 3, k)
         smallest_residual = np.full(values.shape, np.inf)
-        for planes in candidate_planes.T:  # one plane for each value
-            # Project each value onto its plane. The step leads from the centre of the plane to the projection, in unit
-            # coordinates, shape (m, 3). The additional last axis makes each difference a column vector.
+        for planes in candidate_planes.T:  # indices of one plane for each set of values, shape (m,)
+            # Project each set of values onto its plane. The vector `step`, shape (m, 3), leads from the centre of the
+            # plane to the projection, in unit coordinates. The last axis of the difference makes it a column vector.
             difference = values - self.value[planes]
             step = (inverse_slope[planes] @ difference[..., None])[..., 0]
 
@@ -236,16 +238,17 @@ def usual_size(charge: Array) -> Array:
     """Return the median magnitude of the nonzero charges of each channel, shape (n_electrode,), pC.
 
     Args:
-        charge: Charges, shape (n, n_electrode), pC. Every channel has at least one charge that is not 0.
+        charge: Charges, shape (n, n_electrode), pC. Every channel must have at least one charge that is not 0.
     """
     return np.array([np.median(np.abs(column[column != 0.0])) for column in charge.T])
 
 
 def _fit_variances(charge: Array, residual: Array) -> tuple[float, float]:
-    """Estimate the variances white^2 and gain^2 of one channel, for which white^2 + gain^2 Q^2 fits the residuals.
+    """Estimate the variances white^2 and gain^2 of one channel.
 
-    The fit is a weighted least-squares problem with variances that are not negative. The weights of each round follow
-    from the previous round, because the standard deviation of a squared residual is proportional to its expectation.
+    The function white^2 + gain^2 Q^2 is fitted to the squared residuals by weighted least squares, with variances that
+    are not negative. The standard deviation of a squared residual is proportional to its expected value. The weights of
+    each round therefore follow from the expected values of the previous round.
 
     Args:
         charge: Charges Q without noise, shape (n,), pC.
@@ -254,7 +257,7 @@ def _fit_variances(charge: Array, residual: Array) -> tuple[float, float]:
     Returns:
         white^2, pC^2, and gain^2, dimensionless.
     """
-    # The expected squares are columns @ (white^2, gain^2).
+    # The expected values of the squared residuals are columns @ (white^2, gain^2).
     columns = np.stack([np.ones_like(charge), charge**2], axis=1)  # shape (n, 2)
     mean_square = np.mean(residual**2)
     smallest_variance = 1e-12 * mean_square + TINY  # avoids a division by zero
@@ -275,4 +278,4 @@ def _fit_variances(charge: Array, residual: Array) -> tuple[float, float]:
 
 
 Noise = NoiseModel | ChannelNoise
-"""Noise model for all channels alike, or for each channel."""
+"""Noise model with the same parameters for all channels, or with separate parameters for each channel."""

@@ -1,17 +1,18 @@
-"""Chebyshev series of the map from contacts to charges, fitted to a dataset, and the disk in which it is invertible.
+"""Chebyshev series of the map from contacts to charges, and the disk in which this map is invertible.
 
-Without pretension, the charges are nearly Q = F^(2/3) g(x, y) with a smooth function g. The logarithm of each charge is
-therefore expanded in Chebyshev polynomials:
+Without pretension, the charge of an electrode is nearly F^(2/3) g(x, y), with the force F and a smooth function g of
+the position. The logarithm of each charge Q_e is therefore expanded in Chebyshev polynomials T_i:
 
     ln Q_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree.
 
-Here r is the radius of the working area, and l is the logarithm of the force scaled to [-1, 1]. Taut uniaxial films
-have charges of both signs. For such charges, the quotient Q_e / S(l) is expanded instead of the logarithm. Here S(l) is
-the typical size of the charges under this force. The coefficients follow from linear least squares.
+Here r is the radius of the working area, and l is the logarithm of the force, scaled to the interval [-1, 1]. Taut
+uniaxial films have charges of both signs. For charges of both signs, the quotient Q_e / S(l) is expanded instead of the
+logarithm, where S(l) is the typical size of the charges as a function of l. The coefficients are fitted to a dataset by
+linear least squares.
 
-The training uses the series for three searches: for the contact that is nearest to given charges, for folds of the map,
-and for distant contacts with the same charges. The model itself does not use the series. For a dataset of several
-probes, the series describes the mean of their charges.
+The training uses the series in three searches: for the contact whose charges are nearest to given charges, for folds of
+the map, and for distant contacts with the same charges. The trained model does not use the series. For a dataset with
+several probes, the series describes the mean of the charges of these probes.
 """
 
 from dataclasses import dataclass, replace
@@ -32,17 +33,20 @@ from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pa
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 
 CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
-"""Degrees in position and in force that are tried one after the other for positive charges."""
+"""Degrees in the position and in the force that are tried, in this order, for positive charges."""
 
 TAUT_CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = ((6, 4), (10, 4), (16, 4), (24, 4))
-"""Degrees in position and in force that are tried for positive charges on taut films.
+"""Degrees in the position and in the force that are tried, in this order, for positive charges on taut films.
 
-On taut films, the charges are proportional to the force at small forces, and to its power 2/3 at large forces. The
-logarithm of a charge is therefore not a polynomial of low degree in the logarithm of the force."""
+On taut films, the charges are proportional to the force at small forces, and proportional to the power 2/3 of the force
+at large forces. The logarithm of a charge is therefore not a polynomial of low degree in the logarithm of the force."""
 
 TAUT_ERROR_RATIO = 0.8
-"""Ratio of the errors with the first of `TAUT_CANDIDATE_DEGREES` and the first of `CANDIDATE_DEGREES` below which the
-film counts as taut. On a slack film, the degree in force hardly changes the error, and the ratio is nearly one."""
+"""Ratio of two errors of the fit below which a film counts as taut.
+
+The ratio is the error with the first of `TAUT_CANDIDATE_DEGREES` divided by the error with the first of
+`CANDIDATE_DEGREES`. On a slack film, a higher degree in the force hardly changes the error, so the ratio is nearly
+one."""
 
 SIGNED_CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = (
     (6, 1),
@@ -54,46 +58,49 @@ SIGNED_CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = (
     (24, 6),
     (24, 8),
 )
-"""Degrees in position and in force that are tried for charges of both signs.
+"""Degrees in the position and in the force that are tried, in this order, for charges of both signs.
 
-The degrees in force are higher, because on taut films the exponent of the force changes with the force."""
+The degrees in the force are higher than for positive charges. Charges of both signs occur on taut films, on which the
+exponent of the force changes with the force."""
 
 SIZE_DEGREE = 4
-"""Degree of the polynomial in l that approximates ln S, where S is the size of the charges."""
+"""Degree of the polynomial that approximates the logarithm of the size S of the charges as a function of l."""
 
 NOISE_CORNER_pC = 500.0
-"""Charge at which both parts of the `reference` noise are equal, 1 pC and 0.2 %, pC.
+"""Charge at which both parts of the `reference` noise, 1 pC and 0.2 % of the charge, are equal, pC.
 
-For charges of both signs, errors are given relative to the charge or to this value, whichever is larger.
+For charges of both signs, the errors of a fit are divided by the root of the sum of the squares of the charge and of
+this value. Charges near zero would otherwise have large relative errors.
 """
 
 ROWS_PER_TERM = 40
-"""Largest number of presses for each coefficient. A larger number improves the fit mostly near the edge of the disk."""
+"""Largest number of presses per coefficient. More presses would improve the fit mostly near the edge of the disk."""
 
 FEWEST_PER_TERM = 8
-"""Smallest number of presses for each coefficient. Fewer presses do not determine the slopes near the edge."""
+"""Smallest number of presses per coefficient. Fewer presses would not determine the slopes near the edge."""
 
 RIDGE = 1e-9
 """Relative weight of the squared coefficients in the fit (ridge regression).
 
-The polynomials are defined on a square, whose corners lie outside of the disk and contain no presses.
+The ridge is needed because the polynomials are defined on a square, whose corners lie outside the disk and contain no
+presses.
 """
 
 GOOD_ENOUGH = 1.5e-4
-"""Relative rms error of the charges below which no higher degree is tried: about a tenth of the reference noise."""
+"""Relative rms error of the charges below which no higher degree is tried, about a tenth of the reference noise."""
 
 
 @dataclass(frozen=True)
 class ChargeField:
-    """A `ChargeMap` fitted to presses.
+    """Chebyshev series of the charges, which is fitted to presses and has the methods of a `ChargeMap`.
 
     Attributes:
         domain: Contacts for which the field holds.
         electrodes: Names of the electrodes, in the order of the charges.
-        series: Coefficients of ln Q (Q in pC), shape (degree + 1, degree + 1, force_degree + 1, n_electrode).
+        series: Coefficients of ln Q with Q in pC, or of Q / S if `log_size` is given, shape (degree + 1, degree + 1,
+            force_degree + 1, n_electrode).
         error: Relative rms error of the charges of presses that were not used in the fit.
         log_size: Coefficients of ln S for charges of both signs, shape (SIZE_DEGREE + 1,); None for positive charges.
-            With `log_size`, `series` has the coefficients of Q / S.
     """
 
     domain: Domain
@@ -106,16 +113,19 @@ class ChargeField:
     def fit(
         cls, domain: Domain, electrodes: tuple[str, ...], presses: LabelledPresses, validation: LabelledPresses
     ) -> "ChargeField":
-        """Fit the series to presses by least squares, and choose its degree by the error on other presses.
+        """Fit the series to presses by least squares, and choose its degrees by the error on other presses.
 
         Args:
-            domain: Domain of the contacts.
-            electrodes: Names of the electrodes.
-            presses: Presses without noise.
-            validation: Presses on which the error is measured.
+            domain: Working area and range of forces of the contacts.
+            electrodes: Names of the electrodes, in the order of the charges.
+            presses: Presses to which the series is fitted.
+            validation: Other presses, on which the error is measured.
+
+        Returns:
+            The field with the smallest error among the degrees that were tried.
 
         Raises:
-            TrainingError: If there are too few presses for the smallest degree.
+            TrainingError: If there are too few presses for the smallest degrees.
         """
         fitter = _SeriesFitter.of(domain, electrodes, presses, validation)
         candidate_degrees = SIGNED_CANDIDATE_DEGREES if presses.signed else CANDIDATE_DEGREES
@@ -125,7 +135,7 @@ class ChargeField:
             fewest = FEWEST_PER_TERM * series_term_count(*first_degrees)
             raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(presses)}")
 
-        # If the lowest degrees for taut films have a clearly smaller error, the film is taut.
+        # If the first degrees for taut films have a clearly smaller error, the film is taut.
         if not presses.signed and best_field.error > GOOD_ENOUGH:
             first_taut_degrees, *further_taut_degrees = TAUT_CANDIDATE_DEGREES
             taut_field = fitter.fit(*first_taut_degrees)
@@ -144,17 +154,17 @@ class ChargeField:
         return best_field
 
     def charges(self, contact: Array) -> Array:
-        """Return the charges of contacts; see `ChargeMap`."""
+        """Compute the charges of contacts; see `ChargeMap.charges`."""
         charge, _ = self.linearised(contact)
         return charge
 
     def derivatives(self, contact: Array) -> Array:
-        """Return the derivatives of the charges; see `ChargeMap`."""
+        """Compute the derivatives of the charges; see `ChargeMap.derivatives`."""
         _, derivatives = self.linearised(contact)
         return derivatives
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Return charges and their derivatives together, which takes half the time of computing them one by one.
+        """Compute charges and their derivatives together, which is faster than computing them separately.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -165,7 +175,7 @@ class ChargeField:
         """
         unit = self.domain.to_unit(contact)
         # The second axis has the value of the series, and then its derivatives with respect to x, y and l.
-        values_and_slopes = self._series.values(unit)  # shape (n, 4, n_electrode)
+        values_and_slopes = self._series.values_and_derivatives(unit)  # shape (n, 4, n_electrode)
         value = values_and_slopes[:, 0]
         slopes = values_and_slopes[:, 1:]
         if self.log_size is None:  # ln Q = value, so Q' = Q value'
@@ -181,7 +191,7 @@ class ChargeField:
 
     @cached_property
     def _series(self) -> Series:
-        """The series with its coefficients, in the form in which it is evaluated."""
+        """Object that evaluates the series."""
         return Series(self.series)
 
     @property
@@ -194,16 +204,16 @@ class ChargeField:
 
 @dataclass(frozen=True)
 class _SeriesFitter:
-    """Presses to which series of several degrees are fitted, and presses on which their errors are measured.
+    """Presses to which series of several degrees are fitted, and other presses on which the errors are measured.
 
     Attributes:
-        domain: Domain of the contacts.
-        electrodes: Names of the electrodes.
+        domain: Working area and range of forces of the contacts.
+        electrodes: Names of the electrodes, in the order of the charges.
         unit: Contacts of the fit in unit coordinates, shape (n, 3).
         target: Values of the series at these contacts, ln Q or Q / S, shape (n, n_electrode).
         log_size: Coefficients of ln S for charges of both signs; None for positive charges.
         validation: Presses on which the errors are measured.
-        error_unit: Charges to which the errors are relative, pC, of the shape of the charges of `validation`.
+        error_unit: Charges by which the errors are divided, shape (n_validation, n_electrode), pC.
     """
 
     domain: Domain
@@ -218,7 +228,14 @@ class _SeriesFitter:
     def of(
         cls, domain: Domain, electrodes: tuple[str, ...], presses: LabelledPresses, validation: LabelledPresses
     ) -> "_SeriesFitter":
-        """Compute the values of the series at the presses, and the units of the errors; see `ChargeField.fit`."""
+        """Compute the values to which the series is fitted, and the units of the errors.
+
+        Args:
+            domain: Working area and range of forces of the contacts.
+            electrodes: Names of the electrodes, in the order of the charges.
+            presses: Presses to which series will be fitted.
+            validation: Other presses, on which the errors will be measured.
+        """
         unit = domain.to_unit(presses.contact)
         if presses.signed:
             log_size = _fit_log_size(unit[:, 2], presses.charge)
@@ -233,16 +250,16 @@ class _SeriesFitter:
         return cls(domain, electrodes, unit, target, log_size, validation, error_unit)
 
     def fit(self, degree: int, force_degree: int) -> ChargeField | None:
-        """Fit a series of these degrees, and measure its error on the validation presses.
+        """Fit a series with the given degrees, and measure its error on the validation presses.
 
-        If there are many presses for each term of the series, only the first ones are used.
+        At most the first `ROWS_PER_TERM` presses for each term of the series are used.
 
         Args:
             degree: Largest total degree in x and y.
             force_degree: Largest degree in the logarithm of the force.
 
         Returns:
-            The fitted field with its error; None if there are too few presses for these degrees.
+            The fitted field with its error; None if there are fewer than `FEWEST_PER_TERM` presses for each term.
         """
         n_term = series_term_count(degree, force_degree)
         if FEWEST_PER_TERM * n_term > len(self.unit):
@@ -255,7 +272,9 @@ class _SeriesFitter:
 
 
 def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
-    """Fit the logarithm of the size S of the charges as a polynomial of the scaled logarithm l of the force.
+    """Fit a polynomial in the scaled logarithm l of the force to the logarithm of the size S of the charges.
+
+    The size of the charges of a press is the root of the sum of their squares, but at least `LOWEST_CHARGE`.
 
     Args:
         unit_log_force: Logarithms l of the forces scaled to [-1, 1], shape (n,).
@@ -264,8 +283,8 @@ def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
     Returns:
         Coefficients of the Chebyshev polynomials, shape (SIZE_DEGREE + 1,).
     """
-    total = np.maximum(np.linalg.norm(charge, axis=1), LOWEST_CHARGE)
-    return np.asarray(chebyshev.chebfit(unit_log_force, np.log(total), SIZE_DEGREE))
+    size = np.maximum(np.linalg.norm(charge, axis=1), LOWEST_CHARGE)
+    return np.asarray(chebyshev.chebfit(unit_log_force, np.log(size), SIZE_DEGREE))
 
 
 def _size_and_slope(coefficients: Array, unit_log_force: Array) -> tuple[Array, Array]:
@@ -276,7 +295,7 @@ def _size_and_slope(coefficients: Array, unit_log_force: Array) -> tuple[Array, 
         unit_log_force: Logarithms l of the forces scaled to [-1, 1], shape (n,). They are clipped to this interval.
 
     Returns:
-        S, pC, and the derivative, dimensionless, shape (n, 1) each.
+        The size S, pC, and the derivative of ln S, dimensionless, each of shape (n, 1).
     """
     clipped = np.clip(unit_log_force, -1.0, 1.0)[:, None]
     slope = chebyshev.chebval(clipped, chebyshev.chebder(coefficients))
@@ -284,18 +303,18 @@ def _size_and_slope(coefficients: Array, unit_log_force: Array) -> tuple[Array, 
 
 
 def series_term_count(degree: int, force_degree: int) -> int:
-    """Return the number of terms of a series with a total degree in x and y and a degree in the force."""
+    """Return the number of terms of a series with a given total degree in x and y and a given degree in the force."""
     return (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
 
 
 def fit_series(unit: Array, target: Array, degree: int, force_degree: int) -> Array:
     """Fit a Chebyshev series in position and force by least squares.
 
-    The normal equations are solved, which are well conditioned here. With one row of columns A for each contact, they
-    are (A' A + RIDGE n I) coefficients = A' target.
+    Let the matrix A have one row for each of n contacts and one column for each term of the series. The coefficients c
+    solve the normal equations (A' A + RIDGE n I) c = A' target.
 
     Args:
-        unit: Scaled contacts, shape (n, 3).
+        unit: Contacts in unit coordinates, shape (n, 3).
         target: Values of the series at these contacts, shape (n, k).
         degree: Largest total degree in x and y.
         force_degree: Largest degree in the logarithm of the force.
@@ -309,12 +328,12 @@ def fit_series(unit: Array, target: Array, degree: int, force_degree: int) -> Ar
     n_chunk = len(unit) // CHUNK_SIZE + 1  # chunks limit the memory
     for rows in np.array_split(np.arange(len(unit)), n_chunk):
         position_terms, force_terms = chebyshev_terms(unit[rows], degree, force_degree)
-        # Each column is the product of a polynomial in the position and a polynomial in the force.
-        columns = (position_terms[:, :, None] * force_terms[:, None, :]).reshape(len(rows), -1)
-        normal_matrix += columns.T @ columns
-        right_side += columns.T @ target[rows]
+        # Each column of A is the product of a polynomial in the position and a polynomial in the force.
+        chunk_of_a = (position_terms[:, :, None] * force_terms[:, None, :]).reshape(len(rows), -1)
+        normal_matrix += chunk_of_a.T @ chunk_of_a
+        right_side += chunk_of_a.T @ target[rows]
 
-    # The coefficients of terms above the total degree remain zero.
+    # The series also has entries for terms above the total degree, whose coefficients remain zero.
     solution = cho_solve(cho_factor(normal_matrix), right_side)
     series = np.zeros((degree + 1, degree + 1, force_degree + 1, target.shape[1]))
     series[position_degrees(degree)] = solution.reshape(-1, force_degree + 1, target.shape[1])
@@ -322,48 +341,50 @@ def fit_series(unit: Array, target: Array, degree: int, force_degree: int) -> Ar
 
 
 MAX_ERROR_OF_CERTAIN_FOLD = 3e-4
-"""Largest relative error of the fitted charges for which a fold is certain. A poor fit has spurious folds."""
+"""Largest relative error of the fitted charges at which a fold counts as certain. A poor fit has spurious folds."""
 
 MAX_ERROR_WITHOUT_NOISE = 2e-3
 """Relative error of a fit above which the charges probably have noise."""
 
 CREDIBLE_FOLD_RATIO = 0.95
-"""Largest ratio of the radius of a fold to the radius of the domain for which a fold of a poor fit counts as real.
+"""Largest ratio of the radius of a fold to the radius of the domain at which a fold of a poor fit counts as real.
 
-Spurious folds lie near the edge of the domain, where there are presses on one side only."""
+Spurious folds lie near the edge of the domain, because there are presses on only one side of the edge."""
 
 CREDIBLE_FOLD_RATIO_WITH_NOISE = 0.8
-"""The value of `CREDIBLE_FOLD_RATIO` for charges with noise, which moves spurious folds inwards."""
+"""Ratio that replaces `CREDIBLE_FOLD_RATIO` if the charges have noise, because noise moves spurious folds inwards."""
 
 SEARCHED_RADIUS_RATIO = 0.98
-"""Ratio of the searched radius to the radius of the domain. At the edge, presses do not determine the slopes."""
+"""Ratio of the radius within which folds are searched for to the radius of the domain.
+
+At the edge of the domain, the presses do not determine the derivatives of the charges accurately."""
 
 N_PAIR_CONTACTS = 400
-"""Number of contacts for which another contact with the same charges is searched. The search takes half a second."""
+"""Number of contacts for each of which another contact with the same charges is searched for."""
 
 SMALLEST_SHARE = 0.2
-"""Smallest ratio of the fold-free radius to the radius of the dataset for which a training makes sense."""
+"""Smallest ratio of the radius without folds to the radius of the dataset at which a network can be trained."""
 
 
 def invertible_domain(
     field: ChargeField, presses: LabelledPresses, noise: NoiseModel
 ) -> tuple[Domain, tuple[str, ...]]:
-    """Return the largest disk without a certain fold, and sentences about folds and ambiguous pairs.
+    """Return the largest disk that contains no certain fold, and sentences about folds and ambiguous pairs.
 
-    A fit to few presses, or to measured charges with noise, is too inaccurate to prove a fold. The domain is then not
-    reduced, and a sentence states where the map seems to fold. Ambiguous pairs are searched only if the error of the
-    fit is small.
+    A fit to few presses, or to measured charges with noise, is too inaccurate to prove a fold. If a fold is not
+    certain, the domain is not reduced, and a sentence states where the map seems to fold. Ambiguous pairs are searched
+    for only if the error of the fit is small.
 
     Args:
         field: Charge field that was fitted to the presses.
-        presses: The presses. A sentence states how many of them remain.
+        presses: Presses to which the field was fitted. A sentence states how many of them lie in the disk.
         noise: Noise of good presses. Charges that differ by less than the noise count as equal.
 
     Returns:
-        The domain, and the sentences.
+        The domain, which is the disk with the range of forces, and the sentences.
 
     Raises:
-        DatasetError: If the fold is so near to the centre that hardly any contacts remain.
+        DatasetError: If the radius of the disk is less than `SMALLEST_SHARE` of the radius of the field.
     """
     requested = field.domain
     has_little_noise = field.error < MAX_ERROR_WITHOUT_NOISE
@@ -391,20 +412,20 @@ def invertible_domain(
     return domain, tuple(cautions)
 
 
-def _pair_cautions(searched: ChargeMap, noise: NoiseModel) -> list[str]:
-    """Return a sentence about pairs of distant contacts with the same charges, if there are any.
+def _pair_cautions(searched_map: ChargeMap, noise: NoiseModel) -> list[str]:
+    """Return a sentence about pairs of distant contacts with the same charges, if such pairs exist.
 
-    Only contacts with the smallest force are compared.
+    Only contacts with the smallest force of the domain are compared.
 
     Args:
-        searched: Map from contacts to charges; its domain is searched.
+        searched_map: Map from contacts to charges, in whose domain pairs are searched for.
         noise: Noise of good presses. Charges that differ by less than the noise count as equal.
 
     Returns:
         A list of one sentence, or an empty list.
     """
-    smallest_force, _ = searched.domain.force_range
-    pairs = find_ambiguous_pairs(searched, noise, smallest_force, N_PAIR_CONTACTS)
+    smallest_force, _ = searched_map.domain.force_range
+    pairs = find_ambiguous_pairs(searched_map, noise, smallest_force, N_PAIR_CONTACTS)
     if not pairs.summary:
         return []
     # The sentence is continued, so it begins in lower case and has no full stop.
@@ -428,12 +449,12 @@ def _uncertain_fold_caution(fold_radius: float, requested_radius: float) -> str:
 
 
 def _fold_caution(field: ChargeField, presses: LabelledPresses, fold_radius: float) -> str:
-    """Return a sentence about a certain fold, and about the reduction of the domain because of this fold.
+    """Return a sentence about a certain fold, which states how far the domain is reduced because of the fold.
 
-    For positive charges, the sentence also names the command that follows contacts beyond the fold.
+    For positive charges, the sentence also names the command that tracks contacts beyond the fold.
 
     Args:
-        field: Charge field with the domain before the reduction.
+        field: Charge field, whose domain is not reduced yet.
         presses: The presses, some of which lie beyond the fold.
         fold_radius: Distance of the fold from the centre, mm.
     """
@@ -450,7 +471,12 @@ def _fold_caution(field: ChargeField, presses: LabelledPresses, fold_radius: flo
 
 
 def _fold_radius(field: ChargeField, noise: NoiseModel) -> float:
-    """Return the distance of the nearest fold from the centre, mm, rounded; infinity if there is no fold."""
+    """Return the radius of the largest disk without folds, mm, rounded; infinity if the domain has no fold.
+
+    Args:
+        field: Charge field in whose domain folds are searched for.
+        noise: Noise of good presses.
+    """
     area = working_area(within(field, SEARCHED_RADIUS_RATIO * field.domain.radius), noise, search_pairs=False)
     if not np.isfinite(area.fold_radius):
         return np.inf

@@ -18,33 +18,33 @@ from isocharge.train.data.measured_sensor import PressedArea
 USUAL_SIZES = (1e-30, 1e30)
 """Range of the median size of the charges of a channel, pC.
 
-Within this range, float32 numbers can represent the squares of the charges and small fractions of them.
+Within this range, float32 numbers can represent the squares of the charges and small fractions of these squares.
 """
 
 LEAST_VARIATION = 1e-6
-"""Smallest range of the charges of a channel, relative to the largest size."""
+"""Smallest range of the charges of a channel, relative to their largest magnitude."""
 
 LEAST_VARYING_SHARE = 0.01
 """Smallest share of the presses in which the charge of a channel differs from its most frequent value."""
 
 USUAL_SHARE = 0.9
-"""Share of the values of a column that lie in its usual range, dimensionless."""
+"""Share of the values of a column whose distance from the median is at most the usual distance, dimensionless."""
 
 FARTHEST = 1_000.0
-"""Largest distance of a value from the median of its column, as a multiple of the usual range."""
+"""Largest distance of a value from the median of its column, as a multiple of the usual distance."""
 
 LEAST_INDEPENDENCE = 1e-4
-"""Smallest singular value of the standardised charges of independent channels, relative to the largest."""
+"""Smallest ratio of the smallest to the largest singular value of the standardised charges of independent channels."""
 
 LEAST_PARTICIPATION = 1e-2
 """Smallest coefficient of a channel that takes part in a linear dependence, relative to the largest coefficient."""
 
 
 def check_measured_presses(presses: MeasuredPresses) -> None:
-    """Check that a network can be trained on measured presses without unknown values.
+    """Check that a network can be trained on measured presses.
 
     Args:
-        presses: The presses. All positions, forces and charges are known.
+        presses: The presses. None of their positions, forces and charges may be unknown.
 
     Raises:
         PressError: If the charges of a channel hardly vary or are too small or too large, if a value is far from all
@@ -57,23 +57,26 @@ def check_measured_presses(presses: MeasuredPresses) -> None:
         _check_variation(name, charge)
         _check_size(name, charge)
     for name, values in {**contact_columns, **channels}.items():
-        _check_far_value(presses, name, values, compared=values)
+        _check_far_value(presses, name, values, compared_values=values)
 
-    # A force that is far too small is not far from the others, but its inverse is.
+    # A force that is far too small is not far from the other forces, but its inverse is far from the other inverses.
     force = contact_columns["force_N"]
-    _check_far_value(presses, "force_N", force, compared=1.0 / force)
+    _check_far_value(presses, "force_N", force, compared_values=1.0 / force)
     _check_independence(channels)
     PressedArea.of(presses.contact)  # raises if the positions enclose no area
 
 
 def check_measured_dataset(dataset: Dataset) -> None:
-    """Check that a network can be trained on a dataset of measured presses, whose samples are numbered from 0.
+    """Check that a network can be trained on a dataset of measured presses.
+
+    The error messages number the samples of the dataset from 0.
 
     Args:
         dataset: The dataset.
 
     Raises:
-        DatasetError: If `check_measured_presses` finds a fault, or if a number is too large for a file of presses.
+        DatasetError: If `check_measured_presses` would raise an error, or if a number is too large for a file of
+            presses.
     """
     samples = dataset.samples
     count = len(samples)
@@ -135,24 +138,25 @@ def _check_size(name: str, charge: Array) -> None:
         )
 
 
-def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compared: Array) -> None:
-    """Raise an error if a value is far from all others.
+def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compared_values: Array) -> None:
+    """Raise an error if a value of a column is far from all other values.
 
-    The largest distance from the median is compared with a quantile of the distances.
+    The largest distance from the median is compared with the usual distance, which is a quantile of the distances.
 
     Args:
-        presses: The presses, for the number of the line.
-        name: The column, for the message.
+        presses: The presses, which contain the number of each line for the message.
+        name: Name of the column, for the message.
         values: Values of the column, shape (n,).
-        compared: Numbers that are compared, shape (n,): the values, or a function of them.
+        compared_values: Numbers whose distances from their median are compared, shape (n,). They are the values or a
+            function of the values.
 
     Raises:
         PressError: If the largest distance exceeds `FARTHEST` times the usual distance.
     """
-    distance = np.abs(compared - np.median(compared))
+    distance = np.abs(compared_values - np.median(compared_values))
     if not distance.any():  # all values are equal
         return
-    # Distances of zero are left out. If most values are equal, the usual distance would otherwise be zero.
+    # Distances of zero are left out, because the usual distance would otherwise be zero if most values are equal.
     usual_distance = float(np.quantile(distance[distance > 0.0], USUAL_SHARE))
     row = int(distance.argmax())
     if distance[row] > FARTHEST * usual_distance:
@@ -171,7 +175,7 @@ def _check_independence(channels: Mapping[str, Array]) -> None:
 
     Raises:
         PressError: If the smallest singular value of the standardised charges is nearly zero. The message names the
-            channels that contribute to its singular vector.
+            channels that contribute to the singular vector of this value.
     """
     charge = np.column_stack(list(channels.values()))
     scaled_charge = charge / usual_size(charge)

@@ -1,4 +1,4 @@
-"""Sensor without a sensor file. It is described by the names of its channels and by the area that was pressed."""
+"""Sensor without a sensor file, which is described by the names of its channels and the area that was pressed."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ LEAST_HOLE = 6.0
 The radius is relative to the distance between neighbouring places."""
 
 LEAST_RANGE = 1.1
-"""Smallest ratio of the largest to the smallest force of an area, also if all presses have the same force."""
+"""Smallest ratio of the largest to the smallest force of a domain, which applies even if all forces are equal."""
 
 LEAST_WIDTH = 1e-3
 """Smallest ratio of the standard deviations of the places across and along their main direction."""
@@ -29,7 +29,7 @@ LONGEST_MITRE = 2.0
 
 
 MIN_TURN_rad = 1e-6
-"""Smallest angle between two neighbouring sides of an outline, rad. A corner with a smaller angle is left out."""
+"""Smallest angle by which an outline turns at a corner, rad. A corner with a smaller angle is left out."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class MeasuredSensor:
     """Description of a sensor in the metadata of a model of measured presses.
 
     Attributes:
-        name: Name of the sensor, to whose frame x and y refer.
+        name: Name of the sensor, in whose system of coordinates x and y are given.
         electrode_names: Names of the channels, in the order of their charges.
     """
 
@@ -51,21 +51,24 @@ class MeasuredSensor:
 
 @dataclass(frozen=True)
 class PressedArea(Domain):
-    """Domain of the contacts that were pressed: an area of any shape in any place, and a range of forces.
+    """Domain of contacts that were pressed, with an area of any shape and position, and a range of forces.
 
     `radius` is the distance of the farthest corner from the middle of the area, not from the origin.
 
     Attributes:
-        corners: Corners of the area, in order, mm.
+        corners: Corners (x, y) of the area in the order along its outline, mm.
     """
 
     corners: tuple[tuple[float, float], ...]
 
     @classmethod
     def of(cls, contact: Array) -> "PressedArea":
-        """Return the area of contacts (x, y, F), shape (n, 3), mm and N.
+        """Return the domain that contains given contacts, with the outline of their places and their range of forces.
 
         If all forces are nearly equal, the range of forces is enlarged.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Raises:
             PressError: If the places lie on a line.
@@ -83,29 +86,29 @@ class PressedArea(Domain):
 
     @classmethod
     def of_corners(cls, corners: Array, force_range: tuple[float, float]) -> "PressedArea":
-        """Return the area with these corners, shape (n, 2), mm, and forces, N."""
+        """Return the domain with the given corners (x, y), shape (n, 2), mm, and the given range of forces, N."""
         distance_from_middle = np.linalg.norm(corners - _box_middle(corners), axis=1)
         return cls(float(distance_from_middle.max()), force_range, tuple((x, y) for x, y in corners.tolist()))
 
     @cached_property
     def centre(self) -> Array:
-        """Middle of (x, y, ln F), shape (3,), mm and logarithm of N."""
+        """Middle of the ranges of (x, y, ln F), shape (3,), with x and y in mm and F in N."""
         return np.append(_box_middle(np.array(self.corners)), super().centre[2])
 
     @cached_property
     def scale(self) -> Array:
-        """Half width of (x, y, ln F), shape (3,), mm and logarithm of N."""
+        """Half widths of the ranges of (x, y, ln F), shape (3,), with x and y in mm and F in N."""
         return np.append(0.5 * np.ptp(np.array(self.corners), axis=0), super().scale[2])
 
     @property
     def places(self) -> str:
-        """Words that say where contacts may lie."""
+        """Text for error messages that states where contacts may lie."""
         left, bottom = np.min(self.corners, axis=0)
         right, top = np.max(self.corners, axis=0)
         return f"a place in the pressed area, x from {left:g} to {right:g} mm and y from {bottom:g} to {top:g} mm,"
 
     def is_outside(self, contact: Array) -> Booleans:
-        """Return whether contacts are outside the area or the range of forces.
+        """Return which contacts are outside the area or the range of forces.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N. Contacts with NaN do not count as outside.
@@ -117,7 +120,7 @@ class PressedArea(Domain):
         return np.asarray(is_known & ~self.contains(contact))
 
     def contains(self, contact: Array) -> Booleans:
-        """Return whether contacts lie in the domain.
+        """Return which contacts lie in the area and in the range of forces.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N. Contacts with NaN do not lie in the domain.
@@ -130,16 +133,16 @@ class PressedArea(Domain):
 
 
 def _box_middle(corners: Array) -> Array:
-    """Return the middle of the box around corners, shape (2,), mm."""
+    """Return the middle of the box around corners (x, y) whose sides are parallel to x and y, shape (2,), mm."""
     return np.asarray(0.5 * (corners.min(axis=0) + corners.max(axis=0)))
 
 
 def outline(places: Array) -> Array:
-    """Compute the outline of the area that places cover, enlarged by half the distance between neighbours.
+    """Compute the outline of the area that places cover, enlarged by half the distance of neighbouring places.
 
-    The area consists of triangles between places (alpha shape, Edelsbrunner et al., 1983). Only triangles whose
-    circumscribed circle is small enough are used. The limit of the radius is the smallest one for which the triangles
-    contain all places and have a single boundary. Holes are filled.
+    The area consists of triangles whose corners are places (alpha shape, Edelsbrunner et al., 1983). Only triangles
+    with a sufficiently small circumscribed circle are used. The limit of the radius of these circles is the smallest
+    limit with which the triangles contain all places and have a single boundary. Holes are filled.
 
     Args:
         places: Positions (x, y), all different, shape (m, 2), mm.
@@ -195,17 +198,15 @@ def _circumradii(corners: Array) -> Array:
 
 
 def _single_boundary(triangles: Integers, n_place: int) -> list[int] | None:
-    """Return the boundary of an area of triangles.
-
-    The result is None unless the boundary is a single closed line and the area contains all places.
+    """Return the boundary of an area that consists of triangles, if the boundary is a single closed line.
 
     Args:
         triangles: Indices of the places at the corners of each triangle, shape (n, 3).
         n_place: Number of all places.
 
     Returns:
-        Indices of the places on the boundary, in order; None if there are several closed lines, or if a place belongs
-        to no triangle.
+        Indices of the places on the boundary, in order. None if the boundary is not a single closed line, or if a place
+        belongs to no triangle.
     """
     if len(np.unique(triangles)) < n_place:
         return None
@@ -230,13 +231,13 @@ def _single_boundary(triangles: Integers, n_place: int) -> list[int] | None:
 
 
 def _boundary_neighbours(triangles: Integers) -> dict[int, list[int]]:
-    """Return the neighbours along the boundary for each place on the boundary of an area of triangles.
+    """Return the neighbours along the boundary of each place on the boundary of an area that consists of triangles.
 
     Args:
         triangles: Indices of the places at the corners of each triangle, shape (n, 3).
 
     Returns:
-        Indices of the neighbours by the index of the place.
+        Indices of the neighbours of each place on the boundary, by the index of the place.
     """
     # The ends of each edge are sorted, so that equal edges of two triangles are recognised.
     corner_pairs = [[0, 1], [1, 2], [2, 0]]
@@ -252,12 +253,12 @@ def _boundary_neighbours(triangles: Integers) -> dict[int, list[int]]:
 
 
 def _enlarged_polygon(corners: Array, distance: float) -> Array:
-    """Return a polygon whose sides are moved outwards.
+    """Return a polygon whose sides are moved outwards by the same distance.
 
-    Points and directions in the plane are complex numbers x + i y.
+    The function represents points and directions in the plane by complex numbers x + i y.
 
     Args:
-        corners: Corners (x, y) of the polygon in either direction, shape (n, 2), mm.
+        corners: Corners (x, y) of the polygon, clockwise or anticlockwise, shape (n, 2), mm.
         distance: Distance by which each side is moved, mm. The displacement of a sharp corner is limited by
             `LONGEST_MITRE` times this distance.
 
@@ -270,12 +271,13 @@ def _enlarged_polygon(corners: Array, distance: float) -> Array:
     turning_angle = np.angle(all_sides / np.roll(all_sides, 1))
     points = all_points[np.abs(turning_angle) > MIN_TURN_rad]
 
-    # A corner moves along the bisector of the unit normals m and n of both sides. A displacement of the corner by
-    # (m + n) / (1 + m n) moves both sides by 1. The normal of a side points to the right, which is outwards.
+    # Let m and n be the unit normals of both sides of a corner, and m n their scalar product. A displacement of the
+    # corner by (m + n) / (1 + m n) moves both sides by 1. The normal of a side points to the right, which is outwards.
     sides = np.roll(points, -1) - points
     next_normal = -1j * sides / np.abs(sides)
     previous_normal = np.roll(next_normal, 1)
-    cosine = (previous_normal * np.conj(next_normal)).real  # scalar product of both normals
-    mitre = (previous_normal + next_normal) / np.maximum(1.0 + cosine, 1e-9)  # the limit avoids a division by zero
+    scalar_product = (previous_normal * np.conj(next_normal)).real
+    divisor = np.maximum(1.0 + scalar_product, 1e-9)  # not zero
+    mitre = (previous_normal + next_normal) / divisor
     limited_mitre = mitre * np.minimum(1.0, LONGEST_MITRE / np.abs(mitre))
     return to_corners(points + distance * limited_mitre)

@@ -1,7 +1,8 @@
 """Training charges of the misfit network: charges of good presses, charges of faulty presses, and random charges.
 
-The misfit network has to answer any charges, so it is trained on charges of many kinds (`KINDS`) and on presses outside
-the working area. The charges of two simultaneous presses are approximated from the charges of the single presses.
+The misfit network must be accurate for arbitrary charges. It is therefore trained on charges of many kinds (`KINDS`)
+and on charges of presses outside the working area. The charges of two simultaneous presses are approximated from the
+charges of the single presses.
 """
 
 from collections.abc import Callable
@@ -21,25 +22,26 @@ KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0
 """Share of each kind of charges in the training examples, dimensionless.
 
 - "noisy": charges of presses with noise.
-- "moved": charges at various distances from the charges of a press.
-- "gains": charges of electrodes with wrong gains.
-- "dying": charges of presses with one failing electrode.
-- "scaled": charges of forces far outside the range.
+- "moved": charges at various distances from the charges of presses.
+- "gains": charges of presses with wrong gains of some electrodes.
+- "dying": charges of presses in which one electrode loses its charge.
+- "scaled": charges of presses, multiplied by a factor, as for forces far outside the range of forces.
 - "two": charges of two simultaneous presses.
-- "any": charges from a box that contains the charges of all presses.
+- "any": random charges from a box that contains the charges of all presses.
 """
 
 PAIR_EXPONENTS = (1.0, 1.75)
 """Smallest and largest exponent p with which the charges of two presses are combined, (Q1^p + Q2^p)^(1/p).
 
-On a taut film, charges of two presses add up (p = 1). On a slack film the charge grows with the force to the power 2/3,
-and two presses at the same place have p = 3/2. Presses solved with both loads at once lie in between.
+On a taut film, the charges of two presses are added (p = 1). On a slack film, the charge is proportional to the power
+2/3 of the force, so that two presses at the same place are combined with p = 3/2. The charges in a simulation of both
+presses together lie between the results with the two limits of p.
 """
 
 MIN_CHANGE = 1e-4
-"""Change of |residual|^2 below which the search for the nearest contact ends, relative to 1 + |residual|^2.
+"""Change of |residual|^2 below which a search for the nearest contact ends, relative to 1 + |residual|^2.
 
-For 99 % of the examples, the misfit then differs by less than 0.001 from the misfit of a converged search.
+The misfit of nearly all examples then differs negligibly from the misfit of a search that is continued.
 """
 
 MOVED_LOG_STDS = (-3.0, 0.3)
@@ -55,31 +57,35 @@ WRONG_GAIN_STD = 0.15
 """Standard deviation of the logarithm of a wrong gain."""
 
 COMMON_FACTOR_SCATTER = 0.05
-"""Standard deviation of the logarithm of a charge about a factor that is common to all electrodes."""
+"""Standard deviation of the logarithm of an electrode's factor relative to the factor of its press."""
 
 BOX_LOG_LIMIT = 4.0
-"""Decimal logarithm of the largest positive charge of the box, pC, except for `LARGE_BOX_FRACTION` of the presses."""
+"""Decimal logarithm of the largest charge of the box for positive charges in pC, except for large boxes."""
 
 LARGE_BOX_FRACTION = 0.3
-"""Fraction of the presses for which the box reaches up to the largest charge of the network."""
+"""Fraction of the presses with a large box for positive charges, up to the largest charge of the network."""
 
 OUTSIDE_SCATTER = 0.02
-"""Standard deviation of the logarithm of a factor of all charges of a press outside the working area, dimensionless.
+"""Standard deviation of the logarithm of the random factor of a press outside the working area, dimensionless.
 
-The factor fills the gaps between the given presses.
+All charges of the press are multiplied by this factor, which fills the gaps between the given presses.
 """
 
 LARGEST_FACTOR = 2.0
-"""Largest factor by which the charge map is scaled at a press. A quotient of charges near zero is meaningless."""
+"""Largest factor by which the charge map is scaled at a press.
+
+The factor is the quotient of two charges, which is meaningless if the charges are near zero."""
 
 MAX_NEAR_MISFIT = 6.0
-"""Misfit at the contact of a press above which another contact may be nearer, so that a search is made."""
+"""Largest misfit of charges near their press for which the nearest contact is searched for only near this press.
+
+If the misfit is larger, the charges of a distant contact may be nearer."""
 
 
 def misfit_noise(noise: NoiseModel) -> NoiseModel:
-    """Return the noise that is the unit of the misfit.
+    """Return the noise whose standard deviation is the unit of the misfit.
 
-    This unit is the noise of the training, or the noise `reference` if the training has no noise.
+    This noise is the noise of the training, or the noise `reference` if the training has no noise.
     """
     has_noise = noise.white > 0.0
     return noise if has_noise else noise_model("reference")
@@ -87,12 +93,13 @@ def misfit_noise(noise: NoiseModel) -> NoiseModel:
 
 @dataclass(frozen=True)
 class ExampleOptions:
-    """Options for drawing examples.
+    """Options for drawing examples of the misfit network.
 
     Attributes:
-        candidates: Number of contacts among which the starts of a search are chosen.
-        starts: Number of starts of a search.
-        limits: Smallest and largest charge, pC. Charges are clipped to these limits, as in the network.
+        candidates: Number of contacts among which the starts of a search for the nearest contact are chosen.
+        starts: Number of contacts at which a search starts.
+        limits: Smallest and largest charge, pC, for all electrodes or for each electrode. The charges are clipped to
+            these limits, as in the network.
     """
 
     candidates: int = CANDIDATES
@@ -108,13 +115,14 @@ class ExampleOptions:
             sigma: Standard deviations of the charges, shape (n, n_electrode), pC.
 
         Returns:
-            The contacts, shape (n, 3), and the residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
+            The contacts c (x, y, F), shape (n, 3), mm and N, and the residuals (Q - Q(c)) / sigma of the charges Q,
+            shape (n, n_electrode).
         """
         return search(charge_map, charge, sigma, starts=self.starts, candidates=self.candidates, min_change=MIN_CHANGE)
 
 
 DEFAULT_OPTIONS = ExampleOptions()
-"""Options for positive charges and few electrodes."""
+"""Options for positive charges."""
 
 
 def draw_misfit_examples(
@@ -129,23 +137,24 @@ def draw_misfit_examples(
     """Draw charges of every kind, and compute their residuals at the nearest contact.
 
     Args:
-        presses: Presses from whose charges the examples are made.
+        presses: Presses from which the examples are made.
         charge_map: Map from contacts to charges.
-        noise: Noise of good presses, which is also the unit of the distance; a `ChannelNoise` for charges of any sign.
+        noise: Noise of good presses, whose standard deviation is the unit of the residuals; a `ChannelNoise` for
+            charges of any sign.
         count: Number of examples.
         seed: Seed of the random numbers.
         options: Limits of the charges, and settings of the search for the nearest contact.
 
     Returns:
-        The charges Q, pC, and their residuals (Q - Q(c)) / sigma at the nearest contact c, shape (2, count,
-        n_electrode).
+        Array of shape (2, count, n_electrode) with the charges Q, pC, and then their residuals (Q - Q(c)) / sigma at
+        the nearest contact c.
     """
     rng = np.random.default_rng(seed)
     chosen = presses[rng.integers(len(presses), size=count)]
     kinds, drawn_charge = draw_charges(rng, chosen.charge, presses.charge, noise)
     charge = np.clip(drawn_charge, *options.limits)
     is_near = np.isin(kinds, ("noisy", "moved"))  # charges of these kinds are similar to those of their press
-    residual = _residuals(charge_map, charge, noise.sigma(charge), chosen, is_near, options.find_nearest)
+    residual = _compute_residuals(charge_map, charge, noise.sigma(charge), chosen, is_near, options.find_nearest)
     return np.stack([charge, residual])
 
 
@@ -165,13 +174,13 @@ def draw_outside_examples(
     Args:
         outside: Charges of presses outside the working area, shape (m, n_electrode), pC.
         charge_map: Map from contacts of the working area to charges.
-        noise: Noise of good presses, which is also the unit of the distance.
+        noise: Noise of good presses, whose standard deviation is the unit of the residuals.
         count: Number of examples.
         seed: Seed of the random numbers.
         options: Limits of the charges, and settings of the search for the nearest contact.
 
     Returns:
-        Charges and residuals, as `draw_misfit_examples` returns them, shape (2, count, n_electrode).
+        Array of shape (2, count, n_electrode) with charges and residuals, as `draw_misfit_examples` returns them.
     """
     rng = np.random.default_rng(seed)
     chosen_charge = outside[rng.integers(len(outside), size=count)]
@@ -182,7 +191,7 @@ def draw_outside_examples(
     return np.stack([charge, residual])
 
 
-def _residuals(
+def _compute_residuals(
     charge_map: ChargeMap,
     charge: Array,
     sigma: Array,
@@ -192,18 +201,19 @@ def _residuals(
 ) -> Array:
     """Compute the residuals of charges at the nearest contact.
 
-    Some charges are similar to those of the press from which they were made. For these charges, the search begins at
-    this press, with a charge map that is scaled so that it is exact there. For all other charges, the nearest contact
-    is searched for among many candidates.
+    Some charges are similar to the charges of the press from which they were made. For these charges, the search for
+    the nearest contact begins at the contact of this press, with a charge map that is scaled in order to give exactly
+    the charges of the press. For all other charges, and if the residuals of the first search are large, a search begins
+    at several of many candidates.
 
     Args:
         charge_map: Map from contacts to charges.
         charge: Charges, shape (n, n_electrode), pC.
         sigma: Standard deviations of the noise of these charges, same shape, pC.
         chosen: Presses from which the charges were made.
-        is_near: Whether the charges of each row are similar to those of their press, shape (n,).
-        find_nearest: Function from a charge map, charges and their standard deviations to the nearest contacts and the
-            residuals; see `search`.
+        is_near: Whether the charges of each row are similar to the charges of their press, shape (n,).
+        find_nearest: Function that searches for the nearest contacts among many candidates; see
+            `ExampleOptions.find_nearest`.
 
     Returns:
         Residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
@@ -213,20 +223,21 @@ def _residuals(
     start = chosen.contact[near_rows]
     exact_factor = chosen.charge[near_rows] / charge_map.charges(start)
     map_factor = np.clip(exact_factor, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
-    # The residual (Q - f Q(c)) / sigma of the scaled map is equal to (Q / f - Q(c)) / (sigma / f).
+    # With the factor f of the map, the residual (Q - f Q(c)) / sigma is equal to (Q / f - Q(c)) / (sigma / f). The
+    # charges and their standard deviations are therefore divided by f instead of scaling the map.
     _, residual[near_rows] = explain(
         charge_map, charge[near_rows] / map_factor, sigma[near_rows] / map_factor, start, min_change=MIN_CHANGE
     )
 
-    # A large residual near the press may be a local minimum, so a search is made for these charges, too.
+    # A large residual near the press may be a local minimum. Such charges are therefore also searched for elsewhere.
     has_large_residual = np.linalg.norm(residual, axis=1) > MAX_NEAR_MISFIT
     searched_rows = np.flatnonzero(~is_near | has_large_residual)
     _, searched_residual = find_nearest(charge_map, charge[searched_rows], sigma[searched_rows])
 
-    # Keep the smaller one of both residuals. Rows that are not near a press have only the residual of the search.
+    # Keep the smaller of both residuals. Rows with charges that are not near their press only have the second residual.
     near_residual = residual[searched_rows]
-    is_near_smaller = (near_residual**2).sum(axis=1) < (searched_residual**2).sum(axis=1)
-    keeps_near_residual = is_near[searched_rows] & is_near_smaller
+    near_is_smaller = (near_residual**2).sum(axis=1) < (searched_residual**2).sum(axis=1)
+    keeps_near_residual = is_near[searched_rows] & near_is_smaller
     residual[searched_rows] = np.where(keeps_near_residual[:, None], near_residual, searched_residual)
     return residual
 
@@ -234,7 +245,7 @@ def _residuals(
 def draw_charges(
     rng: np.random.Generator, charge: Array, other_charge: Array, noise: Noise
 ) -> tuple[NDArray[Any], Array]:
-    """Draw a kind for each press, and change the charges of the press in the way of this kind.
+    """Draw a kind of charges at random for each press, and make charges of this kind from the charges of the press.
 
     `KINDS` contains the probability of each kind.
 
@@ -254,12 +265,14 @@ def draw_charges(
     drawn = np.empty_like(charge)
     for kind in KINDS:
         rows = kinds == kind
-        drawn[rows] = _draw_kind(kind, rng, charge[rows], other_charge, noise)
+        drawn[rows] = _draw_charges_of_kind(kind, rng, charge[rows], other_charge, noise)
     return kinds, drawn
 
 
-def _draw_kind(kind: str, rng: np.random.Generator, charge: Array, other_charge: Array, noise: Noise) -> Array:
-    """Return the charges of presses, changed in the way of one kind.
+def _draw_charges_of_kind(
+    kind: str, rng: np.random.Generator, charge: Array, other_charge: Array, noise: Noise
+) -> Array:
+    """Draw charges of one kind, one set from the charges of each press.
 
     Args:
         kind: Name of the kind; see `KINDS`.
@@ -269,33 +282,33 @@ def _draw_kind(kind: str, rng: np.random.Generator, charge: Array, other_charge:
         noise: Noise of good presses.
 
     Returns:
-        Charges of the kind, shape (n, n_electrode), pC.
+        Charges of this kind, shape (n, n_electrode), pC.
     """
     match kind:
         case "noisy":
             return noise.add(charge, rng)
         case "moved":
-            return _moved_charges(rng, charge, noise)
+            return _move_charges(rng, charge, noise)
         case "gains":
-            return charge * _wrong_gains(rng, charge.shape)
+            return charge * _draw_wrong_gains(rng, charge.shape)
         case "dying":
-            return charge * _failing_gains(rng, charge.shape)
+            return charge * _draw_failing_gains(rng, charge.shape)
         case "scaled":
-            return charge * _common_factors(rng, charge.shape)
+            return charge * _draw_common_factors(rng, charge.shape)
         case "two":
             second_charge = other_charge[rng.integers(len(other_charge), size=len(charge))]
             exponent = rng.uniform(*PAIR_EXPONENTS, (len(charge), 1))
             return combined_charge(charge, second_charge, exponent)
         case _:  # the kind "any"
-            return _any_charges(rng, charge.shape, other_charge, noise)
+            return _draw_any_charges(rng, charge.shape, other_charge, noise)
 
 
-def _moved_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Array:
+def _move_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Array:
     """Move charges in random directions by random distances.
 
-    Charges of any sign are moved by a multiple of the standard deviation of their noise; see `MOVED_LOG_DISTANCES`.
-    Positive charges are multiplied by factors whose logarithms are normally distributed. The standard deviation of the
-    logarithms is between 0.001 and 2.
+    Charges of any sign are moved by random multiples of the standard deviation of their noise; see
+    `MOVED_LOG_DISTANCES`. Positive charges are multiplied by factors whose logarithms are normally distributed;
+    `MOVED_LOG_STDS` states the range of the standard deviations.
 
     Args:
         rng: Random number generator.
@@ -315,17 +328,21 @@ def _moved_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Arr
     return np.asarray(charge * np.exp(log_std * rng.standard_normal(charge.shape)))
 
 
-def _wrong_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Draw gains, shape (n, n_electrode). About half of them are wrong, with a standard deviation of 15 %."""
+def _draw_wrong_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Draw relative gains of electrodes, shape (n, n_electrode): about half of them wrong, and the others 1."""
     is_wrong = rng.random(shape) < 0.5
     log_gain = np.where(is_wrong, WRONG_GAIN_STD * rng.standard_normal(shape), 0.0)
     return np.exp(log_gain)
 
 
-def _failing_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Draw gains, shape (n, n_electrode).
+def _draw_failing_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Draw relative gains of the electrodes for each press, shape (n, n_electrode).
 
-    One electrode has a gain between 0.001 and 1, and all others have the gain 1.
+    One random electrode of each press has a gain between 0.001 and 1, and all other electrodes have the gain 1.
+
+    Args:
+        rng: Random number generator.
+        shape: Shape of the result, (n, n_electrode).
     """
     n_press, n_electrode = shape
     failing_electrode = rng.integers(n_electrode, size=(n_press, 1))
@@ -334,18 +351,19 @@ def _failing_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
     return np.where(is_failing, failing_gain, 1.0)
 
 
-def _common_factors(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Draw factors from 0.01 to 100, shape (n, n_electrode), which are nearly equal for all electrodes of a press."""
+def _draw_common_factors(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Draw factors from about 0.01 to 100 for each press, shape (n, n_electrode), nearly equal for all electrodes."""
     n_press, _ = shape
     common_factor = 10.0 ** rng.uniform(-2.0, 2.0, (n_press, 1))
     return np.asarray(common_factor * np.exp(COMMON_FACTOR_SCATTER * rng.standard_normal(shape)))
 
 
-def _any_charges(rng: np.random.Generator, shape: tuple[int, ...], other_charge: Array, noise: Noise) -> Array:
-    """Draw charges from a box that contains the charges of all presses.
+def _draw_any_charges(rng: np.random.Generator, shape: tuple[int, ...], other_charge: Array, noise: Noise) -> Array:
+    """Draw random charges from a box that contains the charges of all presses.
 
-    Charges of any sign are uniformly distributed in units of their noise. The logarithms of positive charges are
-    uniformly distributed, from 1 pC to 10 nC or, for some presses, to the largest charge of the network.
+    For charges of any sign, the levels (`ChannelNoise.level`) are uniformly distributed. For positive charges, the
+    logarithms are uniformly distributed, from 1 pC to the upper limit of a small box or, for some presses, of a large
+    box.
 
     Args:
         rng: Random number generator.
@@ -373,13 +391,13 @@ def _any_charges(rng: np.random.Generator, shape: tuple[int, ...], other_charge:
 def combined_charge(first: Array, second: Array, exponent: Array | float) -> Array:
     """Approximate the charges of two simultaneous presses by (Q1^p + Q2^p)^(1/p).
 
-    Q1 and Q2 are the charges that each press alone would cause. A power of a negative charge keeps the sign of the
-    charge: it is sign(Q) |Q|^p.
+    Q1 and Q2 are the charges that each press alone would cause. The power of a charge Q keeps the sign of the charge,
+    that is, it is defined as sign(Q) |Q|^p.
 
     Args:
         first: Charges of the first press alone, shape (n, n_electrode), pC.
         second: Charges of the second press alone, same shape.
-        exponent: The exponent p, a number or shape (n, 1).
+        exponent: The exponent p, as one number or for each row, shape (n, 1).
 
     Returns:
         Charges of both presses, shape (n, n_electrode), pC.

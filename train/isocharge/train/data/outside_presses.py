@@ -1,8 +1,8 @@
 """Presses outside the working area, for training the misfit network and for measuring its detection rate.
 
-The charges come from the coarse map of the whole film. The error of this map is a few percent near the clamp and does
-not matter. The misfit network is trained with the exact misfit of these charges. The error hardly changes the measured
-fractions of presses without a flag.
+The charges are computed with a coarse map of the whole film, whose error is a few percent near the clamp. The error
+does not affect the training, because the misfit network is trained on the exact misfits of the computed charges. The
+error hardly changes the measured share of wrong answers without a flag.
 """
 
 import logging
@@ -21,27 +21,27 @@ from isocharge.train.data.presses import LabelledPresses
 _log = logging.getLogger(__name__)
 
 MIN_WIDTH = 1.0
-"""Smallest width of the ring between the working area and the clamp in which presses are drawn, mm."""
+"""Smallest width of the ring between the working area and the clamp, mm. In a narrower ring, no presses are drawn."""
 
 FORCE_RATIO = 10.0
-"""Ratio of the largest to the smallest force of the presses whose answers are measured, dimensionless."""
+"""Largest ratio of the largest to the smallest force of the presses of `OutsidePresses.grid`, dimensionless."""
 
 N_FORCES = 5
-"""Number of forces of the presses at each place where answers are measured."""
+"""Number of forces of the presses at each place of `OutsidePresses.grid`."""
 
 N_RINGS = 24
-"""Number of rings into which the area outside the working area is divided."""
+"""Number of rings into which `OutsidePresses.grid` divides the area outside the working area."""
 
 N_SECTORS = 36
-"""Number of sectors into which each ring is divided."""
+"""Number of sectors into which `OutsidePresses.grid` divides each ring."""
 
 SHARE_DECIMALS = 2
-"""Decimals of the measured shares."""
+"""Number of decimals to which the measured shares of presses are rounded."""
 
 
 @dataclass(frozen=True)
 class OutsidePresses:
-    """The part of a film between the working area and the clamp.
+    """Presses on the part of a film between the working area and the clamp.
 
     Attributes:
         charge_map: Map of the whole film from contacts to charges.
@@ -53,17 +53,19 @@ class OutsidePresses:
 
     @classmethod
     def of(cls, sensor: Sensor, probes: tuple[str, ...], force_range: tuple[float, float]) -> "OutsidePresses | None":
-        """Solve a coarse forward map of the whole film for the largest probe.
+        """Simulate a coarse forward map of the whole film for the probe with the largest reach.
 
         The reach of a probe is the distance of the farthest point of its footprint from the centroid.
 
         Args:
             sensor: The sensor.
-            probes: Notations of the probes. The probe with the largest reach is replaced by a disk with the same reach.
+            probes: Notations of the probes. In the simulation, the probe with the largest reach is replaced by a disk
+                with the same reach.
             force_range: Smallest and largest force of the model, N.
 
         Returns:
-            Presses on the whole film, to be restricted by `beyond`; None if the film cannot be solved.
+            Presses on the whole film, which `beyond` restricts to the part outside the working area. None if the film
+            cannot be simulated.
         """
         reach = max(parse_probe(notation).reach for notation in probes)
         probe = Circle(reach)
@@ -74,10 +76,12 @@ class OutsidePresses:
         except (SceneError, SolveError) as error:
             _log.warning("presses outside the working area are not simulated: %s", error)
             return None
-        return cls(charge_map, inner=0.0)  # the working area is not known yet
+        return cls(charge_map, inner=0.0)  # `beyond` replaces the radius, because the working area is not known yet
 
     def beyond(self, radius: float) -> "OutsidePresses | None":
-        """Return the presses outside a working area; None if the working area nearly reaches the clamp.
+        """Restrict the presses to the ring outside a working area.
+
+        The result is None if the working area nearly reaches the clamp.
 
         Args:
             radius: Radius of the working area, mm.
@@ -92,7 +96,7 @@ class OutsidePresses:
         return self.charge_map.domain.radius
 
     def draw(self, count: int, seed: int) -> LabelledPresses:
-        """Draw presses whose positions are uniformly distributed over the ring, with log-uniform forces.
+        """Draw presses with positions that are uniformly distributed over the ring, and with log-uniform forces.
 
         The squared distances from the centre are uniformly distributed, because the area grows with the square.
 
@@ -108,16 +112,19 @@ class OutsidePresses:
         return self._simulate(distance, angle, force)
 
     def grid(self) -> LabelledPresses:
-        """Return presses at the middle of each sector of each ring, with `N_FORCES` forces at each place."""
-        edges = np.linspace(self.inner, self.outer, N_RINGS + 1)
-        distance = 0.5 * (edges[1:] + edges[:-1])
+        """Return presses at the middle of each sector of each ring, with `N_FORCES` forces at each place.
+
+        The area outside the working area is divided into `N_RINGS` rings, and each ring into `N_SECTORS` sectors.
+        """
+        ring_edges = np.linspace(self.inner, self.outer, N_RINGS + 1)
+        distance = 0.5 * (ring_edges[1:] + ring_edges[:-1])
         angle = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
         # All combinations of distance, angle and force
         distances, angles, forces = np.meshgrid(distance, angle, self._measured_forces(), indexing="ij")
         return self._simulate(distances.ravel(), angles.ravel(), forces.ravel())
 
     def unnoticed(self, is_unnoticed: Booleans) -> UnnoticedPresses:
-        """Compute the share of unnoticed presses in each ring and sector of `grid`.
+        """Compute the share of presses that are answered wrongly without a flag, in each ring and sector of `grid`.
 
         Args:
             is_unnoticed: Whether each press of `grid` is answered wrongly without a flag, shape (n,).
@@ -140,7 +147,7 @@ class OutsidePresses:
         return np.geomspace(smallest_measured, max_force, N_FORCES)
 
     def _simulate(self, distance: Array, angle: Array, force: Array) -> LabelledPresses:
-        """Return presses with their charges.
+        """Return presses at the given places with the given forces, and compute their charges.
 
         Args:
             distance: Distances of the presses from the centre, shape (n,), mm.

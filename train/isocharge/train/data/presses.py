@@ -1,8 +1,8 @@
 """Presses for training and presses for measuring errors, split by position.
 
-All presses at one position belong to the same part. Otherwise, the test would contain positions of the training, and
-the measured errors would be too small. Measured presses are always split in the same way: the coordinates determine
-which fifth of the positions is held out. Every command therefore measures errors on the same presses of a file.
+All presses at one position belong to the same part. If a test contained positions of the training, the measured errors
+would be too small. Measured presses are always split in the same way, because their coordinates determine which fifth
+of them is held out. Every command therefore measures errors on the same presses of a file.
 """
 
 from collections.abc import Sequence
@@ -18,10 +18,10 @@ from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
 from isocharge.train.data.channel_noise import Noise
 
 LOWEST_CHARGE = 1.0
-"""Smallest positive charge, pC. Smaller charges are set to this value before the logarithm, which is then finite."""
+"""Lower limit of a charge whose logarithm is computed, pC. Smaller charges are set to this value."""
 
 HIGHEST_CHARGE = 1e6
-"""Largest positive charge, pC. Larger charges are set to this value before the logarithm."""
+"""Upper limit of a charge whose logarithm is computed, pC. Larger charges are set to this value."""
 
 SOLVER = "solver"
 """Name of a manifest entry. Every simulated dataset has this entry, and no measured dataset has it."""
@@ -30,7 +30,7 @@ FEWEST = 500
 """Smallest number of presses for a fit."""
 
 ROUNDING = 1.0 + 1e-9
-"""Ratio by which a sample may exceed the ranges of its manifest because of rounding."""
+"""Largest ratio by which a sample may exceed the ranges of its manifest because of rounding."""
 
 FEWEST_POSITIONS = 50
 """Smallest number of positions for a fit."""
@@ -38,12 +38,12 @@ FEWEST_POSITIONS = 50
 
 @dataclass(frozen=True)
 class LabelledPresses:
-    """Contacts and their charges.
+    """Contacts and the charges that were measured or simulated for them.
 
     Attributes:
-        contact: (x, y, F), shape (n, 3), mm and N.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
         charge: Charges, shape (n, n_electrode), pC.
-        measured: Whether the charges were measured, so that they have noise of their own.
+        measured: Whether the charges were measured. Measured charges already contain noise.
     """
 
     contact: Array
@@ -52,7 +52,7 @@ class LabelledPresses:
 
     @classmethod
     def of(cls, dataset: Dataset) -> "LabelledPresses":
-        """Return all presses of a dataset without checks."""
+        """Return all presses of a dataset without checking them."""
         samples = dataset.samples
         contact = np.stack([samples.x_mm, samples.y_mm, samples.force_N], axis=1)
         return cls(contact, samples.charge_pC, is_measured(dataset))
@@ -74,16 +74,16 @@ class LabelledPresses:
         return self[np.hypot(self.contact[:, 0], self.contact[:, 1]) <= radius]
 
     def repeated(self, min_count: int) -> "LabelledPresses":
-        """Return the presses in their order, repeated from the first one until there are enough.
+        """Return the presses in their order, and repeat them from the first press until there are enough.
 
         Args:
-            min_count: Number of presses to return. If there are more presses, each of them is returned once.
+            min_count: Smallest number of presses to return. If there are more presses, each press is returned once.
         """
         count = max(min_count, len(self))
         return self[np.arange(count) % len(self)]
 
     def noisy(self, noise: Noise, seed: int) -> Array:
-        """Return the charges with added noise, shape (n, n_electrode), pC."""
+        """Return the charges with added noise, shape (n, n_electrode), pC, for one seed of the noise."""
         return noise.add(self.charge, np.random.default_rng(seed))
 
 
@@ -107,21 +107,21 @@ def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array
     """
     radius = domain.radius * np.sqrt(rng.random(count))
     angle = 2.0 * np.pi * rng.random(count)
-    min_log, max_log = np.log(domain.force_range)
-    force = np.exp(rng.uniform(min_log, max_log, count))
+    min_log_force, max_log_force = np.log(domain.force_range)
+    force = np.exp(rng.uniform(min_log_force, max_log_force, count))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), force], axis=1)
 
 
 def domain_of(dataset: Dataset) -> Domain:
     """Return the working area and the range of forces of a dataset.
 
-    The manifest states them. If the manifest does not state them, they are computed from the samples.
+    Both ranges are read from the manifest. A range that the manifest does not state is computed from the samples.
 
     Args:
         dataset: The dataset.
 
     Raises:
-        DatasetError: If the ranges of the manifest are not numbers or do not contain the samples.
+        DatasetError: If the ranges in the manifest are not numbers or do not contain the samples.
     """
     samples = dataset.samples
     ranges = dataset.manifest.get("ranges", {})
@@ -219,7 +219,7 @@ def _check_finite(presses: LabelledPresses) -> None:
 
 
 HELD_SHARE = 0.2
-"""Share of measured presses that is held out, dimensionless."""
+"""Share of the measured presses that are held out for the measurement of errors, dimensionless."""
 
 FEWEST_HELD = 10
 """Smallest number of presses that are held out, because the errors of fewer presses are too uncertain."""
@@ -229,10 +229,10 @@ FEWEST_MEASURED = 50
 
 
 def held_out(contact: Array) -> Booleans:
-    """Choose the measured presses that are held out.
+    """Determine which measured presses are held out for the measurement of errors.
 
-    Presses at one position are held out together. The order in which positions are chosen depends only on their
-    coordinates. The order is therefore the same in every subset of the presses.
+    Presses at one position are held out together. The positions are chosen in an order that depends only on their
+    coordinates, and that is therefore the same in every subset of the presses.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -242,11 +242,11 @@ def held_out(contact: Array) -> Booleans:
     """
     count = len(contact)
     held_count = max(HELD_SHARE * count, min(FEWEST_HELD, 0.5 * count))
-    return _count_before(contact) < held_count
+    return _count_presses_before(contact) < held_count
 
 
 def folds_by_place(contact: Array, count: int) -> Integers:
-    """Return the fold of each measured press, from 0 to `count` - 1, shape (n,).
+    """Return the number of the fold of each measured press, from 0 to `count` - 1, shape (n,).
 
     Presses at one place are in the same fold. Places are assigned to the folds in the order in which `held_out` chooses
     them.
@@ -255,19 +255,20 @@ def folds_by_place(contact: Array, count: int) -> Integers:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         count: Number of folds.
     """
-    return np.asarray(_count_before(contact) * count // len(contact), dtype=np.intp)
+    return np.asarray(_count_presses_before(contact) * count // len(contact), dtype=np.intp)
 
 
-def _count_before(contact: Array) -> Integers:
+def _count_presses_before(contact: Array) -> Integers:
     """Return, for each press, the number of presses at positions that are chosen before its own position.
 
-    Positions are chosen in the order of their checksums. This order is random but the same in every run.
+    Positions are chosen in the order of the checksums of their coordinates. This order is random but the same in every
+    run.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
     Returns:
-        Numbers of presses, shape (n,).
+        Number of earlier presses for each press, shape (n,).
     """
     rounded_position = np.round(contact[:, :2], 3) + 0.0  # the addition converts -0.0 into 0.0
     positions, position_of_press, presses_at_position = np.unique(
@@ -281,7 +282,7 @@ def _count_before(contact: Array) -> Integers:
 
 
 def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Dataset:
-    """Return measured presses as a dataset, without presses whose place, force or charges are unknown.
+    """Return measured presses as a dataset, without the presses whose place, force or charges are unknown.
 
     Args:
         presses: The measured presses.
@@ -303,17 +304,20 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
 
 
 def complete(presses: MeasuredPresses) -> Booleans:
-    """Return which presses have a known place, force and charge of every electrode, shape (n,)."""
+    """Return which presses have a known place, a known force and a known charge of every electrode, shape (n,)."""
     return presses.placed & np.isfinite(presses.charge_pC).all(axis=1)
 
 
 def check_enough(count: int, total_count: int, sensor: str) -> None:
-    """Raise PressError if there are too few measured presses for training and for measuring errors.
+    """Raise an error if there are too few measured presses for training and for measuring errors.
 
     Args:
         count: Number of presses that can be used.
         total_count: Number of all presses.
         sensor: Name of the sensor, for the message.
+
+    Raises:
+        PressError: If there are fewer than `FEWEST_MEASURED` presses that can be used.
     """
     if count < FEWEST_MEASURED:
         raise PressError(
@@ -324,6 +328,6 @@ def check_enough(count: int, total_count: int, sensor: str) -> None:
 
 
 def presses_sha256(presses: MeasuredPresses) -> str:
-    """Return the checksum of all numbers of the presses."""
+    """Return the checksum of the contacts, the charges and the standard deviations of measured presses."""
     columns: Sequence[Array] = (presses.contact, presses.charge_pC, presses.position_std_mm, presses.force_std)
     return sha256_of(np.column_stack(columns).tobytes())

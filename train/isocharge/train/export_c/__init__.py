@@ -7,6 +7,6 @@
     host_example.c           a serial port in, contacts out
     arduino/                 a sketch with copies of what it needs
 
-The folder `sources/` contains templates of these files. The `$names` in a template are replaced by the values of a
-model or a board. The source of the layers of a network is generated without a template.
+The folder `sources/` contains templates of the files above. Each `$name` in a template is replaced by a value of a
+model or of a board. The C source of the layers of a network is generated without a template.
 """

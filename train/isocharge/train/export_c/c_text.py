@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LINE_WIDTH = 109
-"""Largest number of characters of a line of numbers."""
+"""Largest number of characters in a line of numbers, without the indentation."""
 
 
 def source_text(name: str, **values: object) -> str:
@@ -26,7 +26,7 @@ def c_float(value: float) -> str:
 
 
 def c_double(value: float) -> str:
-    """Return the C literal of a finite double."""
+    """Return the shortest C literal that gives exactly this finite double."""
     return _with_point(repr(float(value)))
 
 
@@ -52,22 +52,22 @@ def c_array(name: str, values: NDArray[Any]) -> str:
     number_type = "signed char" if is_int8 else "float"
     as_text = str if is_int8 else c_float
     literals = ", ".join(as_text(value) for value in values.ravel())
-    # With a comma after it, the last number is as long as the others when the lines are broken. The comma is then
-    # removed.
+    # While the lines are broken, a comma follows the last number, too. The last number then counts with the same length
+    # as the other numbers. The last comma is removed afterwards.
     lines = wrap(f"{literals},", LINE_WIDTH, break_on_hyphens=False)
     numbers = "\n    ".join(lines).rstrip(",")
     return f"static const {number_type} {name}[{values.size}] = {{\n    {numbers}\n}};\n"
 
 
 def c_string(text: str) -> str:
-    """Return a C string literal. All characters except ASCII letters, digits and blanks are written as octal codes.
+    """Return a C string literal in which all characters except ASCII letters, digits and blanks are octal codes.
 
     Args:
-        text: The text.
+        text: Text of the literal.
     """
 
     def escape(byte: int) -> str:
-        """Return one byte of the text as a character or as an octal code."""
+        """Return one byte of the encoded text as a character or as an octal code."""
         character = chr(byte)
         is_plain = character == " " or (character.isascii() and character.isalnum())
         return character if is_plain else f"\\{byte:03o}"
@@ -77,9 +77,9 @@ def c_string(text: str) -> str:
 
 
 def c_comment(text: str) -> str:
-    """Return a text for a C comment.
+    """Return a text that can be inserted into a C comment.
 
-    Characters that could end the comment, or begin another comment, are replaced by `_`.
+    Characters that could end the comment or begin another comment are replaced by `_`.
     """
 
     def is_allowed(character: str) -> bool:

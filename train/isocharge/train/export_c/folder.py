@@ -22,13 +22,13 @@ from isocharge.train.export_c.model_source import model_header, model_source, se
 from isocharge.train.model_release.onnx_graph import read_graph
 
 MAX_TARE_FRAMES = 10_000
-"""Largest number of frames of a tare in C. The frames take 320 kB with four electrodes."""
+"""Largest number of frames of a tare in C, which limits the memory that the C program needs."""
 
 SWITCHES = {"HUM": "HUM", "TARE": "TARE_ON", "LEAK": "LEAK", "TOUCH": "TOUCH", "THERMAL": "THERMAL_ON"}
 """Name of the C constant that switches a stage on, by the prefix of the stage's other constants."""
 
 C_NAMES = {"frequency_Hz": "HZ"}
-"""C names of settings whose name in C is not their name in capital letters."""
+"""Names in C of the settings whose name in C is not simply their name in capital letters."""
 
 
 def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
@@ -39,7 +39,7 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
         electrodes: Names of the electrodes in the order of the model.
 
     Raises:
-        DeviceError: If the device file is for other electrodes, has a tare that is too long for C, or uses a stage
+        DeviceError: If the device file is for other electrodes, if its tare is too long for C, or if it uses a stage
             that does not exist in C.
     """
     chain = device.chain(electrodes)
@@ -63,16 +63,16 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
 
 
 def settings_origin(device: Device) -> str:
-    """Return the words that state where the settings of the signal chain come from, for comments and the README."""
+    """Return words for comments and the README that state where the settings of the signal chain come from."""
     if device is ANY_BOARD:
         return "the defaults, because no device file was given"
     return f'from the device file "{c_comment(device.name)}"'
 
 
 def _stage_numbers(prefix: str, settings: Mapping[str, Any]) -> dict[str, str]:
-    """Return the C literals of a stage by the names of their macros, without the common prefix of all macros.
+    """Return the C literals of the settings of a stage, by the names of their macros without `ISOCHARGE_`.
 
-    The first macro is 1 if the stage is on, and 0 otherwise.
+    The first macro switches the stage on: its literal is 1 if the stage is on, and 0 otherwise.
 
     Args:
         prefix: Prefix of the macros of the stage, for example "TARE".
@@ -91,12 +91,12 @@ def _stage_numbers(prefix: str, settings: Mapping[str, Any]) -> dict[str, str]:
 def _stage_settings(chain: Chain) -> dict[str, dict[str, Any]]:
     """Return the settings of each stage of a signal chain, by the prefix of its macros in C.
 
-    A stage that is missing in the chain has no settings. The switch `on` of a stage is one of its settings.
+    The settings of a stage that is missing in the chain are empty. The switch `on` of a stage is one of its settings.
 
     Args:
         chain: The signal chain.
     """
-    # A chain always has settings of the leak. Without a time constant, its charges do not leak.
+    # A chain has settings of the leak in any case. Without a time constant, the charges do not leak.
     leak = None if chain.tau_s is None else chain.leak
     stages = {"HUM": chain.hum, "TARE": chain.tare, "LEAK": leak, "TOUCH": chain.touch, "THERMAL": chain.thermal}
     settings_by_prefix: dict[str, dict[str, Any]] = {}
@@ -129,7 +129,7 @@ def _check_exists_in_c(where: str, chain: Chain) -> None:
             f"{where}: tare.frames: expected a whole number from 1 to {MAX_TARE_FRAMES} for a signal chain in C, which "
             f"stores all frames of the tare, got {chain.tare.frames}"
         )
-    has_pyroelectric_charges = isinstance(chain.pyro, np.ndarray)
+    has_pyroelectric_charges = isinstance(chain.warming_ratios, np.ndarray)
     if chain.memory is not None or has_pyroelectric_charges:
         key = "common_mode.pC_per_K" if has_pyroelectric_charges else "memory"
         raise DeviceError(
@@ -155,7 +155,7 @@ SKETCH = "isocharge_sketch"
 """Name of the Arduino sketch, of its folder and of the file in the folder."""
 
 BOARD_SOURCES = ("isocharge_chain.h", "isocharge_chain.c", "isocharge_frames.h", "isocharge_frames.c")
-"""Files that are the same for every model; the sketch gets copies of them."""
+"""Files that are the same for every model. The sketch contains copies of these files."""
 
 SINGLE_PRECISION = "/* This board computes the chain in single precision. */\n#define ISOCHARGE_CHAIN_FLOAT\n\n"
 """Text that switches the signal chain of the sketch to single precision."""
@@ -178,7 +178,7 @@ def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: 
         DeviceError: If the device file is for other electrodes.
         ChargeError: If the device file has no channel for an electrode.
         OutputExists: If the folder exists.
-        OutputError: If the file system refuses to write. No files remain then.
+        OutputError: If the file system refuses to write. In this case, no files remain.
     """
     refuse_existing(output)
     files = c_files(model, device, command)

@@ -1,10 +1,11 @@
-"""C source of a layer of a network: a function with constant arrays.
+"""Generator of the C source of a layer of a network, which is a function with constant arrays.
 
-A layer computes y = f(x W + c). The weights W have the shape (inputs, outputs). The products with a few rows of W are
-added to all outputs at a time. The inner loop runs over neighbouring outputs, and its number of iterations is constant.
-With -O2 or a higher level of optimisation, compilers therefore vectorise the loop without changing the order of any
-sum. If two perceptrons run side by side, the weights are two blocks, and the zeros beside the blocks are left out.
-Weights that training rounded to 8 bits take one byte each.
+A layer computes the outputs y = f(x W + c) of the inputs x, with the weights W, shape (inputs, outputs), the bias c and
+the activation f. The C function adds the products of a few inputs with their rows of W to all outputs at a time. The
+inner loop of the C function runs over neighbouring outputs, and its number of iterations is constant. With -O2 or a
+higher level of optimisation, compilers therefore vectorise the loop without changing the order of any sum. If two
+perceptrons run side by side, the weight matrix consists of two blocks, and the zeros outside the blocks are left out.
+Each weight that the training rounded to 8 bits is stored in one byte.
 """
 
 from collections.abc import Sequence
@@ -20,15 +21,15 @@ from isocharge.common.arrays import Singles
 from isocharge.train.export_c.c_text import c_array
 
 N_ROWS = 4
-"""Number of rows of the weights whose products are added at a time.
+"""Number of rows of the weights whose products are added to the outputs at a time.
 
-Each output is then loaded and stored only once for these rows."""
+The program then reads and writes each output only once for all of these rows."""
 
 LARGEST_INT8 = 127
 """Largest absolute value of a weight that is rounded to 8 bits, in units of the scale of its column."""
 
 INT8_TOLERANCE = 2.0**-21
-"""Relative difference from a multiple of the scale that float32 arithmetic can cause."""
+"""Largest relative difference between a weight and a multiple of the scale that rounding in float32 can cause."""
 
 Block = tuple[slice, slice]
 """Rows and columns of a part of a matrix."""
@@ -39,13 +40,13 @@ WHOLE_MATRIX: Block = (slice(0, None), slice(0, None))
 
 @dataclass(frozen=True)
 class LayerSource:
-    """The C function `void name(x, c, y)`, which computes y = f(x W + c).
+    """Generator of the C function `void name(x, c, y)`, which computes y = f(x W + c).
 
     Attributes:
         name: Name of the function.
-        weight: W, shape (inputs, outputs), float32.
-        bias: c if it is constant, shape (outputs,), written as the array `name_bias`; otherwise None.
-        blocks: Blocks outside which W is zero.
+        weight: Weights W, shape (inputs, outputs), float32.
+        bias: Bias c, shape (outputs,), which is written as the array `name_bias`. None if c is not constant.
+        blocks: Blocks of W. All weights outside the blocks are zero.
         activation: The function f; None for the identity.
     """
 
@@ -58,7 +59,7 @@ class LayerSource:
     def text(self) -> str:
         """Return the C text of the constant arrays, and of the function that computes y = activation(x @ weight + c).
 
-        The function adds c last, because intermediate sums would otherwise be rounded to the digits of a large c.
+        The function adds c last. If a large c were added first, the intermediate sums would lose accuracy.
         """
         n_input, n_output = self.weight.shape
         values, scale = round_to_int8(self.weight)
@@ -70,11 +71,11 @@ class LayerSource:
         if self.bias is not None:
             arrays.append(c_array(f"{self.name}_bias", self.bias))
 
-        # The sums over integer weights are multiplied by the scale of their column.
+        # If the weights are integers, each sum is multiplied by the scale of its column.
         result = "y[j] + c[j]" if scale is None else f"y[j] * {self.name}_scale[j] + c[j]"
         if self.activation is not None:
             result = f"{self.activation.c_function}({result})"
-        products = [_add_product(name, block, values[block]) for name, block in named_blocks]
+        products = [_product_lines(name, block, values[block]) for name, block in named_blocks]
         lines = [
             f"/* {n_input} numbers x to {n_output} numbers y */",
             f"static void {self.name}(const float *restrict x, const float *restrict c, float *restrict y)",
@@ -91,19 +92,20 @@ class LayerSource:
 
 
 def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Block, ...]]:
-    """Find the blocks of consecutive layers: two where two perceptrons run side by side, otherwise one.
+    """Find the blocks of the weights of consecutive layers.
 
-    Where two perceptrons run side by side, a weight matrix is block diagonal: the inputs and outputs of the first
-    perceptron come first, and no weight connects both perceptrons. The layers are examined from the last to the first
-    one. For the last layer, it is known which outputs belong to which perceptron. The rows of a layer then show which
-    of its inputs belong to which perceptron.
+    A layer has two blocks if two perceptrons run side by side in it, and otherwise one block. With two perceptrons, the
+    weight matrix is block diagonal: the inputs and outputs of the first perceptron come first, and no weight connects
+    both perceptrons. The layers are examined in reverse order. For the last layer, the caller states which outputs
+    belong to the first perceptron. The rows of a weight matrix then show which inputs belong to the first perceptron,
+    and these inputs are the outputs of the layer before it.
 
     Args:
-        weights: Weights of each layer except the first one, whose inputs both perceptrons share.
+        weights: Weights of each layer except the first layer, whose inputs both perceptrons share.
         first_width: Number of outputs of the last layer that belong to the first perceptron.
 
     Returns:
-        Blocks of each layer, as slices of the rows (inputs) and the columns (outputs) of its weights.
+        Blocks of each layer, as slices of the rows (inputs) and of the columns (outputs) of its weights.
     """
     blocks: list[tuple[Block, ...]] = []
     n_first_output = first_width  # number of outputs of the examined layer that belong to the first perceptron
@@ -127,13 +129,15 @@ def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Bloc
 
 
 def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
-    """Convert weights to 8-bit integers with a scale for each column, if all weights are multiples of the scale.
+    """Convert weights to 8-bit integers if all weights of each column are multiples of a scale.
+
+    The scale of a column is its largest absolute weight divided by `LARGEST_INT8`.
 
     Args:
         values: Weights, shape (inputs, outputs).
 
     Returns:
-        Integers and the scale, shape (outputs,); or the unchanged weights and None, if some weights are no multiples.
+        Integers and the scales, shape (outputs,). If some weights are no multiples, the unchanged weights and None.
     """
     scale = np.abs(values).max(axis=0) / np.float32(LARGEST_INT8)
     divisor = np.where(scale > 0.0, scale, 1.0)  # a column of zeros has the scale 0
@@ -144,15 +148,15 @@ def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
     return values, None
 
 
-def _add_product(name: str, block: Block, values: NDArray[Any]) -> list[str]:
+def _product_lines(name: str, block: Block, values: NDArray[Any]) -> list[str]:
     """Return the lines of C that add the product of the inputs x and one block of the weights to the outputs y.
 
-    One pass over the outputs adds the products of up to `N_ROWS` inputs, so that y is read and written less often.
+    Each loop over the outputs adds the products of up to `N_ROWS` inputs, so that y is read and written less often.
 
     Args:
         name: Name of the array with the weights of the block.
-        block: Rows and columns of the block.
-        values: Weights of the block.
+        block: Rows and columns of the block in the weight matrix of the layer.
+        values: Weights of the block, float32 or int8.
     """
     n_row, n_column = values.shape
     rows, columns = block

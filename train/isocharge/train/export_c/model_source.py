@@ -1,15 +1,17 @@
-"""The files `isocharge_model.h`, `isocharge_model.c` and `self_test.c` of a model.
+"""Texts of the files `isocharge_model.h`, `isocharge_model.c` and `self_test.c` for a model.
 
-The first layer gets the logarithm of one charge and the differences of the other logarithms from it. The result is the
-same function of the charges, but with smaller rounding errors. The charges of a film rise and fall together, and the
-position changes their ratios. A first layer therefore has large weights of both signs on logarithms that are nearly
-equal, and its sums nearly cancel:
+The inputs of the first layer in C are the logarithm of one charge, ln q_0, and the logarithms of the ratios of the
+other charges to this charge. The network remains the same function of the charges, but its rounding errors are smaller.
+The charges of a film rise and fall together, and the position changes their ratios. The first layer of a trained
+network therefore has large weights of both signs for logarithms that are nearly equal, so that the terms of its sums
+nearly cancel:
 
     sum_k w_k ln q_k = (sum_k w_k) ln q_0 + sum_k w_k ln(q_k / q_0).
 
-On the right-hand side the subtraction comes first. The difference of two charges is exact if their ratio is at most two
-(Sterbenz 1974). The logarithm of 1 + (q_k - q_0) / q_0 therefore has all its digits. The logarithm of a charge is
-larger, so its last digits are lost in the sums.
+On the right-hand side, the charges are subtracted before a logarithm is computed, because ln(q_k / q_0) is computed as
+log1p((q_k - q_0) / q_0). The difference of two charges is exact if their ratio is at most two (Sterbenz 1974), so all
+digits of this logarithm are correct. On the left-hand side, the logarithms are larger, and their last digits are lost
+in the sums.
 """
 
 from itertools import cycle, islice, pairwise
@@ -33,7 +35,12 @@ from isocharge.train.training.folded_network import (
 
 
 def model_header(metadata: ModelMetadata, network: FoldedNetwork) -> str:
-    """Return the text of `isocharge_model.h`."""
+    """Return the text of `isocharge_model.h`.
+
+    Args:
+        metadata: Metadata of the model.
+        network: The network of the model.
+    """
     features = network.features
     is_logarithmic = features.mean is None
     n_number = _contact_size(network)
@@ -63,14 +70,15 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     activation = network.layers.activation
     widest = max(layer.weight.shape[1] for layer in hidden)
 
-    # The hidden layers read and write two buffers alternately; the first one reads the logarithms of the charges.
+    # The first hidden layer reads the buffer `logs` with the inputs of the network. The hidden layers write alternately
+    # to the buffers `one` and `other`, and each layer reads the buffer that the layer before it wrote.
     buffers = ["logs", *islice(cycle(["one", "other"]), len(hidden))]
     calls = []
     for layer, (input_buffer, output_buffer) in zip(hidden, pairwise(buffers), strict=True):
         calls.append(f"{layer.name}({input_buffer}, {layer.name}_bias, {output_buffer});")
     calls.append(f"skip({buffers[0]}, skip_bias, skipped);")
     calls.append(f"last({buffers[-1]}, skipped, answers);")
-    hidden_buffers = dict.fromkeys(buffers[1:])  # each name once, in order
+    hidden_buffers = dict.fromkeys(buffers[1:])  # removes repeated names, and keeps the order
     return source_text(
         "isocharge_model.c",
         label=c_comment(metadata.label),
@@ -92,41 +100,41 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
 def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSource, LayerSource]:
     """Return the hidden layers, the skip layer and the output layer of a network.
 
-    The weights are single-precision numbers. If the features are logarithms, the layers that read the features are
-    changed by `_weights_on_differences`.
+    The weights and biases are converted to single precision. If the features are logarithms, the weights of the layers
+    that read the features are also changed by `_convert_to_differences`.
 
     Args:
         network: The network.
     """
     perceptron = network.layers
     is_logarithmic = network.features.mean is None
-    weights_on_inputs = _weights_on_differences if is_logarithmic else _single_precision
+    convert_input_weights = _convert_to_differences if is_logarithmic else _to_single_precision
     first, *others = perceptron.hidden
-    other_weights = [_single_precision(layer.weight) for layer in others]
-    last_weight = _single_precision(perceptron.last.weight)
+    other_weights = [_to_single_precision(layer.weight) for layer in others]
+    last_weight = _to_single_precision(perceptron.last.weight)
     # The outputs before the misfit vector belong to the contact perceptron.
     n_contact_output = network.angle_columns.stop
     *other_blocks, last_blocks = find_blocks([*other_weights, last_weight], n_contact_output)
 
-    first_weight = weights_on_inputs(first.weight)
-    hidden = [LayerSource("layer_0", first_weight, _single_precision(first.bias), activation=perceptron.activation)]
+    first_weight = convert_input_weights(first.weight)
+    hidden = [LayerSource("layer_0", first_weight, _to_single_precision(first.bias), activation=perceptron.activation)]
     for layer, weight, blocks in zip(others, other_weights, other_blocks, strict=True):
         name = f"layer_{len(hidden)}"
-        bias = _single_precision(layer.bias)
+        bias = _to_single_precision(layer.bias)
         hidden.append(LayerSource(name, weight, bias, blocks, perceptron.activation))
     # The bias of the output layer is added with the skip layer.
-    skip = LayerSource("skip", weights_on_inputs(perceptron.skip), _single_precision(perceptron.last.bias))
+    skip = LayerSource("skip", convert_input_weights(perceptron.skip), _to_single_precision(perceptron.last.bias))
     last = LayerSource("last", last_weight, blocks=last_blocks)
     return hidden, skip, last
 
 
 def _contact_size(network: FoldedNetwork) -> int:
-    """Return the number of fields of a `Contact` that a network computes."""
+    """Return the number of fields of a `Contact` that a network computes, with or without the correlations."""
     return len(Contact._fields) if network.n_angle else N_WITHOUT_CORRELATION
 
 
 def _correlations_source(network: FoldedNetwork) -> str:
-    """Return the C function that computes the correlations as well."""
+    """Return the text of the C function that computes the correlations in addition to the other outputs."""
     text = source_text(
         "isocharge_all.c",
         table=c_array("COSINES", COSINES_TO_CORRELATIONS.astype(np.float32)),
@@ -138,8 +146,13 @@ def _correlations_source(network: FoldedNetwork) -> str:
 
 
 def self_test(golden: Golden) -> str:
-    """Return the text of `self_test.c`, which contains golden vectors and their tolerances."""
-    # A Contact ends with the correlations. False is sorted before True, and other names keep their order.
+    """Return the text of `self_test.c`, which contains golden vectors and their tolerances.
+
+    Args:
+        golden: Golden vectors of the model.
+    """
+    # The correlations are sorted to the end, as in a `Contact`, because False comes before True. The sort is stable, so
+    # the other names keep their order.
     names = sorted(golden.outputs, key=lambda name: name == CORRELATION)
     answers = np.concatenate([golden.outputs[name] for name in names], axis=1)
     floors = np.array([floor for name in names for floor in golden.floors[name]], np.float32)
@@ -156,7 +169,7 @@ def self_test(golden: Golden) -> str:
 
 
 def _features_source(features: ChargeFeatures) -> str:
-    """Return the C function `features`, which computes the inputs of the first layer from the charges.
+    """Return the text of the C function `features`, which computes the inputs of the first layer from the charges.
 
     Logarithmic features have the same limits for all electrodes. Features of charges of both signs have limits and a
     mean for each electrode.
@@ -164,7 +177,7 @@ def _features_source(features: ChargeFeatures) -> str:
     Args:
         features: Typical charges, limits and means of the features.
     """
-    factor = _single_precision(1.0 / features.typical_pC)
+    factor = _to_single_precision(1.0 / features.typical_pC)
     if features.mean is None:
         return source_text(
             "features.c",
@@ -175,29 +188,29 @@ def _features_source(features: ChargeFeatures) -> str:
         )
     arrays = [
         c_array("FACTOR", factor),
-        c_array("LOW", _single_precision(features.low_pC)),
-        c_array("HIGH", _single_precision(features.high_pC)),
-        c_array("MEAN", _single_precision(features.mean)),
+        c_array("LOW", _to_single_precision(features.low_pC)),
+        c_array("HIGH", _to_single_precision(features.high_pC)),
+        c_array("MEAN", _to_single_precision(features.mean)),
     ]
     return source_text("features_signed.c", arrays="\n".join(arrays), electrodes=features.n_electrode)
 
 
-def _single_precision(values: Array) -> Singles:
-    """Return values in single precision."""
+def _to_single_precision(values: Array) -> Singles:
+    """Convert values to single precision."""
     return np.asarray(values, dtype=np.float32)
 
 
-def _weights_on_differences(weight: Array) -> Singles:
-    """Return weights on (ln q_0, ln(q_1 / q_0), ...) that give the same sums as weights on (ln q_0, ln q_1, ...).
+def _convert_to_differences(weight: Array) -> Singles:
+    """Convert weights of (ln q_0, ln q_1, ...) into weights of (ln q_0, ln(q_1 / q_0), ...) that give the same sums.
 
-    The equation in the description of this module shows that only the weights on ln q_0 change.
+    The equation in the docstring of the module shows that only the weights of ln q_0 change.
 
     Args:
-        weight: Weights on the logarithms, shape (inputs, outputs).
+        weight: Weights of the logarithms, shape (inputs, outputs).
 
     Returns:
-        Weights on the first logarithm and on the differences from it, same shape.
+        Weights of the first logarithm and of the logarithms of the ratios, same shape, float32.
     """
-    changed = np.array(weight)
-    changed[0] = weight.sum(axis=0)
-    return changed.astype(np.float32)
+    new_weight = np.array(weight)
+    new_weight[0] = weight.sum(axis=0)
+    return new_weight.astype(np.float32)

@@ -1,1 +1,1 @@
-"""One network for all films: its data, its training, its file, and the model of one film that is computed from it."""
+"""Network for all films: training data, training, file, and computation of the model of one film."""

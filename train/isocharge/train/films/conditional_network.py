@@ -1,10 +1,12 @@
-"""The network for all films during training: a perceptron whose weights depend on the film.
+"""Network for all films in the form in which it is trained: a perceptron whose weights depend on the film.
 
-The inputs are logarithms of the charges, from which the exact scales of the film are subtracted (`film_scaling`). The
-context of a film consists of a few numbers that describe the film. A small context network converts the context into a
-vector psi. The weights of layer l are then W_l = W_l0 + sum over k of phi_lk W_lk. The factors phi and the biases are
-linear functions of psi. The skip layer has weights of the same form. For one film, the result is an ordinary perceptron
-(`films_model.ConditionalWeights`).
+The inputs are the logarithms of the charges after division by the charge scales of the film (see `film_scaling`). The
+context of a film consists of a few numbers that describe the film. A small network, the context network, converts the
+context into a feature vector psi. The weight matrix of layer l is W_l = W_l0 + sum over k of phi_lk W_lk, with matrices
+W_l0 and W_lk that are the same for all films, and with factors phi_lk that depend on the film. The factors phi_lk and
+the biases of the layers are linear functions of the feature vector psi. The weight matrix of the skip layer is also a
+constant matrix plus a weighted sum of matrices. For the context of a single film, `ConditionalWeights.perceptron`
+computes an ordinary perceptron.
 """
 
 from dataclasses import dataclass
@@ -27,28 +29,31 @@ from isocharge.train.training.network import as_tensor
 from isocharge.train.training.torch_evaluation import evaluate, evaluate_features, evaluate_hidden_layers
 
 N_BASES = 6
-"""Number of weight matrices W_lk that are mixed in a layer, besides the constant matrix W_l0."""
+"""Number of matrices W_lk of a layer, whose weighted sum is added to the constant matrix W_l0."""
 
 CONTEXT_WIDTH = 64
-"""Width of the context network and length of psi."""
+"""Width of each layer of the context network, and length of the feature vector psi."""
 
 N_WHITENING_FILMS = 512
 """Number of films from whose charges the whitening is computed."""
 
 INITIAL_BASIS_SIZE = 0.3
-"""Initial size of the matrices W_lk, relative to the constant matrix."""
+"""Initial size of the matrices W_lk, relative to the initial size of the constant matrix W_l0."""
 
 INITIAL_PHI_STD = 0.3
-"""Initial standard deviation of phi."""
+"""Initial standard deviation of the factors phi_lk for a feature vector psi whose elements have the magnitude 1."""
 
 
 @dataclass(frozen=True)
 class FilmInputs:
-    """Inputs of the network for all films: (ln clip(Q) - log charge scale of the film - mean) @ whitening.
+    """Computation of the inputs of the network for all films from charges.
+
+    The inputs are (ln(clip(Q)) - ln(S) - mean) @ whitening, with the charges Q in pC and the charge scales S of the
+    film. `FilmScaling.log_charge_scale` computes ln(S).
 
     Attributes:
-        scaling: Exact scales and contexts of films.
-        mean: Mean of the scaled logarithms (Q in pC), shape (n_electrode,).
+        scaling: Charge scales and contexts of films.
+        mean: Mean of the logarithms of the scaled charges Q / S, with Q in pC, shape (n_electrode,).
         whitening: Whitening matrix, shape (n_electrode, n_electrode).
     """
 
@@ -61,24 +66,24 @@ class FilmInputs:
         """Fit the mean and the whitening matrix to noise-free charges of many films.
 
         Args:
-            scaling: Exact scales and contexts of films.
-            presses: Presses on films. Only the first `N_WHITENING_FILMS` films are used.
+            scaling: Charge scales and contexts of films.
+            presses: Presses on films. Only the presses on the first `N_WHITENING_FILMS` films are used.
         """
         charge = presses.charge()[:N_WHITENING_FILMS]
         log_charge = np.log(np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE))
         log_scale = scaling.log_charge_scale(presses.parameters[:N_WHITENING_FILMS])  # shape (n_film, n_electrode)
         scaled_log_charge = log_charge - log_scale[:, None]  # shape (n_film, n_press, n_electrode)
         n_electrode = charge.shape[-1]
-        mean, matrix = whitening(scaled_log_charge.reshape(-1, n_electrode))
-        return cls(scaling, mean, matrix)
+        mean, whitening_matrix = whitening(scaled_log_charge.reshape(-1, n_electrode))
+        return cls(scaling, mean, whitening_matrix)
 
     @property
     def charge_features(self) -> ChargeFeatures:
-        """Logarithms of the charges in pC."""
+        """Features ln(Q / 1 pC) of charges Q, which are first clipped to the limits of the network."""
         return ChargeFeatures(np.ones(self.mean.size), np.array(LOWEST_CHARGE), np.array(HIGHEST_CHARGE))
 
     def values(self, charge: Tensor, parameters: Array) -> Tensor:
-        """Compute the inputs of the network.
+        """Compute the inputs of the network from charges on several films.
 
         Args:
             charge: Charges, shape (n_film, n, n_electrode), pC.
@@ -87,25 +92,32 @@ class FilmInputs:
         Returns:
             Inputs, shape (n_film, n, n_electrode).
         """
-        shift = as_tensor(self.scaling.log_charge_scale(parameters) + self.mean)
-        logarithms = evaluate_features(self.charge_features, charge)
-        return (logarithms - shift[:, None]) @ as_tensor(self.whitening)
+        mean_log_charge = as_tensor(self.scaling.log_charge_scale(parameters) + self.mean)  # (n_film, n_electrode)
+        log_charge = evaluate_features(self.charge_features, charge)
+        return (log_charge - mean_log_charge[:, None]) @ as_tensor(self.whitening)
 
     def context(self, parameters: Array) -> Tensor:
-        """Compute the contexts, shape (n_film, n_context), of films with parameters of shape (n_film, n_parameter)."""
+        """Compute the contexts of films from their parameters.
+
+        Args:
+            parameters: Parameters of the films, shape (n_film, n_parameter).
+
+        Returns:
+            Contexts, shape (n_film, n_context).
+        """
         return as_tensor(self.scaling.context(parameters))
 
 
 class ConditionalPerceptron(nn.Module):
-    """A perceptron with a skip layer, in which all weights depend on the film.
+    """Perceptron with a skip layer, whose weights and biases depend on the film.
 
-    The perceptron is evaluated for many films at once.
+    One call evaluates the perceptrons of many films.
 
     Args:
         n_input: Number of electrodes.
         hidden: Widths of the hidden layers.
         n_output: Number of outputs.
-        n_context: Number of context values.
+        n_context: Number of values in the context of a film.
         activation: Activation of the hidden layers and of the context network.
     """
 
@@ -119,39 +131,42 @@ class ConditionalPerceptron(nn.Module):
     ) -> None:
         """Create the layers with random weights.
 
-        The weights of each layer are a constant matrix plus `N_BASES` matrices, whose factors phi depend on the film. A
-        small network computes these factors and the biases from the context. At the beginning, the biases do not depend
-        on the film.
+        The weight matrix of each layer is the sum of a constant matrix and `N_BASES` basis matrices, which are
+        multiplied by factors phi. The context network computes features of the film from its context. The factors phi
+        and the biases are linear functions of these features. Before the training, the biases do not depend on the
+        film.
 
         Args:
             n_input: Number of inputs.
             hidden: Widths of the hidden layers.
             n_output: Number of outputs.
-            n_context: Number of values that describe a film.
-            activation: Activation of the hidden layers.
+            n_context: Number of values in the context of a film.
+            activation: Activation of the hidden layers and of the context network.
         """
         super().__init__()
         self.activation = activation
-        sizes = list(pairwise((n_input, *hidden, n_output)))  # numbers of inputs and outputs of each layer
-        context_sizes = [(n_context, CONTEXT_WIDTH), (CONTEXT_WIDTH, CONTEXT_WIDTH)]
+        layer_shapes = list(pairwise((n_input, *hidden, n_output)))  # numbers of inputs and outputs of each layer
+        context_shapes = [(n_context, CONTEXT_WIDTH), (CONTEXT_WIDTH, CONTEXT_WIDTH)]
         self.context = nn.ModuleDict(
-            {name: nn.Linear(*size) for name, size in zip(CONTEXT_LAYERS, context_sizes, strict=True)}
+            {name: nn.Linear(*shape) for name, shape in zip(CONTEXT_LAYERS, context_shapes, strict=True)}
         )
-        self.constant = nn.ParameterList([_uniform_weights(1.0, size) for size in sizes])
-        self.bases = nn.ParameterList([_uniform_weights(INITIAL_BASIS_SIZE, size, (N_BASES,)) for size in sizes])
-        self.bias = nn.ModuleList([nn.Linear(CONTEXT_WIDTH, width) for _, width in sizes])
+        self.constant = nn.ParameterList([_uniform_weights(1.0, shape) for shape in layer_shapes])
+        self.bases = nn.ParameterList(
+            [_uniform_weights(INITIAL_BASIS_SIZE, shape, (N_BASES,)) for shape in layer_shapes]
+        )
+        self.bias = nn.ModuleList([nn.Linear(CONTEXT_WIDTH, width) for _, width in layer_shapes])
         self.skip = nn.Parameter(torch.zeros(n_input, n_output))
         self.skip_bases = nn.Parameter(torch.zeros(N_BASES, n_input, n_output))
-        n_mixed_matrix = len(sizes) + 1  # the layers and the skip layer
+        n_mixed_matrix = len(layer_shapes) + 1  # the weights of the layers and of the skip layer
         self.phi = nn.Linear(CONTEXT_WIDTH, N_BASES * n_mixed_matrix)
 
-        for linear in self.bias:
-            nn.init.zeros_(linear.weight)  # type: ignore[arg-type]
+        for bias_layer in self.bias:  # with weights of zero, the biases are the same for all films
+            nn.init.zeros_(bias_layer.weight)  # type: ignore[arg-type]
         nn.init.normal_(self.phi.weight, std=INITIAL_PHI_STD / np.sqrt(CONTEXT_WIDTH))
         nn.init.zeros_(self.phi.bias)
 
     def forward(self, inputs: Tensor, context: Tensor) -> Tensor:
-        """Compute the outputs for films.
+        """Compute the outputs of the network for presses on several films.
 
         Args:
             inputs: Inputs for each film, shape (n_film, n, n_input).
@@ -163,10 +178,11 @@ class ConditionalPerceptron(nn.Module):
         return evaluate(self.definition(context), inputs)
 
     def definition(self, context: Tensor) -> Perceptron[Tensor]:
-        """Return the perceptrons of films, as one perceptron whose weights have a first axis for the film.
+        """Return the perceptrons of several films as one perceptron, whose weights have a first axis for the film.
 
-        The context network computes features psi of each film. The weights of each layer are a sum of matrices with the
-        factors phi. The factors phi and the biases are linear functions of psi.
+        The context network computes the features psi of each film. The weight matrix of each layer is a constant matrix
+        plus basis matrices, which are multiplied by the factors phi of the film. The factors phi and the biases are
+        linear functions of the features psi.
 
         Args:
             context: Contexts of the films, shape (n_film, n_context).
@@ -186,7 +202,7 @@ class ConditionalPerceptron(nn.Module):
         return Perceptron(tuple(hidden), last, skip, self.activation)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return the weights by name, as `ConditionalWeights` takes them."""
+        """Return the weights as arrays by name, in the form that `ConditionalWeights` expects."""
         return {name: values.detach().double().numpy() for name, values in self.state_dict().items()}
 
     def _context_linears(self) -> list[nn.Linear]:
@@ -195,7 +211,7 @@ class ConditionalPerceptron(nn.Module):
 
 
 def _mix_weights(constant: Tensor, bases: Tensor, phi: Tensor) -> Tensor:
-    """Compute the weights W_l of films: a constant matrix plus a weighted sum of basis matrices.
+    """Compute the weights of one layer for several films: a constant matrix plus a weighted sum of basis matrices.
 
     Args:
         constant: Constant matrix, shape (n_input, n_output).
@@ -209,14 +225,17 @@ def _mix_weights(constant: Tensor, bases: Tensor, phi: Tensor) -> Tensor:
     return constant + torch.einsum("fk,kio->fio", phi, bases)
 
 
-def _uniform_weights(size: float, shape: tuple[int, int], batch: tuple[int, ...] = ()) -> nn.Parameter:
-    """Draw weights that are uniformly distributed between -size / sqrt(n_input) and size / sqrt(n_input).
+def _uniform_weights(scale: float, shape: tuple[int, int], leading_shape: tuple[int, ...] = ()) -> nn.Parameter:
+    """Draw weights that are uniformly distributed between -scale / sqrt(n_input) and scale / sqrt(n_input).
 
     Args:
-        size: Size of the weights.
-        shape: Shape of a matrix, (n_input, n_output).
-        batch: Leading dimensions, if several matrices are drawn.
+        scale: Largest magnitude of a weight, multiplied by sqrt(n_input).
+        shape: Shape of one weight matrix, (n_input, n_output).
+        leading_shape: Leading dimensions of the result if several matrices are drawn; empty for one matrix.
+
+    Returns:
+        Weights, shape (*leading_shape, n_input, n_output).
     """
     n_input, _ = shape
-    from_minus_one_to_one = 2.0 * torch.rand((*batch, *shape)) - 1.0
-    return nn.Parameter(size * from_minus_one_to_one / np.sqrt(n_input))
+    from_minus_one_to_one = 2.0 * torch.rand((*leading_shape, *shape)) - 1.0
+    return nn.Parameter(scale * from_minus_one_to_one / np.sqrt(n_input))

@@ -1,14 +1,15 @@
-"""Scaling of the charges of films, and the context: the properties of a film on which the scaled charges depend.
+"""Scales of the charges of films, and contexts, which are the properties of films on which the scaled charges depend.
 
-E is Young's modulus, h is the thickness, d is the geometric mean of d31 and d32, and g is the gain of an electrode. The
-charge Q of this electrode then has the form
+Let E be Young's modulus, h the thickness, d the geometric mean of d31 and d32, and g the gain of an electrode. The
+charge Q of the electrode under a force F then has the form
 
     Q / (g d E)  =  function of F / (E h), of the position in the frame of the electrodes, and of the context.
 
-The context contains the softened pretension over E, ln(d31 / d32), h, the position of the film's centre in the frame of
-the electrodes, the rotation of the film, and the radius of the probe. The noise and the limits of the domain do not
-scale with the film. The context therefore also contains the scales by which charges and forces are divided. The scales
-are the scale of all charges, the scale of the force, and the gain of each electrode relative to the mean gain.
+The context contains the logarithms of pretension / E, of d31 / d32 and of h. The context also contains the position of
+the film's centre in the frame of the electrodes, the rotation of the electrodes, and the radius of the probe. The noise
+and the limits of the domain are the same for all films, so their influence depends on the scales of the film. The
+context therefore also contains the mean scale of the charges, the scale of the forces, and the gain of each electrode
+relative to the mean gain.
 """
 
 from dataclasses import dataclass
@@ -23,11 +24,11 @@ from isocharge.simulate.forward.film_grid import SOFTENING
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 
 N_FILMS = 4096
-"""Number of films from which mean and standard deviation of the context are computed."""
+"""Number of films from which the mean and the standard deviation of the context are computed."""
 
 
 class ContextStatistics(NamedTuple):
-    """Mean and standard deviation of the context over the films, each of shape (n_context,)."""
+    """Mean and standard deviation of the unstandardised context over many films, each of shape (n_context,)."""
 
     mean: Array
     std: Array
@@ -35,34 +36,37 @@ class ContextStatistics(NamedTuple):
 
 @dataclass(frozen=True)
 class FilmScaling:
-    """Exact scales and contexts of films. Parameters can have any leading dimensions.
+    """Scales of the charges, transformations of the contacts, and contexts of films.
+
+    The arrays of parameters can have any number of leading dimensions.
 
     Attributes:
         prior: Distribution of the films.
-        domain: Contacts, to which the unit coordinates refer.
+        domain: Working area and range of forces, which define the unit coordinates.
     """
 
     prior: FilmPrior
     domain: Domain
 
     def log_charge_scale(self, parameters: Array) -> Array:
-        """Compute the logarithms of those factors of the charges that follow exactly from the parameters.
+        """Compute the logarithms of the charge scales of the electrodes.
 
-        The factor of an electrode is the product of three ratios between the film and the described film: Young's
-        modulus, the geometric mean of d31 and d32, and the gain of the electrode.
+        The charge scale of an electrode is the product of Young's modulus, the geometric mean of d31 and d32, and the
+        gain of the electrode, each divided by its value for the described film.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
 
         Returns:
-            Logarithms of the factors, shape (..., n_electrode).
+            Logarithms of the charge scales, shape (..., n_electrode).
         """
-        mean_piezo = 0.5 * (_shared(parameters, "d31") + _shared(parameters, "d32"))
-        common = _shared(parameters, "young") + mean_piezo
-        return np.asarray(_gains(parameters) + common[..., None])
+        # These parameters are logarithms, so the sum of two parameters is the logarithm of a product.
+        log_mean_piezo = 0.5 * (_shared(parameters, "d31") + _shared(parameters, "d32"))
+        log_common_scale = _shared(parameters, "young") + log_mean_piezo
+        return np.asarray(_log_gains(parameters) + log_common_scale[..., None])
 
     def rotation(self, parameters: Array) -> Array:
-        """Compute the matrix T of `to_film`, the rotation of the electrodes.
+        """Compute the matrices T of `to_film`, which rotate positions with the electrodes.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
@@ -76,10 +80,11 @@ class FilmScaling:
         return rotation
 
     def offset(self, parameters: Array) -> Array:
-        """Compute the vector o of `to_film` in unit coordinates.
+        """Compute the vectors o of `to_film` in unit coordinates.
 
-        The electrodes are rotated about the origin and then displaced. The first two components of o are this
-        displacement. The third component is the logarithm of the stiffness relative to the described film.
+        The electrodes of a film are first rotated about the origin and then displaced. The first two components of the
+        vector o are the displacement of the electrodes. The third component is the logarithm of the ratio of the
+        stiffness to that of the described film.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
@@ -98,7 +103,7 @@ class FilmScaling:
         return np.asarray(offset / self.domain.scale)
 
     def to_film(self, parameters: Array, unit: Array) -> Array:
-        """Transform unit coordinates u on the described film into unit coordinates on another film, T u + o.
+        """Convert the unit coordinates u on the described film into the unit coordinates T u + o on another film.
 
         The position moves with the electrodes, and the force is proportional to the stiffness.
 
@@ -113,7 +118,7 @@ class FilmScaling:
         return np.asarray(rotated + self.offset(parameters))
 
     def context(self, parameters: Array) -> Array:
-        """Compute the context of films, standardised over the prior.
+        """Compute the contexts of films, standardised with the mean and the standard deviation over the prior.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
@@ -125,16 +130,17 @@ class FilmScaling:
 
     @cached_property
     def statistics(self) -> ContextStatistics:
-        """Mean and standard deviation of the context over films drawn from the prior."""
+        """Mean and standard deviation of the unstandardised context over films that are drawn from the prior."""
         raw = self._raw_context(self.prior.draw(np.random.default_rng(0), N_FILMS))
         return ContextStatistics(raw.mean(axis=0), raw.std(axis=0))
 
     def _raw_context(self, parameters: Array) -> Array:
-        """Compute the numbers that describe films, before they are standardised.
+        """Compute the contexts of films before they are standardised.
 
-        The numbers are the pretension strain, the ratio of d31 to d32, the thickness, the position (x, y) of the film
-        relative to the electrodes, the rotation of the electrodes, the probe radius, the mean scale of the charges, the
-        stiffness, and the gains relative to their mean. All except position, rotation and radius are logarithms.
+        The context of a film contains the pretension divided by Young's modulus, the ratio of d31 to d32, the
+        thickness, the position (x, y) of the film's centre relative to the electrodes, the rotation of the electrodes,
+        the probe radius, the mean scale of the charges, the stiffness, and the gains relative to their mean. All values
+        except the position, the rotation and the probe radius are logarithms.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
@@ -148,14 +154,14 @@ class FilmScaling:
         strain = _shared(parameters, "pretension") / young
         shift = described_shift + _shift(parameters)
 
-        # Centre of the film in the axes of the electrodes, relative to its described position. The shifts get a last
-        # axis for the product of matrix and vector.
+        # Centre of the film in the axes of the electrodes, relative to its described position. The additional last axis
+        # makes each shift a column vector, shape (..., 2, 1).
         rotation_to_electrodes = _rotation(-_shared(parameters, "rotation"))
         rotated_shift = (rotation_to_electrodes @ shift[..., None])[..., 0]
         centre = described_shift - rotated_shift
 
         shared_columns = [
-            np.log(strain + SOFTENING),  # a slack film has the strain 0
+            np.log(strain + SOFTENING),  # the constant is added because a slack film has the strain 0
             _shared(parameters, "d31") - _shared(parameters, "d32"),
             _shared(parameters, "thickness"),
             centre[..., 0],
@@ -165,28 +171,28 @@ class FilmScaling:
             self.log_charge_scale(parameters).mean(axis=-1),
             _shared(parameters, "young") + _shared(parameters, "thickness"),
         ]
-        gains = _gains(parameters)
-        relative_gains = gains - gains.mean(axis=-1, keepdims=True)
-        return np.concatenate([np.stack(shared_columns, axis=-1), relative_gains], axis=-1)
+        log_gains = _log_gains(parameters)
+        log_relative_gains = log_gains - log_gains.mean(axis=-1, keepdims=True)
+        return np.concatenate([np.stack(shared_columns, axis=-1), log_relative_gains], axis=-1)
 
 
 def _shared(parameters: Array, name: str) -> Array:
-    """Return the parameter with this name, which does not belong to a single electrode, shape (...)."""
+    """Return one of the parameters that do not belong to a single electrode, by its name, shape (...)."""
     return np.asarray(parameters[..., SHARED.index(name)])
 
 
-def _gains(parameters: Array) -> Array:
-    """Return the logarithms of the gains, shape (..., n_electrode)."""
+def _log_gains(parameters: Array) -> Array:
+    """Return the logarithms of the gains of the electrodes relative to the described film, shape (..., n_electrode)."""
     return parameters[..., len(SHARED) :]
 
 
 def _shift(parameters: Array) -> Array:
-    """Return the shift of the electrodes, shape (..., 2), mm."""
+    """Return the shift of the electrodes relative to the described film, shape (..., 2), mm."""
     return np.stack([_shared(parameters, "shift_x"), _shared(parameters, "shift_y")], axis=-1)
 
 
 def _rotation(angle: Array) -> Array:
-    """Return matrices, shape (..., 2, 2), of rotations by angles of shape (...), rad, anticlockwise."""
+    """Return the matrices, shape (..., 2, 2), that rotate anticlockwise by angles of shape (...), rad."""
     cosine = np.cos(angle)
     sine = np.sin(angle)
     first_row = np.stack([cosine, -sine], axis=-1)

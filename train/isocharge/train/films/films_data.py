@@ -1,10 +1,12 @@
 """Training data of the networks for all films.
 
-The contact network is trained on presses on many films. Gains and piezoelectric coefficients are exact factors of the
-charges, so training draws them again in every step. The charges are therefore stored for the described coefficients, in
-separate parts for d31, d32 and d33.
+The contact network is trained on presses on many films. The gains and the piezoelectric coefficients are exact factors
+of the charges. The training draws new gains and coefficients in every step, which needs no new simulation. The charges
+are therefore stored in three parts, for d31, d32 and d33, which are computed with the gains and coefficients of the
+sensor file.
 
-The misfit network is trained on charges of many kinds with their nearest contacts, and on good presses.
+The misfit network is trained on charges of many kinds, with their residuals at the nearest contact, and on charges of
+good presses.
 """
 
 from concurrent.futures import Executor
@@ -25,39 +27,41 @@ from isocharge.train.data.misfit_charges import ExampleOptions, draw_misfit_exam
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses, draw_contacts
 
 CHUNK = 16
-"""Number of films that one task computes."""
+"""Number of films whose presses one task of the executor computes."""
 
 MAX_NEGATIVE_FRACTION = 0.2
-"""Largest fraction of presses with a charge that is not positive, as light presses on taut uniaxial films have.
+"""Largest accepted fraction of presses with a charge that is zero or negative.
 
-Charges below 1 pC are clipped to 1 pC, and only the other electrodes then carry information.
+Light presses on taut uniaxial films can have such charges. The network clips charges below 1 pC to 1 pC, so that only
+the other electrodes of these presses carry information.
 """
 
 N_CANDIDATES = 512
-"""Number of contacts among which the search for the nearest contact starts.
+"""Number of contacts among which the starts of a search for the nearest contact are chosen.
 
-A candidate costs more here than for a single film, so there are fewer.
+The charges of these contacts are computed again for each film. The number is therefore smaller than in the training for
+a single film.
 """
 
 D31 = SHARED.index("d31")
-"""Index of ln d31 among the parameters."""
+"""Index of the logarithm of d31 among the parameters of a film."""
 
 D32 = SHARED.index("d32")
-"""Index of ln d32 among the parameters."""
+"""Index of the logarithm of d32 among the parameters of a film."""
 
 GAINS = slice(len(SHARED), None)
-"""Indices of the logarithms of the gains among the parameters."""
+"""Indices of the logarithms of the gains among the parameters of a film."""
 
 
 @dataclass(frozen=True)
 class FilmPresses:
-    """Presses on films.
+    """Presses on several films, without noise.
 
     Attributes:
         parameters: Parameters of the films, shape (n_film, n_parameter).
         contact: Contacts (x, y, F), shape (n_film, n_press, 3), mm and N, float32.
-        response: Charges for the described gains, in parts for d31, d32 and d33 alone with their described values,
-            shape (n_film, n_press, n_electrode, 3), pC, float32.
+        response: Parts of the charges that are due to d31, to d32 and to d33, for the gains and coefficients of the
+            sensor file, shape (n_film, n_press, n_electrode, 3), pC, float32.
     """
 
     parameters: Array
@@ -68,10 +72,10 @@ class FilmPresses:
         return len(self.parameters)
 
     def charge(self) -> Array:
-        """Compute the charges of the films without noise.
+        """Compute the charges of the presses with the gains and the coefficients of their films.
 
-        The parts of the charges for d31, d32 and d33 are multiplied by the factors of the film and added. The sums are
-        multiplied by the gains of the electrodes:
+        The parts of a charge for d31, d32 and d33 are multiplied by factors of the film, and the products are added.
+        The sum of the products is multiplied by the gain factor of the electrode:
 
             charge = gain factor * sum over the parts (part factor * part).
 
@@ -80,10 +84,10 @@ class FilmPresses:
         """
         d31_factor = np.exp(self.parameters[:, D31])
         d32_factor = np.exp(self.parameters[:, D32])
-        d33_factor = np.ones(len(self))  # d33 is the same for all films
+        d33_factor = np.ones(len(self))  # all films have the d33 of the sensor file
         part_factors = np.stack([d31_factor, d32_factor, d33_factor], axis=1)
         gain_factors = np.exp(self.parameters[:, GAINS])
-        # Sum over the parts c, for each film f, press p and electrode e.
+        # Sum over the parts c for each film f, press p and electrode e
         return np.asarray(np.einsum("fpec,fc,fe->fpe", self.response.astype(float), part_factors, gain_factors))
 
 
@@ -96,74 +100,78 @@ def draw_film_presses(
     seed: int,
     executor: Executor | None = None,
 ) -> FilmPresses:
-    """Draw films from the prior, and draw presses on each film.
+    """Draw films from the prior, draw presses on each film, and compute their charges.
 
-    Positions are uniformly distributed over the disk, and forces are log-uniform.
+    The positions of the presses are uniformly distributed over the disk of the domain, and the forces are log-uniform.
 
     Args:
         prior: Distribution of the films.
         family: Forward maps of the films.
-        domain: Contacts.
+        domain: Working area and range of forces of the presses.
         films: Number of films.
         presses: Number of presses on each film.
         seed: Seed of films and presses.
-        executor: Executor of the tasks; None for this process.
+        executor: Executor that computes the presses of `CHUNK` films in each task; None for this process.
 
     Returns:
         Contacts, and the charges of each film in parts; see `FilmPresses`.
 
     Raises:
-        DatasetError: If too many charges are not positive.
+        DatasetError: If too many presses have a charge that is zero or negative.
     """
-    # The number after the seed makes this sequence independent of the sequences of the presses.
+    # The number after the seed makes these random numbers independent of those of the presses.
     parameters = prior.draw(np.random.default_rng([seed, 0]), films)
     jobs = [(first_film, parameters[first_film : first_film + CHUNK]) for first_film in range(0, films, CHUNK)]
     press_films = partial(_press_films, prior, family, domain, presses, seed)
     chunks = list(track(in_order(executor, press_films, jobs), "pressing films", len(jobs)))
 
-    # The third axis contains the contact and then the response of each electrode.
-    contact, response = np.split(np.concatenate(chunks), [1], axis=2)
-    drawn = FilmPresses(parameters, contact[:, :, 0], response)
-    _check_charges_are_positive(drawn)
-    return drawn
+    contact_and_response = np.concatenate(chunks)  # shape (films, presses, 1 + n_electrode, 3)
+    contact = contact_and_response[:, :, 0]
+    response = contact_and_response[:, :, 1:]
+    film_presses = FilmPresses(parameters, contact, response)
+    _check_most_charges_are_positive(film_presses)
+    return film_presses
 
 
 def _press_films(
     prior: FilmPrior, family: FilmFamily, domain: Domain, presses: int, seed: int, job: tuple[int, Array]
 ) -> Singles:
-    """Compute presses on some films.
+    """Draw presses on some films, and compute their charges in parts.
 
-    A job returns a single array to the executor, so the contacts and the responses are joined in one array.
+    The contacts and the parts of the charges are joined in one array, because a task of the executor returns a single
+    array.
 
     Args:
         prior: Distribution of the films.
         family: Forward maps of the films.
-        domain: Contacts.
+        domain: Working area and range of forces of the presses.
         presses: Number of presses on each film.
         seed: Seed of the presses.
-        job: Index of the first film among all films, and parameters of the films, shape (n_film, n_parameter).
+        job: Index of the first of these films among all films, and parameters of these films, shape (n_film,
+            n_parameter).
 
     Returns:
-        Contacts and then responses of the electrodes, shape (n_film, presses, 1 + n_electrode, 3).
+        Array of shape (n_film, presses, 1 + n_electrode, 3). Along the third axis, it contains the contact and then the
+        response of each electrode (see `FilmPresses`).
     """
     first_film, parameters = job
-    # The numbers after the seed make this sequence independent of those of the films and of other jobs.
+    # The numbers after the seed make these random numbers independent of those of the films and of other jobs.
     rng = np.random.default_rng([seed, 1, first_film])
     contacts = np.stack([draw_contacts(rng, domain, presses) for _ in parameters])
     responses = np.stack(
         [
-            _response(prior, family, film_parameters, film_contacts)
+            _compute_response(prior, family, film_parameters, film_contacts)
             for film_parameters, film_contacts in zip(parameters, contacts, strict=True)
         ]
     )
     return np.concatenate([contacts[:, :, None], responses], axis=2).astype(np.float32)
 
 
-def _response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: Array) -> Array:
+def _compute_response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: Array) -> Array:
     """Compute the parts of the charges of one film that are due to d31, to d32 and to d33.
 
-    The piezoelectric coefficients and the gains are those of the sensor file. The coefficients and gains of the film
-    are factors of the parts, which `FilmPresses.charge` applies.
+    The parts are computed with the piezoelectric coefficients and the gains of the sensor file. `FilmPresses.charge`
+    multiplies the parts by the factors that convert these coefficients and gains into those of the film.
 
     Args:
         prior: Distribution of the films.
@@ -183,41 +191,42 @@ def _response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: 
     piezo = prior.sensor.piezo
     no_charge = np.zeros((len(contact), len(prior.sensor.electrodes)))
 
-    def charges(d31: float, d32: float, d33: float = 0.0) -> Array:
-        """Return the charges of the film with other piezoelectric coefficients, shape (n_press, n_electrode), pC."""
-        if d31 == 0.0 and d32 == 0.0:  # the sensor file has no such coefficient, so this part is zero
+    def charges_with(d31: float, d32: float, d33: float = 0.0) -> Array:
+        """Return the charges of the film with these piezoelectric coefficients, shape (n_press, n_electrode), pC."""
+        if d31 == 0.0 and d32 == 0.0:  # the coefficient of this part is zero in the sensor file
             return no_charge
         other_sensor = replace(forward_map.sensor, piezo=Piezo(d31, d32, d33))
         return replace(forward_map, sensor=other_sensor).charges(contact)
 
-    d31_part = charges(piezo.d31, 0.0)
-    d32_part = charges(0.0, piezo.d32)
-    d33_part = no_charge
-    if piezo.d33 != 0.0:
-        # The charge is a sum of three parts. No charge is computed for d33 alone, so its part is what remains.
-        all_parts = charges(piezo.d31, piezo.d32, piezo.d33)
-        d33_part = all_parts - d31_part - d32_part
+    d31_part = charges_with(piezo.d31, 0.0)
+    d32_part = charges_with(0.0, piezo.d32)
+    if piezo.d33 == 0.0:
+        d33_part = no_charge
+    else:
+        # The charge is a sum of three parts. The map is not evaluated with d33 alone, so its part is the remainder.
+        total_charge = charges_with(piezo.d31, piezo.d32, piezo.d33)
+        d33_part = total_charge - d31_part - d32_part
     return np.stack([d31_part, d32_part, d33_part], axis=-1)
 
 
-def _check_charges_are_positive(drawn: FilmPresses) -> None:
+def _check_most_charges_are_positive(film_presses: FilmPresses) -> None:
     """Check that at most the fraction `MAX_NEGATIVE_FRACTION` of the presses has a charge that is zero or negative.
 
     The network learns from the logarithms of the charges, so it needs positive charges.
 
     Args:
-        drawn: The drawn presses.
+        film_presses: Presses on the drawn films.
 
     Raises:
-        DatasetError: If there are more such presses. The message describes the first one.
+        DatasetError: If the fraction is larger. The message describes the first press with such a charge.
     """
-    charge = drawn.charge()
+    charge = film_presses.charge()
     is_unusable = (charge <= 0.0).any(axis=-1)  # shape (n_film, n_press)
     unusable_fraction = is_unusable.mean()
     if unusable_fraction <= MAX_NEGATIVE_FRACTION:
         return
     film_index, press_index = np.argwhere(is_unusable)[0]
-    first_contact = drawn.contact[film_index, press_index].tolist()
+    first_contact = film_presses.contact[film_index, press_index].tolist()
     first_charge = charge[film_index, press_index].tolist()
     raise DatasetError(
         f"{unusable_fraction:.0%} of the presses have an electrode whose charge is zero or negative, expected at most "
@@ -234,8 +243,8 @@ class FilmsSource:
     Attributes:
         prior: Distribution of the films.
         family: Forward maps of the films.
-        domain: Contacts.
-        noise: Noise of good presses.
+        domain: Working area and range of forces of the presses.
+        noise: Noise of good presses, whose standard deviation is the unit of the residuals.
     """
 
     prior: FilmPrior
@@ -244,9 +253,10 @@ class FilmsSource:
     noise: NoiseModel
 
     def charge_map(self, parameters: Array) -> FunctionMap:
-        """Return the map of one film from contacts to charges.
+        """Return the map of one film from contacts to charges, which are clipped to the limits of the input features.
 
-        The charges are clipped to the limits of the input features.
+        Args:
+            parameters: Parameters of the film, shape (n_parameter,).
         """
         forward_map = self.family.forward_map(*self.prior.film(parameters))
 
@@ -259,12 +269,13 @@ class FilmsSource:
 
 @dataclass(frozen=True)
 class DrawnFilms:
-    """Training data of the misfit network.
+    """Charges on several films, and the data from which the targets of the misfit network are computed.
 
     Attributes:
         parameters: Parameters of the films, shape (n_film, n_parameter).
-        charge: Charges, shape (n_film, n, n_electrode), pC.
-        target: Residuals or projections from which the targets are computed, shape (n_film, n, n_electrode, ...).
+        charge: n sets of charges on each film, shape (n_film, n, n_electrode), pC.
+        target: Residuals of the charges, shape (n_film, n, n_electrode), from `draw_misfit_films`; or matrices that
+            convert noise into residuals, shape (n_film, n, n_electrode, n_electrode), from `draw_near_films`.
     """
 
     parameters: Array
@@ -275,40 +286,41 @@ class DrawnFilms:
 def draw_misfit_films(
     source: FilmsSource, films: int, charges: int, seed: int, executor: Executor | None = None
 ) -> DrawnFilms:
-    """Draw films and charges of every kind on each film.
+    """Draw films from the prior, and draw charges of every kind on each film.
 
     Args:
-        source: Films and contacts.
+        source: Distribution and forward maps of the films, contacts and noise.
         films: Number of films.
-        charges: Number of charges on each film.
+        charges: Number of sets of charges on each film.
         seed: Seed of films and charges.
-        executor: Executor of the tasks; None for this process.
+        executor: Executor that draws the data of one film in each task; None for this process.
 
     Returns:
-        Films and charges. The target is (Q - Q(c)) / sigma at the nearest contact c, in standard deviations of the
-        noise, shape (films, charges, n_electrode).
+        Films, charges Q and targets. The targets are the residuals (Q - Q(c)) / sigma at the nearest contact c, with
+        the standard deviation sigma of the noise, shape (films, charges, n_electrode).
     """
     parameters = source.prior.draw(np.random.default_rng([seed, 2]), films)
-    jobs = in_order(executor, partial(_charges_of_every_kind, source, charges, seed), enumerate(parameters))
-    charge, residual = np.stack(list(track(jobs, "searching nearest contacts", films)), axis=1)
+    results = in_order(executor, partial(_draw_charges_of_every_kind, source, charges, seed), enumerate(parameters))
+    charge_and_residual = list(track(results, "searching nearest contacts", films))  # one array for each film
+    charge, residual = np.stack(charge_and_residual, axis=1)
     return DrawnFilms(parameters, charge, residual)
 
 
-def _charges_of_every_kind(source: FilmsSource, charges: int, seed: int, job: tuple[int, Array]) -> Array:
+def _draw_charges_of_every_kind(source: FilmsSource, charges: int, seed: int, job: tuple[int, Array]) -> Array:
     """Draw charges of every kind on one film, from good presses to charges that no contact explains.
 
     Args:
-        source: Films, domain and noise.
-        charges: Number of charges.
+        source: Distribution and forward maps of the films, contacts and noise.
+        charges: Number of sets of charges.
         seed: Seed of the random numbers.
         job: Number of the film, and its parameters, shape (n_parameter,).
 
     Returns:
-        Charges, pC, and residuals, shape (2, charges, n_electrode).
+        Array of shape (2, charges, n_electrode) with the charges, pC, and then their residuals at the nearest contact.
     """
     film_number, parameters = job
     charge_map = source.charge_map(parameters)
-    # The numbers after the seed make this sequence independent of those of other films and other purposes.
+    # The numbers after the seed make these random numbers independent of those of other films and other data sets.
     rng = np.random.default_rng([seed, 3, film_number])
     contact = draw_contacts(rng, source.domain, charges)
     presses = LabelledPresses(contact, charge_map.charges(contact))
@@ -319,52 +331,53 @@ def _charges_of_every_kind(source: FilmsSource, charges: int, seed: int, job: tu
 def draw_near_films(
     source: FilmsSource, films: int, presses: int, seed: int, executor: Executor | None = None
 ) -> DrawnFilms:
-    """Draw films and good presses on each film, with matrices that compute the residuals of the presses.
+    """Draw films from the prior, and draw good presses with projection matrices on each film.
 
-    The nearest contact of a good press is found without a search, because the charges are linearised about the true
-    contact.
+    The projection matrix of a press converts the noise of its charges into their residuals at the nearest contact. No
+    search for this contact is needed, because the charges are linearised about the true contact.
 
     Args:
-        source: Films and contacts.
+        source: Distribution and forward maps of the films, contacts and noise.
         films: Number of films.
         presses: Number of presses on each film.
         seed: Seed of films and presses.
-        executor: Executor of the tasks; None for this process.
+        executor: Executor that draws the data of one film in each task; None for this process.
 
     Returns:
-        Films and charges without noise. The target is a projection matrix, shape (films, presses, n_electrode,
-        n_electrode). To first order, it maps a deviation in standard deviations of the noise to the residual at the
-        nearest contact, so new noise costs nothing.
+        Films, charges without noise, and projection matrices as targets, shape (films, presses, n_electrode,
+        n_electrode). The noise and the residuals of a press are in units of the standard deviation of the noise.
     """
     parameters = source.prior.draw(np.random.default_rng([seed, 4]), films)
-    jobs = in_order(executor, partial(_good_presses, source, presses, seed), enumerate(parameters))
-    drawn = np.stack(list(track(jobs, "drawing good presses", films)))
-    # The last axis contains the charge and then the row of the projection matrix of each electrode.
-    charge, projection = np.split(drawn, [1], axis=-1)
-    return DrawnFilms(parameters, charge[..., 0], projection)
+    results = in_order(executor, partial(_draw_good_presses, source, presses, seed), enumerate(parameters))
+    charge_and_projection = np.stack(list(track(results, "drawing good presses", films)))
+    # The last axis contains the charge of an electrode, and then the row of the projection matrix for this electrode.
+    charge = charge_and_projection[..., 0]
+    projection = charge_and_projection[..., 1:]
+    return DrawnFilms(parameters, charge, projection)
 
 
-def _good_presses(source: FilmsSource, presses: int, seed: int, job: tuple[int, Array]) -> Array:
-    """Draw good presses on one film, with the matrices that compute their residuals from their noise.
+def _draw_good_presses(source: FilmsSource, presses: int, seed: int, job: tuple[int, Array]) -> Array:
+    """Draw good presses on one film, with the matrices that convert the noise of their charges into residuals.
 
     Args:
-        source: Films, domain and noise.
+        source: Distribution and forward maps of the films, contacts and noise.
         presses: Number of presses.
         seed: Seed of the random numbers.
         job: Number of the film, and its parameters, shape (n_parameter,).
 
     Returns:
-        Charges, pC, and then projection matrices, shape (presses, n_electrode, 1 + n_electrode).
+        Array of shape (presses, n_electrode, 1 + n_electrode). Along the last axis, it contains the charge of an
+        electrode, pC, and then the row of the projection matrix for this electrode.
     """
     film_number, parameters = job
-    # The numbers after the seed make this sequence independent of those of other films and other purposes.
+    # The numbers after the seed make these random numbers independent of those of other films and other data sets.
     rng = np.random.default_rng([seed, 5, film_number])
     contact = draw_contacts(rng, source.domain, presses)
     charge, slopes = linearised(source.charge_map(parameters), contact)
-    scaled_slopes = slopes / source.noise.sigma(charge)[:, :, None]
-    # The projection removes the changes of the charges that a change of the contact explains. These changes are
-    # combinations of the columns of `scaled_slopes`, for which QR gives an orthonormal basis B. The projection is
-    # I - B B'.
+    noise_std = source.noise.sigma(charge)
+    scaled_slopes = slopes / noise_std[:, :, None]  # shape (presses, n_electrode, 3)
+    # A change of the contact changes the charges by a combination of the columns of `scaled_slopes`. The QR
+    # decomposition gives an orthonormal basis B of these columns. The projection I - B B' removes such changes.
     basis, _ = np.linalg.qr(scaled_slopes)
     projection = np.eye(charge.shape[1]) - basis @ basis.transpose(0, 2, 1)
     return np.concatenate([charge[:, :, None], projection], axis=2)

@@ -1,4 +1,4 @@
-"""Writer and reader of `films.npz`, which contains the network for all films beside a model.
+"""Writer and reader of `films.npz`, the file of a network for all films in the version folder of a model.
 
     about              JSON: format, sensor, probe, spread, domain, activation, noise
     family.*           the forward maps of the films (`FilmFamily.to_arrays`)
@@ -7,7 +7,7 @@
     mean, whitening    mean and whitening matrix of the inputs
     sha256             checksum of all arrays above
 
-The weights are rounded to few bits, because their last bits are nearly random and cannot be compressed.
+The weights are rounded to `BITS` bits. The bits that are removed are nearly random and could not be compressed.
 """
 
 import hashlib
@@ -35,52 +35,56 @@ from isocharge.train.films.film_scaling import FilmScaling
 from isocharge.train.films.films_model import ConditionalWeights, FilmsModel
 
 FILE = "films.npz"
-"""Name of the file in a version folder."""
+"""Name of the file of a network for all films in a version folder."""
 
 FORMAT = 1
 """Version of the file's format."""
 
 BITS = 14
-"""Number of bits of a weight, including its sign. The largest weight of a row has the largest integer."""
+"""Number of bits of a rounded weight, including its sign."""
 
 FILE_UNITS = {"pretension": 1e6, "shift": 1e-3, "probe_radius": 1e-3}
-"""Factors that convert quantities to the units of the file, Pa and m, by the name of the quantity."""
+"""Factors that convert quantities from MPa and mm to the units of the file, Pa and m, by the name of the quantity."""
 
 COULOMB_PER_PC = 1e-12
-"""Factor that converts the white noise from pC into the unit of the file, C."""
+"""Factor that converts the white noise from pC to the unit of the file, C."""
 
 MAX_LAYER_WIDTH = 2048
-"""Largest number of nodes of a layer."""
+"""Largest number of nodes of a layer that is accepted from a file."""
 
 MIN_LARGEST_WEIGHT = 1e-30
-"""Largest weight that is assumed for a row of zeros, so that its scale is positive."""
+"""Lower limit of the largest magnitude in a row of weights, so that the scale of a row of zeros is positive."""
 
 ADVICE = "copy the model's folder again, or train it again (isocharge train fit --films)"
-"""What a user can do about a damaged file, for error messages."""
+"""Part of the error message about a damaged file that states what the user can do."""
 
 
 def films_bytes(films: FilmsModel) -> bytes:
-    """Return the content of the file."""
+    """Return the content of the file `films.npz` for a network.
+
+    Args:
+        films: The network for all films.
+    """
     arrays = {
         "about": np.array(json.dumps(_about_table(films), allow_nan=False)),
         "mean": films.mean,
         "whitening": films.whitening,
         **{f"family.{name}": np.asarray(value) for name, value in films.family.to_arrays().items()},
-        **_packed("contact", films.contact.arrays),
-        **_packed("misfit", films.misfit.arrays),
+        **_pack_weights("contact", films.contact.arrays),
+        **_pack_weights("misfit", films.misfit.arrays),
     }
     checksum = np.array(_checksum(arrays))
     return _npz({**arrays, "sha256": checksum})
 
 
 def read_films(version_folder: Path) -> FilmsModel:
-    """Read the network for all films beside a model.
+    """Read the network for all films from the version folder of a model.
 
     Args:
-        version_folder: The folder that holds `model.onnx`, as `find_model` gives it.
+        version_folder: The folder that contains `model.onnx` and the file, as `find_model` returns it.
 
     Raises:
-        ModelError: If the file is missing or damaged, or of another format.
+        ModelError: If the file is missing or damaged, or has another format.
     """
     advice = "expected the version folder of a model for all films, as `isocharge train fit --films` writes it"
     data = read_companion_file(version_folder, FILE, advice)
@@ -88,7 +92,7 @@ def read_films(version_folder: Path) -> FilmsModel:
 
 
 def films_from_bytes(data: bytes, where: str) -> FilmsModel:
-    """Read a model from the content of a file.
+    """Read a network for all films from the content of its file.
 
     Args:
         data: Content of the file.
@@ -103,14 +107,14 @@ def films_from_bytes(data: bytes, where: str) -> FilmsModel:
         if about["format"] != FORMAT:
             raise ModelError(f"{where}: format {about['format']} is not supported (this version reads {FORMAT})")
         return _model_from_arrays(about, arrays, sha256_of(data))
-    except ModelError:  # it has a message of its own, but is one of the errors below
+    except ModelError:  # a subclass of ValueError, which the next clause would report as damage
         raise
     except DAMAGED_FILE_ERRORS as error:
         raise ModelError(f"{where}: damaged ({type(error).__name__}: {error}); {ADVICE}") from error
 
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return an npz file with LZMA compression, which reduces its size by a tenth compared with deflate.
+    """Return the content of an npz file with LZMA compression, which is smaller than with the usual compression.
 
     Args:
         arrays: The arrays by name.
@@ -124,13 +128,14 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def _checked_arrays(data: bytes) -> dict[str, np.ndarray]:
-    """Read the arrays of a file, check the checksum and the numbers, and return all arrays except the checksum.
+    """Read the arrays of a file, check them, and return all arrays except the checksum, by name.
 
     Args:
         data: Content of the file.
 
     Raises:
-        ValueError: If the checksum does not fit, or an array is neither a text nor finite real numbers.
+        ValueError: If the stored checksum differs from that of the arrays, or if an array contains neither a text nor
+            finite real numbers.
     """
     arrays = npz_arrays(data)
     expected = str(arrays.pop("sha256"))
@@ -147,7 +152,7 @@ def _checked_arrays(data: bytes) -> dict[str, np.ndarray]:
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
-    """Return the SHA-256 checksum of names, types, shapes and numbers of arrays.
+    """Return the SHA-256 checksum of the names, types, shapes and values of arrays.
 
     Args:
         arrays: The arrays by name.
@@ -161,12 +166,13 @@ def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def _about_table(films: FilmsModel) -> dict[str, Any]:
-    """Return the JSON object that describes the films, the domain and the noise of a model.
+    """Return the JSON object that describes the films, the domain, the noise and the activation of a network.
 
-    The numbers are converted into the units of the file. If the activation is tanh, the object has no entry for it.
+    The numbers are converted into the units of the file. The object has an entry for the activation only if the
+    activation is not tanh.
 
     Args:
-        films: The model.
+        films: The network for all films.
     """
     prior = films.prior
     activation = films.contact.activation
@@ -186,7 +192,10 @@ def _about_table(films: FilmsModel) -> dict[str, Any]:
 
 
 def _model_from_arrays(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str) -> FilmsModel:
-    """Return the model of a file. This is the inverse of `_about_table` and of the functions that write the arrays.
+    """Create a network for all films from the JSON object and the arrays of its file.
+
+    The numbers of the JSON object are converted from the units of the file. The function is the inverse of
+    `_about_table` and `_pack_weights`.
 
     Args:
         about: The JSON object of the file.
@@ -194,38 +203,39 @@ def _model_from_arrays(about: dict[str, Any], arrays: Mapping[str, np.ndarray], 
         sha256: Checksum of the file.
 
     Raises:
-        InputError: If the parts of the file do not fit together.
+        InputError: If the sensor, the inputs and the weights in the file do not fit together.
     """
     spread = {name: _converted(value, 1.0 / FILE_UNITS.get(name, 1.0)) for name, value in about["spread"].items()}
     probe = Circle(_converted(about["probe_radius"], 1.0 / FILE_UNITS["probe_radius"]))
     prior = FilmPrior(sensor_from_dict(about["sensor"]), probe, FilmSpread(**spread))
-    noise = about["noise"]
+    noise_table = about["noise"]
+    noise = NoiseModel(**{**noise_table, "white": _converted(noise_table["white"], 1.0 / COULOMB_PER_PC)})
     min_force, max_force = about["force_range_N"]
     domain = Domain(float(about["radius_mm"]), (float(min_force), float(max_force)))
     activation = ACTIVATIONS[about.get("activation", TANH.name)]
-    model = FilmsModel(
+    films = FilmsModel(
         family=FilmFamily.from_arrays(_arrays_of_part(arrays, "family")),
         scaling=FilmScaling(prior, domain),
         mean=arrays["mean"],
         whitening=arrays["whitening"],
-        contact=_unpacked(_arrays_of_part(arrays, "contact"), activation),
-        misfit=_unpacked(_arrays_of_part(arrays, "misfit"), activation),
-        noise=NoiseModel(**{**noise, "white": _converted(noise["white"], 1.0 / COULOMB_PER_PC)}),
+        contact=_unpack_weights(_arrays_of_part(arrays, "contact"), activation),
+        misfit=_unpack_weights(_arrays_of_part(arrays, "misfit"), activation),
+        noise=noise,
         sha256=sha256,
     )
 
     n_electrode = len(prior.sensor.electrodes)
-    if model.mean.shape != (n_electrode,) or model.whitening.shape != (n_electrode, n_electrode):
-        raise InputError(f"inputs of {model.mean.size} electrodes, a sensor with {n_electrode}")
-    model.fold(prior.mean)  # raises if the weights do not fit together
-    return model
+    if films.mean.shape != (n_electrode,) or films.whitening.shape != (n_electrode, n_electrode):
+        raise InputError(f"inputs of {films.mean.size} electrodes, a sensor with {n_electrode}")
+    films.fold(prior.mean)  # raises an error if the weights do not fit together
+    return films
 
 
 def _converted(value: float, factor: float) -> float:
     """Multiply a number by the factor between two units, and round the product to 15 digits.
 
-    A number of up to 15 digits is therefore the same after a conversion to another unit and back. The factor 1 leaves
-    any number unchanged.
+    A number of up to 15 digits is therefore the same after a conversion to another unit and back. If the factor is 1,
+    the number is returned without rounding.
     """
     if factor == 1.0:
         return value
@@ -233,20 +243,20 @@ def _converted(value: float, factor: float) -> float:
 
 
 def _arrays_of_part(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np.ndarray]:
-    """Return the arrays of one part of the file, by their names in this part."""
+    """Return the arrays of one part of the file, by their names without the prefix of this part."""
     prefix = f"{part}."
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
-def _packed(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarray]:
-    """Round weights to integers with a scale for each row of their last axis.
+def _pack_weights(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarray]:
+    """Round weights to integers, with one scale for each row of an array.
 
-    A weight is approximately its integer times the scale of its row. The largest magnitude in a row becomes the largest
-    integer of `BITS` bits.
+    The rows extend along the last axis. A weight is approximately its integer times the scale of its row. The scale is
+    chosen so that the largest magnitude in a row becomes the largest integer of `BITS` bits.
 
     Args:
         part: Name of the part of the file.
-        weights: Arrays by name.
+        weights: Arrays of weights by name.
 
     Returns:
         Integers and scales by their names in the file.
@@ -262,11 +272,11 @@ def _packed(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarray]:
     return packed
 
 
-def _unpacked(packed: Mapping[str, np.ndarray], activation: Activation) -> ConditionalWeights:
-    """Convert rounded weights of a file into the weights of a network. This is the inverse of `_packed`.
+def _unpack_weights(packed: Mapping[str, np.ndarray], activation: Activation) -> ConditionalWeights:
+    """Convert rounded weights of a file into the weights of a network. This is the inverse of `_pack_weights`.
 
     Args:
-        packed: Integers and scales by their names in the part of the file.
+        packed: Integers and scales by their names in the part of the file. The name of a scale ends with ".scale".
         activation: Activation of the hidden layers.
 
     Raises:

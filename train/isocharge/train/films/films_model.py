@@ -18,23 +18,26 @@ from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.features import logarithmic_features
 from isocharge.train.training.fitted import Fitted, Provenance
 from isocharge.train.training.folded_network import FoldedNetwork
-from isocharge.train.training.folding import answer_units, fold
+from isocharge.train.training.folding import fold, linear_answer_map
 from isocharge.train.training.output_regression import adapt_to_charges, add_variance
 
 N_REGRESSION_PRESSES = 750
-"""Number of presses from which the last layer is fitted to another film. Twice as many change the errors by 0.5 %."""
+"""Number of presses to which a network is fitted if the charges differ from those of the simulated film.
+
+More presses hardly reduce the errors.
+"""
 
 N_COPIES = 4
-"""Number of copies of these presses with different noise."""
+"""Number of copies of each press in the fits of the corrections. Each copy has its own noise."""
 
 N_CORRELATION_PRESSES = 1500
-"""Number of presses from which the correlations are fitted; the presses above are among them."""
+"""Number of presses to which the correlations are fitted. They include the `N_REGRESSION_PRESSES` presses."""
 
 N_TEST_PRESSES = 1000
-"""Number of presses on which the errors of a film's network are measured."""
+"""Largest number of presses on which the errors of the network of a film are measured."""
 
 SEED = 11
-"""Seed of the presses and the noise."""
+"""Seed of the presses and of their noise."""
 
 CONTEXT_LAYERS = ("0", "2")
 """Names of the layers of the context network in the films file."""
@@ -55,14 +58,15 @@ class ConditionalWeights:
     def perceptron(self, context: Array) -> Perceptron[Array]:
         """Compute the perceptron of one film.
 
-        Two context layers compute features psi of the film. The weights of each layer are a sum of matrices with the
-        factors phi. The factors phi and the biases are linear functions of psi.
+        Two context layers compute the features psi of the film. The weight matrix of each layer is a constant matrix
+        plus basis matrices, which are multiplied by factors phi. The factors phi and the biases are linear functions of
+        the features psi.
 
         Args:
             context: Numbers that describe the film, shape (n_context,).
 
         Returns:
-            The perceptron, whose weights are mixed from the matrices of all films.
+            The perceptron with the weights and biases of this film.
         """
         context_layers = [self._linear(f"context.{name}") for name in CONTEXT_LAYERS]
         psi = evaluate_hidden_layers(context_layers, self.activation, context)
@@ -73,16 +77,17 @@ class ConditionalWeights:
             weight = self._mix_weights(f"constant.{index}", f"bases.{index}", phi[index])
             bias = self._apply_linear(f"bias.{index}", psi)
             layers.append(Layer(weight, bias))
-        *hidden, output_layer = layers
         skip_weight = self._mix_weights("skip", "skip_bases", phi[n_layer])
+        *hidden, output_layer = layers
         return Perceptron(tuple(hidden), output_layer, skip_weight, self.activation)
 
     def _linear(self, name: str) -> Layer[Array]:
-        """Return the linear layer with this name. Its weight is stored with the shape (n_output, n_input)."""
+        """Return the linear layer with this name."""
+        # The weight is stored with the shape (n_output, n_input), as in PyTorch.
         return Layer(self.arrays[f"{name}.weight"].T, self.arrays[f"{name}.bias"])
 
     def _apply_linear(self, name: str, vector: Array) -> Array:
-        """Apply the linear layer with this name to a vector, shape (n_input,)."""
+        """Apply the linear layer with this name to a vector of shape (n_input,)."""
         layer = self._linear(name)
         return np.asarray(vector @ layer.weight + layer.bias)
 
@@ -99,7 +104,7 @@ class ConditionalWeights:
 
 
 class AddedVariance(NamedTuple):
-    """Variances that are added to the variances of a network.
+    """Variances that are added to the variances that a network reports.
 
     Attributes:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -112,18 +117,19 @@ class AddedVariance(NamedTuple):
 
 @dataclass(frozen=True)
 class FilmsModel:
-    """A network for all films of a prior.
+    """A network for all films that a prior describes.
 
     Attributes:
         family: Forward maps of the films.
-        scaling: Exact scales and contexts of films, with prior and domain.
-        mean: Mean of the logarithms of the charges (pC) with the exact scales divided out, shape (n_electrode,).
-        whitening: Whitening matrix, shape (n_electrode, n_electrode).
+        scaling: Charge scales and contexts of the films. It contains the prior and the domain.
+        mean: Mean of the logarithms of the charges, pC, after division by the charge scales of the films, shape
+            (n_electrode,).
+        whitening: Matrix that whitens these logarithms, shape (n_electrode, n_electrode).
         contact: Weights of the contact network.
         misfit: Weights of the misfit network.
-        noise: Noise of the training.
+        noise: Noise for which the network was trained.
         sha256: Checksum of the file from which the model was read; empty for a model that was not read from a file.
-        made_with: Settings of the training, for the metadata; they are not in the file.
+        made_with: Settings of the training for the metadata of a model. The file does not contain them.
     """
 
     family: FilmFamily
@@ -153,7 +159,7 @@ class FilmsModel:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
 
         Raises:
-            SceneError: If the film is outside the family.
+            SceneError: If the forward maps of the family do not cover the film.
         """
         return self.family.forward_map(*self.prior.film(parameters))
 
@@ -169,18 +175,20 @@ class FilmsModel:
     ) -> Fitted:
         """Compute the network of one film in the form that a release needs.
 
-        The network is first computed from the parameters and adapted to the factors of the charges. After that, the
-        correlations of the network are fitted, and the added variances are included. Each correction is fitted to
-        presses on the simulated film.
+        The network is first computed from the parameters of the film. The network is then corrected in up to three
+        steps, each of which is fitted to presses on the simulated film. The first step of the correction adapts the
+        network to the factors of the charges. The second step fits the correlations of the network, and the third step
+        includes the added variances.
 
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
-            provenance: Additional information for the release.
-            charge_factor: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns the charges of the film
-                divided by the charges of the simulated film, shape (n, n_electrode). The first and the last layer of
-                the network are then changed, and its standard deviations are fitted to the remaining errors.
+            provenance: Additional information for the release; None for no information.
+            charge_factor: Function of contacts (x, y, F), shape (n, 3), mm and N, that returns the charges of the film
+                divided by the charges of the simulated film, shape (n, n_electrode). None if the charges are equal.
+                With this function, the first and the last layer of the network are changed, and its standard deviations
+                are fitted to the remaining errors.
             added_variance: Variances that are added to the variances of the network, for example because the parameters
-                of the film are uncertain.
+                of the film are uncertain; None to add nothing.
             correlation: Whether to fit the correlations, which takes one or two seconds.
             n_test: Number of test presses, at most `N_TEST_PRESSES`.
 
@@ -189,13 +197,14 @@ class FilmsModel:
 
         Raises:
             InputError: If there are not as many finite parameters as the prior names.
-            SceneError: If the film is outside the family.
+            SceneError: If the forward maps of the family do not cover the film.
         """
         network = self.fold(parameters)
         sensor, probe = self.prior.film(parameters)
         rng = np.random.default_rng(SEED)
 
-        # Contacts for the test, for the corrections, and for the added variances, whose charges are computed together
+        # The charges of three groups of contacts are computed together: contacts for the test, for the corrections, and
+        # for the added variances.
         n_train = N_CORRELATION_PRESSES if correlation else N_REGRESSION_PRESSES
         test_contact, train_contact = self._draw_contacts(rng, n_test, n_train)
         uncertain_contact = np.empty((0, 3)) if added_variance is None else added_variance.contact
@@ -232,8 +241,8 @@ class FilmsModel:
     def _draw_contacts(self, rng: np.random.Generator, n_test: int, n_train: int) -> tuple[Array, Array]:
         """Draw contacts for the test and contacts for the corrections.
 
-        The largest possible number of contacts is always drawn, and some of them are not used. The contacts for the
-        corrections therefore do not depend on the number of test contacts.
+        The largest possible number of contacts is always drawn, and some of them are not used. Therefore, the contacts
+        for the corrections do not depend on the number of contacts for the test.
 
         Args:
             rng: Random number generator.
@@ -254,7 +263,8 @@ class FilmsModel:
 
         Args:
             network: Network of the simulated film.
-            presses: Presses on the film, with the factors in their charges.
+            presses: Presses whose charges are already multiplied by the
+                factors.
             factors: Charges of the film divided by the charges of the simulated film, shape (n, n_electrode).
             rng: Random number generator for the noise.
         """
@@ -264,10 +274,11 @@ class FilmsModel:
         return adapt_to_charges(network, noisy_charge, simulated_charge, presses.contact[copied_rows])
 
     def fold(self, parameters: Array) -> FoldedNetwork:
-        """Compute the network of one film without corrections, which takes a few milliseconds.
+        """Compute the network of one film without corrections.
 
-        The perceptrons of contact and misfit are folded into one perceptron. The first layer includes the scaling of
-        the charges of this film. The last layer includes the rotation and the shift of its electrodes.
+        The perceptrons for the contact and for the misfit are merged into one perceptron. The first layer of the merged
+        perceptron includes the charge scales of the film. The last layer includes the rotation and the shift of the
+        electrodes.
 
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
@@ -290,9 +301,9 @@ class FilmsModel:
 
         log_charge_mean = self.mean + self.scaling.log_charge_scale(parameters)
         features = logarithmic_features(log_charge_mean)
-        features_mean = log_charge_mean - np.log(features.typical_pC)  # the features are ln(Q / typical charge)
+        features_mean = log_charge_mean - np.log(features.typical_pC)  # because the features are ln(Q / typical charge)
 
         rotation = self.scaling.rotation(parameters)
         offset = self.scaling.offset(parameters)
-        units = answer_units(self.domain, rotation, offset, features.n_electrode)
-        return FoldedNetwork(features, fold(perceptrons, features_mean, self.whitening, units))
+        answer_map = linear_answer_map(self.domain, rotation, offset, features.n_electrode)
+        return FoldedNetwork(features, fold(perceptrons, features_mean, self.whitening, answer_map))

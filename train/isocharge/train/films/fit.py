@@ -1,4 +1,4 @@
-"""Training of one network for all films of a prior."""
+"""Training of one network for all films that a prior describes."""
 
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
@@ -46,28 +46,29 @@ from isocharge.train.training.losses import (
 from isocharge.train.training.network import as_tensor, compress_length
 
 RADIUS_MARGIN = 1.5
-"""Distance by which the forward maps reach beyond the domain, mm.
+"""Distance by which the forward maps reach beyond the radius of the domain, mm.
 
-A calibration moves presses whose position is uncertain.
+A calibration needs this margin, because it moves presses whose position is uncertain.
 """
 
 FORCE_MARGINS = (0.8, 1.2)
-"""Factors of the smallest and the largest force of the domain up to which the forward maps reach."""
+"""Ratios of the smallest and the largest force of the forward maps to those of the domain."""
 
 LARGEST_GRADIENT = 5.0
-"""Norm to which larger gradients are clipped. Films whose map nearly folds have large gradients."""
+"""Norm to which larger gradients are scaled. Such gradients occur on films whose map nearly folds."""
 
 MAX_NOISE_FACTOR = 8.0
-"""Largest factor on the noise of good presses in the training of the misfit network."""
+"""Largest factor by which the noise of good presses is multiplied in the training of the misfit network."""
 
 GOOD_PRESS_WEIGHT = 10.0
 """Weight of good presses in the loss of the misfit network.
 
-Good presses determine the rate of false alarms. The misfits of these presses are small, so they need a large weight.
+Good presses determine the rate of false alarms. Their misfits and therefore their losses are small, so that they need a
+large weight.
 """
 
 MISFIT_VALIDATION_FRACTION = 0.06
-"""Fraction of the films that are used for validation in the training of the misfit network."""
+"""Fraction of the films with charges of every kind that are used for the validation of the misfit network."""
 
 N_VALIDATION_PRESSES = 8
 """Number of good presses of each film in the validation of the misfit network."""
@@ -85,7 +86,7 @@ class FilmsConfig:
         activation: Name of the activation of the hidden layers (`isocharge.common.activations`).
         films: Number of films for the contact network, including those for validation.
         presses: Number of presses on each film, for the contact network and for the good presses of the misfit network.
-        watched: Number of films for the validation of the contact network.
+        watched: Number of films of `films` that are used for the validation of the contact network.
         steps: Number of optimiser steps of the contact network.
         misfit_films: Number of films with charges of every kind for the misfit network.
         misfit_charges: Number of sets of charges on each of the `misfit_films`.
@@ -130,26 +131,26 @@ def fit_films(
     executor: Executor | None = None,
     run: ResumableRun | None = None,
 ) -> FilmsModel:
-    """Train a network for films drawn from a prior.
+    """Train a network for all films that a prior describes.
 
-    The forward maps of the films are simulated first. A second thread then trains the contact perceptron on presses on
-    drawn films. At the same time, this thread draws charges of every kind and good presses, and trains the misfit
-    perceptron on them.
+    The forward maps of the films are simulated first, and films are drawn from the prior. A second thread then trains
+    the contact perceptron on presses on these films. At the same time, the calling thread draws charges of every kind
+    and good presses, and trains the misfit perceptron on these data.
 
     Args:
         prior: Distribution of the films: the described sensor, the probe and the standard deviations of the parameters.
-        config: Radius, sizes, steps and seed.
-        executor: Executor for solves, presses and searches; None for this process.
-        run: Saves the state, so that an interrupted training can be continued.
+        config: Settings of the training.
+        executor: Executor for the solves, the presses and the searches; None for this process.
+        run: Run that saves the state, so that an interrupted training can be continued; None to save nothing.
 
     Returns:
-        The model, from which the network of each film is computed.
+        The network for all films, from which the network of each film is computed.
 
     Raises:
         InputError: If the noise model is unknown.
         SceneError: If the force, the radius or the probe is impossible for one of the films.
         SolveError: If a press has no equilibrium, or the forward maps are not accurate enough.
-        DatasetError: If too many charges are not positive.
+        DatasetError: If too many presses have a charge that is zero or negative.
         TrainingError: If the loss is not finite.
     """
     noise = noise_model(config.noise)  # an unknown name raises before the long computation
@@ -158,7 +159,7 @@ def fit_films(
         """Return an executor that saves the results of its tasks in the run, if there is a run."""
         return executor if run is None else run.storing_executor(name, executor)
 
-    with threads_and_seed(1, config.seed), second_thread() as thread:
+    with threads_and_seed(1, config.seed), second_thread() as thread_executor:
         domain = Domain(config.radius, config.force_range)
         family = _build_family(prior, config, saving_executor("family"))
         presses = draw_film_presses(
@@ -171,7 +172,7 @@ def fit_films(
         misfit_perceptron = _new_perceptron(inputs, config.misfit_hidden, n_electrode, activation)
 
         # Second thread: train the contact perceptron
-        contact_training = thread.submit(
+        contact_training = thread_executor.submit(
             _train_stage, contact_stage(contact_perceptron, inputs, presses, noise, config), config, run
         )
 
@@ -184,7 +185,7 @@ def fit_films(
             source, config.near_films, config.presses, config.seed, saving_executor("good-presses")
         )
         _train_stage(misfit_stage(misfit_perceptron, inputs, examples, good_presses, source.noise, config), config, run)
-        contact_training.result()
+        contact_training.result()  # waits for the second thread, and raises its exception
     return FilmsModel(
         family=family,
         scaling=inputs.scaling,
@@ -198,7 +199,7 @@ def fit_films(
 
 
 def films_identity(prior: FilmPrior, config: FilmsConfig) -> dict[str, Any]:
-    """Return all settings that determine the weights. These settings identify a run that can be resumed."""
+    """Return all settings that determine the weights of a network, in order to identify a run that can be resumed."""
     return {
         "sensor": sensor_to_dict(prior.sensor),
         "probe": prior.probe.notation,
@@ -211,7 +212,7 @@ def films_identity(prior: FilmPrior, config: FilmsConfig) -> dict[str, Any]:
 
 
 def _build_family(prior: FilmPrior, config: FilmsConfig, executor: Executor | None) -> FilmFamily:
-    """Simulate the forward maps of the films that the prior describes.
+    """Simulate the forward maps of all films that a prior describes, with the effects of imperfections of the films.
 
     Args:
         prior: Distribution of the films.
@@ -219,7 +220,7 @@ def _build_family(prior: FilmPrior, config: FilmsConfig, executor: Executor | No
         executor: Executor of the simulations; None for this process.
 
     Returns:
-        The family of forward maps, rounded as in a films file.
+        The family of forward maps, whose numbers are rounded as in a films file.
     """
     min_force, max_force = config.force_range
     min_factor, max_factor = FORCE_MARGINS
@@ -240,7 +241,10 @@ def _new_perceptron(
 
 
 def _train_stage(stage: TrainingStage, config: FilmsConfig, run: ResumableRun | None) -> None:
-    """Train without early stopping, because the last steps of the schedule have the smallest loss."""
+    """Train a network for all steps of its stage.
+
+    The training does not stop early, because the loss is smallest after the last steps of the schedule.
+    """
     Descent(stage, config.learning_rate, stage.steps, config.seed).run(run)
 
 
@@ -255,14 +259,14 @@ class _Batch(NamedTuple):
 def contact_stage(
     network: ConditionalPerceptron, inputs: FilmInputs, presses: FilmPresses, noise: NoiseModel, config: FilmsConfig
 ) -> TrainingStage:
-    """Return the training of the contact network.
+    """Return the stage that trains the contact network.
 
     Args:
-        network: The network.
-        inputs: Inputs of the network.
-        presses: Presses on films; the last films are used for validation.
+        network: The contact network, whose weights the training changes.
+        inputs: Computation of the inputs from charges.
+        presses: Presses on films; the last `config.watched` films are used for validation.
         noise: Noise that is added to the charges in every step.
-        config: Numbers of steps and films, and sizes of the batches.
+        config: Settings of the training.
     """
     training = _ContactTraining(network, inputs, presses, noise, config)
     return TrainingStage(
@@ -293,13 +297,13 @@ class _ContactTraining:
 
     @property
     def n_train(self) -> int:
-        """Number of films for the training. The other films are used for validation."""
+        """Number of films for the training. The films after the training films are used for validation."""
         return len(self.presses) - self.config.watched
 
     def loss(self, step: int, random: torch.Generator) -> Tensor:
         """Return the loss of a random batch, in which d31, d32 and the gains of the films are drawn again.
 
-        The first steps use the warm-up loss.
+        The first `warm_up_steps` steps use the warm-up loss, and the other steps use the likelihood loss.
 
         Args:
             step: Number of the step.
@@ -307,46 +311,47 @@ class _ContactTraining:
         """
         config = self.config
         n_press = self.presses.contact.shape[1]
-        films = torch.randint(self.n_train, (config.batch_films,), generator=random).numpy()
+        film_rows = torch.randint(self.n_train, (config.batch_films,), generator=random).numpy()
         press_rows = torch.randint(n_press, (config.batch_films, config.batch_presses), generator=random).numpy()
         prior = self.inputs.scaling.prior
-        parameters = _with_fresh_factors(prior, self.presses.parameters[films], random)
-        batch = self.evaluate_batch(films, press_rows, parameters, random)
+        parameters = _with_fresh_factors(prior, self.presses.parameters[film_rows], random)
+        batch = self.evaluate_batch(film_rows, press_rows, parameters, random)
         loss_function = warm_up_loss if step < self.warm_up_steps else likelihood_loss
         return loss_function(*batch)
 
     def score(self) -> tuple[float, str]:
         """Return the loss on the validation films, and a text that states the errors."""
-        films = np.arange(self.n_train, len(self.presses))
+        film_rows = np.arange(self.n_train, len(self.presses))
         n_press = self.presses.contact.shape[1]
         all_press_rows = np.tile(np.arange(n_press), (self.config.watched, 1))
         random = torch.Generator().manual_seed(self.config.seed)
-        batch = self.evaluate_batch(films, all_press_rows, self.presses.parameters[films], random)
+        batch = self.evaluate_batch(film_rows, all_press_rows, self.presses.parameters[film_rows], random)
         return validation_score(*batch, self.inputs.scaling.domain, "films")
 
     def evaluate_batch(
-        self, films: np.ndarray, press_rows: np.ndarray, parameters: Array, random: torch.Generator
+        self, film_rows: np.ndarray, press_rows: np.ndarray, parameters: Array, random: torch.Generator
     ) -> _Batch:
-        """Evaluate the network on charges with noise.
+        """Evaluate the network on the charges of presses, to which noise is added.
 
         Args:
-            films: Numbers of the films, shape (n_film,).
-            press_rows: Numbers of the presses on each film, shape (n_film, n_row).
-            parameters: Parameters of these films, shape (n_film, n_parameter).
+            film_rows: Rows of the films in `presses`, shape (n_film,).
+            press_rows: Rows of the presses on each film, shape (n_film, n_row).
+            parameters: Parameters of the films, shape (n_film, n_parameter). They can differ from those in `presses` in
+                d31, d32 and the gains.
             random: Generator of the noise.
 
         Returns:
             Estimated and true contacts of all presses of the batch.
         """
         # The index arrays have the shapes (n_film, 1) and (n_film, n_row), and select n_row presses of each film.
-        film_column = films[:, None]
+        film_column = film_rows[:, None]
         contact = self.presses.contact[film_column, press_rows]
         response = self.presses.response[film_column, press_rows]
         charge = as_tensor(FilmPresses(parameters, contact, response).charge())
         noisy_charge = with_fresh_noise(charge, self.noise, random)
         outputs = self.network(self.inputs.values(noisy_charge, parameters), self.inputs.context(parameters))
 
-        # The network works in the axes of the electrodes; rotate and shift its answer into those of the film.
+        # The network answers in the axes of the electrodes. Rotate and shift its answers into the axes of the film.
         scaling = self.inputs.scaling
         rotation = as_tensor(scaling.rotation(parameters))
         offset = as_tensor(scaling.offset(parameters))
@@ -357,9 +362,9 @@ class _ContactTraining:
 
 
 def _with_fresh_factors(prior: FilmPrior, parameters: Array, random: torch.Generator) -> Array:
-    """Return films for which d31, d32 and the gains are drawn again from the prior.
+    """Return the parameters of films with new values of d31, d32 and the gains, which are drawn from the prior.
 
-    These parameters are factors of the charges, so new values need no simulation.
+    The charges are proportional to factors that follow from these parameters, so new values need no simulation.
 
     Args:
         prior: Distribution of the films.
@@ -367,14 +372,14 @@ def _with_fresh_factors(prior: FilmPrior, parameters: Array, random: torch.Gener
         random: Random number generator.
 
     Returns:
-        Parameters with new factors, same shape.
+        Parameters with the new values, same shape.
     """
     gain_columns = range(len(SHARED), parameters.shape[1])
     columns = [D31, D32, *gain_columns]
     deviation = torch.randn((len(parameters), len(columns)), generator=random).clamp(-MAX_DEVIATION, MAX_DEVIATION)
-    changed = parameters.copy()
-    changed[:, columns] = prior.mean[columns] + prior.std[columns] * deviation.double().numpy()
-    return changed
+    new_parameters = parameters.copy()
+    new_parameters[:, columns] = prior.mean[columns] + prior.std[columns] * deviation.double().numpy()
+    return new_parameters
 
 
 def misfit_stage(
@@ -385,16 +390,18 @@ def misfit_stage(
     noise: NoiseModel,
     config: FilmsConfig,
 ) -> TrainingStage:
-    """Return the training of the misfit network. Half of the films of each batch have good presses.
+    """Return the stage that trains the misfit network.
+
+    Half of the films of each batch have good presses, and the other half have charges of every kind.
 
     Args:
-        network: The network.
-        inputs: Inputs of the network.
+        network: The misfit network, whose weights the training changes.
+        inputs: Computation of the inputs from charges.
         examples: Charges of every kind (`draw_misfit_films`); the last films are used for validation.
-        good: Good presses (`draw_near_films`). In every step they get new noise, of up to `MAX_NOISE_FACTOR` times
-            their standard deviation.
+        good: Good presses (`draw_near_films`). In every step, they get new noise with up to `MAX_NOISE_FACTOR` times
+            the standard deviation of `noise`.
         noise: Noise of good presses.
-        config: Number of steps and sizes of the batches.
+        config: Settings of the training.
     """
     training = _MisfitTraining(network, inputs, examples, good, noise, config)
     return TrainingStage(
@@ -405,8 +412,9 @@ def misfit_stage(
 class _MisfitTraining:
     """Loss and validation of the misfit network.
 
-    The loss is the weighted sum of two parts. The residuals of the first part, the examples, were found by a search.
-    The residuals of the second part, the good presses, are computed from their noise.
+    The loss of the misfit network is a weighted sum of two losses. The first loss is that of the examples, whose
+    residuals were found by a search. The second loss is that of good presses, whose residuals are computed from their
+    noise.
     """
 
     def __init__(
@@ -421,12 +429,12 @@ class _MisfitTraining:
         """Compute the inputs and targets of the examples.
 
         Args:
-            network: The network.
-            inputs: Inputs of the network.
+            network: The misfit network.
+            inputs: Computation of the inputs from charges.
             examples: Charges of every kind and their residuals.
             good: Good presses and the projections that compute their residuals.
             noise: Noise of good presses.
-            config: Sizes of the batches.
+            config: Settings of the training.
         """
         self.network = network
         self.inputs = inputs
@@ -443,20 +451,20 @@ class _MisfitTraining:
         self.n_train = n_example_film - n_validation
 
     def loss(self, _: int, random: torch.Generator) -> Tensor:
-        """Return the weighted sum of the losses of random examples and of random good presses.
+        """Return the loss of random examples plus the weighted loss of random good presses.
 
         Args:
             _: Number of the step, which has no influence.
             random: Random number generator.
         """
-        n_film = self.config.batch_films // 2  # the other half of the batch are good presses
+        n_film = self.config.batch_films // 2  # the other half of the films have good presses
         n_press = self.config.batch_presses
         n_charge = self.example_inputs.shape[1]
-        films = torch.randint(self.n_train, (n_film,), generator=random)
-        film_column = films[:, None]
-        rows = torch.randint(n_charge, (n_film, n_press), generator=random)
-        misfit_vector = self.network(self.example_inputs[film_column, rows], self.example_context[films])
-        example_loss = mean_squared_distance(misfit_vector, self.example_targets[film_column, rows])
+        film_rows = torch.randint(self.n_train, (n_film,), generator=random)
+        charge_rows = torch.randint(n_charge, (n_film, n_press), generator=random)
+        film_column = film_rows[:, None]  # with `charge_rows`, it selects n_press sets of charges of each film
+        misfit_vector = self.network(self.example_inputs[film_column, charge_rows], self.example_context[film_rows])
+        example_loss = mean_squared_distance(misfit_vector, self.example_targets[film_column, charge_rows])
         return GOOD_PRESS_WEIGHT * self.good_press_loss(n_film, n_press, random) + example_loss
 
     def score(self) -> tuple[float, str]:
@@ -472,8 +480,8 @@ class _MisfitTraining:
     def good_press_loss(self, n_film: int, n_press: int, random: torch.Generator) -> Tensor:
         """Return the loss of random good presses with new noise.
 
-        The noise of each press is multiplied by a random factor from 1 to `MAX_NOISE_FACTOR`, so that larger misfits
-        occur as well.
+        The noise of each press is multiplied by a random factor from 1 to `MAX_NOISE_FACTOR`, because the network also
+        has to learn larger misfits.
 
         Args:
             n_film: Number of films.
@@ -481,19 +489,20 @@ class _MisfitTraining:
             random: Random number generator.
         """
         n_good_film, n_good_press = self.good_charge.shape[:2]
-        films = torch.randint(n_good_film, (n_film,), generator=random)
-        rows = torch.randint(n_good_press, (n_film, n_press), generator=random)
-        film_column = films[:, None]
-        charge = self.good_charge[film_column, rows]
+        film_rows = torch.randint(n_good_film, (n_film,), generator=random)
+        press_rows = torch.randint(n_good_press, (n_film, n_press), generator=random)
+        film_column = film_rows[:, None]  # with `press_rows`, it selects n_press presses of each film
+        charge = self.good_charge[film_column, press_rows]
 
-        # The third power makes small factors frequent.
+        # The third power of the random number makes small factors more frequent than large ones.
         noise_factor = 1.0 + (MAX_NOISE_FACTOR - 1.0) * torch.rand((n_film, n_press, 1), generator=random) ** 3
         deviation = noise_factor * torch.randn(charge.shape, generator=random)  # in standard deviations of the noise
         noise_std = torch.hypot(torch.tensor(self.noise.white), self.noise.gain * charge)
         noisy_charge = charge + noise_std * deviation
 
         # The residual is the part of the noise that no change of the contact explains.
-        residual = (self.good_projection[film_column, rows] @ deviation[..., None])[..., 0]
-        parameters = self.good.parameters[films.numpy()]
+        deviation_column = deviation[..., None]  # column vectors, shape (n_film, n_press, n_electrode, 1)
+        residual = (self.good_projection[film_column, press_rows] @ deviation_column)[..., 0]
+        parameters = self.good.parameters[film_rows.numpy()]
         misfit_vector = self.network(self.inputs.values(noisy_charge, parameters), self.inputs.context(parameters))
         return mean_squared_distance(misfit_vector, compress_length(residual))

@@ -23,10 +23,10 @@ N_FILMS = 64
 """Number of new films on which the errors are measured."""
 
 N_PRESSES = 256
-"""Number of presses on each of these films."""
+"""Number of presses on each new film on which the errors are measured."""
 
 SEED = 90_001
-"""Seed of these films, which no training uses."""
+"""Seed of the new films and of the presses on them. No training uses this seed."""
 
 ROWS = (
     ("position, median", "position_median_mm", "mm"),
@@ -37,7 +37,7 @@ ROWS = (
     ("force, median", "force_median_percent", "%"),
     ("force, rms", "force_rms_percent", "%"),
 )
-"""Rows of the table of errors: text, name of the error, unit."""
+"""Rows of the table of errors in the card, each with a text, the name of the error, and its unit."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,11 @@ class FilmsErrors:
 
     Attributes:
         with_known_film: Errors if the parameters of each film are known.
-        with_assumed_film: Errors on the same films if each of them is taken for the assumed film.
+        with_assumed_film: Errors on the same films if the network of the assumed film is used for each of them.
         parameters: Parameters of the assumed film, shape (n_parameter,). The assumed film is the described film or the
             mean of the prior, whichever gives the smaller errors.
-        description: Text that names the assumed film, and states the errors with the described film and with the mean.
+        description: Text that names the assumed film, and states the errors with the described film and with the mean
+            of the prior.
     """
 
     with_known_film: Mapping[str, float]
@@ -59,11 +60,11 @@ class FilmsErrors:
 
 
 def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PRESSES, seed: int = SEED) -> FilmsErrors:
-    """Measure the errors on new films from the prior, with presses that were not in the training.
+    """Measure the errors on new films that are drawn from the prior.
 
-    The result contains position errors in mm and relative force errors in percent. These errors are computed over all
-    presses, for the median film and for the worst film. The result also contains the coverage of the 68 and 95 %
-    intervals, as a fraction of the coordinates from 0 to 1.
+    The result contains position errors in mm and relative force errors in percent over all presses. The result also
+    contains the rms position errors on the median film and on the worst film. The coverages of the 68 and 95 %
+    intervals are fractions of the coordinates, 0 to 1.
 
     Args:
         films: The network.
@@ -72,15 +73,16 @@ def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PR
         seed: Seed of films, presses and noise.
 
     Returns:
-        Errors if the network of the right film is used, and if the network of one assumed film is used for all films.
-        The assumed film is that with the smaller error: the described film, or the mean of the prior.
+        Errors if the network of each film is computed from its true parameters, and errors if the network of one
+        assumed film is used for all films. The assumed film is the described film or the mean of the prior, whichever
+        gives the smaller error.
     """
     rng = np.random.default_rng(seed)
     true_films = films.prior.draw(rng, n_film)
     true_contact, noisy_charge = _draw_presses(films, true_films, n_press, rng)
     errors_with_known_film = _errors_with_networks(films, true_films, true_contact, noisy_charge)
 
-    # Two candidates for the assumed film, whose network is used for all films
+    # For each candidate for the assumed film, use its network for all films.
     assumed_films = {"as described": films.prior.described, "in the middle of all": films.prior.mean}
     assumed_errors = {}
     for name, film in assumed_films.items():
@@ -100,7 +102,9 @@ def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PR
 def _errors_with_networks(
     films: FilmsModel, network_films: Array, true_contact: Array, noisy_charge: Array
 ) -> Mapping[str, float]:
-    """Compute the errors if the contacts on each film are estimated with the network of a given, maybe other, film.
+    """Compute the errors of contacts that are estimated with the networks of given films.
+
+    The films of the networks can differ from the films on which the presses were made.
 
     Args:
         films: The network for all films.
@@ -166,10 +170,11 @@ def _error_statistics(contact: Array, std: Array, truth: Array) -> Mapping[str, 
 
 
 def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command: str = "") -> Release:
-    """Write a network for all films as a model: `films.npz`, and the model of the assumed film.
+    """Write a model folder that contains a network for all films, `films.npz`, and the model of the assumed film.
 
-    The network is evaluated as it is written, with rounded weights. Presses outside the working area are simulated on
-    the assumed film. The metadata state which share of them is answered wrongly without a flag.
+    The errors are measured with the rounded weights that the file contains. Presses outside the working area are
+    simulated on the assumed film. The metadata state the share of these presses to which the model gives a wrong answer
+    without a flag.
 
     Args:
         films: The trained network.
@@ -178,7 +183,7 @@ def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command:
         command: Command that makes this model again, for the card.
 
     Returns:
-        The version folder and the metadata, with the errors on the assumed film.
+        The version folder, and the metadata with the errors on the assumed film.
 
     Raises:
         OutputExists: If the version exists.
@@ -186,7 +191,7 @@ def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command:
     """
     data = films_bytes(films)
     rounded_films = films_from_bytes(data, FILE)
-    errors = evaluate_films(rounded_films, N_FILMS)
+    errors = evaluate_films(rounded_films)
     made_with = {**films.made_with, "films": dict(errors.with_known_film)}
     provenance = Provenance(made_with=made_with, files={FILE: data})
     assumed_film = rounded_films.film(errors.parameters, provenance=provenance)
@@ -195,14 +200,15 @@ def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command:
 
 
 def _outside_presses(films: FilmsModel, parameters: Array) -> OutsidePresses | None:
-    """Simulate one film outside the working area.
+    """Simulate the part of one film outside the working area.
 
     Args:
         films: The network for all films, with the prior of the films and the working area.
         parameters: Parameters of the film, shape (n_parameter,).
 
     Returns:
-        Presses outside the working area; None if this part of the film cannot be simulated.
+        Forward map of the film, from which presses outside the working area are drawn; None if this part of the film
+        cannot be simulated.
     """
     sensor, probe = films.prior.film(parameters)
     whole_film = OutsidePresses.of(sensor, (probe.notation,), films.domain.force_range)
@@ -210,7 +216,7 @@ def _outside_presses(films: FilmsModel, parameters: Array) -> OutsidePresses | N
 
 
 def films_card(films: FilmsModel, errors: FilmsErrors, about: ModelMetadata, fitted: Fitted) -> str:
-    """Return the text of `card.md`.
+    """Return the text of the card, `card.md`, of a model that contains a network for all films.
 
     Args:
         films: The network for all films.
@@ -220,9 +226,10 @@ def films_card(films: FilmsModel, errors: FilmsErrors, about: ModelMetadata, fit
     """
     min_force, max_force = fitted.domain.force_range
     spread = films.prior.spread
-    known_film = errors.with_known_film
-    assumed_film = errors.with_assumed_film
-    exact = about.errors
+    errors_if_known = errors.with_known_film
+    errors_if_assumed = errors.with_assumed_film
+    model_errors = about.errors  # of `model.onnx`, on the film that it assumes
+    force_rms_percent = model_errors["force_rms_percent"]
     electrodes = ", ".join(about.electrodes)
     correlated = ", `contact_correlation` (xy, xF, yF)"
     outside_section = ""
@@ -230,10 +237,12 @@ def films_card(films: FilmsModel, errors: FilmsErrors, about: ModelMetadata, fit
         outside_section = (
             f"{unnoticed_section(about.unnoticed)}These shares hold for the film that `model.onnx` assumes.\n\n"
         )
-    lines = [f"| {text} | {known_film[key]:g} {unit} | {assumed_film[key]:g} {unit} |" for text, key, unit in ROWS]
-    lines += [
-        f"| coverage of the {level} % intervals | {100 * known_film[f'coverage_{level}']:.3g} % | "
-        f"{100 * assumed_film[f'coverage_{level}']:.3g} % |"
+    error_rows = [
+        f"| {text} | {errors_if_known[key]:g} {unit} | {errors_if_assumed[key]:g} {unit} |" for text, key, unit in ROWS
+    ]
+    error_rows += [
+        f"| coverage of the {level} % intervals | {100 * errors_if_known[f'coverage_{level}']:.3g} % | "
+        f"{100 * errors_if_assumed[f'coverage_{level}']:.3g} % |"
         for level in (68, 95)
     ]
     return f"""# {about.name}, version {about.version}
@@ -270,11 +279,11 @@ The forces are log-uniform, the positions are uniform over the working area, and
 
 | error | the film is known | `model.onnx`, the film is unknown |
 |---|---|---|
-{chr(10).join(lines)}
+{chr(10).join(error_rows)}
 
-On the film that it assumes, `model.onnx` has an error of {exact["position_rms_mm"]:g} mm rms (median
-{exact["position_median_mm"]:g} mm) and {exact["force_rms_percent"]:g} % of the force. 1 % of the good presses of that
-film have a misfit above {exact["misfit_p99"]:g}, and 0.1 % above {exact["misfit_p999"]:g}.
+On the film that it assumes, `model.onnx` has an error of {model_errors["position_rms_mm"]:g} mm rms (median
+{model_errors["position_median_mm"]:g} mm) and {force_rms_percent:g} % of the force. 1 % of the good presses of that
+film have a misfit above {model_errors["misfit_p99"]:g}, and 0.1 % above {model_errors["misfit_p999"]:g}.
 
 {outside_section}## Limits
 

@@ -15,8 +15,9 @@ from isocharge.train.training.fitted import Fitted
 Predict = Callable[[Array], tuple[Array, Array, Array]]
 """Function that estimates contacts from charges.
 
-The argument has the shape (n, n_electrode), pC. The results are the contacts (x, y, F), shape (n, 3), mm and N, the
-standard deviations of the contacts, shape (n, 3), and the misfits, shape (n, 1)."""
+The argument contains charges, shape (n, n_electrode), pC. The first result contains contacts (x, y, F), shape (n, 3),
+mm and N. The second result contains the standard deviations of the contacts, shape (n, 3), and the third result
+contains the misfits, shape (n, 1)."""
 
 FALSE_ALARM_RATE = 0.01
 """Fraction of good presses whose misfit exceeds the threshold of the alarm, dimensionless."""
@@ -25,13 +26,13 @@ FORCES_NEAR_1_N = (0.8, 1.25)
 """Smallest and largest force of the presses on which the detection of faults is measured, N."""
 
 N_NOISE_DRAWS = 20
-"""Number of draws of the noise from which percentiles of the misfit are computed."""
+"""Number of times that noise is drawn for each press in order to compute percentiles of the misfit."""
 
 HELD_PRESSES = "measured_presses"
-"""Name of the entry with the number of measured presses. Errors on simulated presses have no such entry."""
+"""Name of the error entry that contains the number of measured presses. Errors on simulated presses do not have it."""
 
 ONLY_SIMULATED = ("position_p99_mm", "force_p99_percent")
-"""Errors that need more presses than a rig usually makes."""
+"""Names of the errors that need more presses than a rig usually makes."""
 
 WITHIN_95_PERCENT = 1.96
 """Half width of the 95 % interval of a Gaussian, in standard deviations."""
@@ -51,7 +52,8 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
         Errors by name. The position errors are in mm, and the force errors are in percent of the force. The coverages
         of the 68 and 95 % intervals are fractions of the coordinates, 0 to 1. Further entries are the misfits that 1 %
         and 0.1 % of the good presses exceed. For simulated presses, the result also contains the errors without noise,
-        and the fractions of faults that cause an alarm. For measured presses, there is also the number of presses.
+        and the fractions of faults that cause an alarm. For measured presses, the result also contains the number of
+        presses.
     """
     if presses is None:
         test = fitted.test
@@ -74,17 +76,17 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
 
 
 def _good_press_misfits(fitted: Fitted, seed: int) -> dict[str, float]:
-    """Compute the misfits that only a few good presses exceed, for a network that is judged by measured presses.
+    """Compute the misfits that only a few good presses exceed, for a network with errors on measured presses.
 
-    Simulated good presses get noise. For measured good presses, the misfits of the cross-validation are used if there
-    are any, and the misfits of the network otherwise.
+    Noise is added to the charges of simulated good presses. For measured good presses, the misfits of the
+    cross-validation are used. If there was no cross-validation, the misfits of the network are used.
 
     Args:
         fitted: The network, with its good presses.
         seed: Seed of the noise.
 
     Returns:
-        Errors by name, as `evaluate` returns them.
+        Misfits by name, as `evaluate` returns them.
     """
     if not fitted.good.measured and isinstance(fitted.noise, NoiseModel):
         return misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)
@@ -99,10 +101,10 @@ def _good_press_misfits(fitted: Fitted, seed: int) -> dict[str, float]:
 
 
 def simulated_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int = 1) -> dict[str, float]:
-    """Measure the errors on simulated presses, with and without noise.
+    """Measure the errors of a network on simulated presses, with and without noise.
 
     Args:
-        predict: The network.
+        predict: Function that computes the answers of the network.
         presses: Presses without noise.
         noise: Noise to add.
         seed: Seed of the noise.
@@ -122,7 +124,7 @@ def simulated_errors(predict: Predict, presses: LabelledPresses, noise: NoiseMod
 
 
 def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]:
-    """Compute the errors of contacts and the coverage of their intervals.
+    """Compute the errors of estimated contacts, and the coverage of the intervals around them.
 
     Args:
         contact: Estimated contacts (x, y, F), shape (n, 3), mm and N.
@@ -134,7 +136,7 @@ def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]
     """
     statistics = asdict(ContactErrorStatistics.of(contact, truth))
     del statistics["presses"]  # the number of presses is not an error
-    deviation = np.abs(contact - truth) / std  # in standard deviations
+    deviation = np.abs(contact - truth) / std  # in reported standard deviations
     errors = {
         **statistics,
         "coverage_68": np.mean(deviation < 1.0),
@@ -147,7 +149,7 @@ def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel,
     """Compute the misfits that only a few good presses exceed, and the fraction of faults that cause an alarm.
 
     Args:
-        predict: The network.
+        predict: Function that computes the answers of the network.
         presses: Presses without noise.
         noise: Noise of the training.
         seed: Seed of the noise.
@@ -165,7 +167,7 @@ def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel,
 
     force = presses.contact[:, 2]
     presses_near_1_N = presses[is_near_1_N(force)]
-    detected_fractions = _detected_faults(predict, presses_near_1_N, noise_of_misfit, threshold, seed + N_NOISE_DRAWS)
+    detected_fractions = _measure_detection(predict, presses_near_1_N, noise_of_misfit, threshold, seed + N_NOISE_DRAWS)
     return {
         "misfit_p99": rounded(threshold),
         "misfit_p999": rounded(np.percentile(all_misfits, 99.9)),
@@ -174,12 +176,16 @@ def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel,
 
 
 def alarm_threshold(good_misfits: Array) -> float:
-    """Compute the misfit that is exceeded by the fraction `FALSE_ALARM_RATE` of good presses."""
+    """Compute the threshold of the alarm, which the misfits of the fraction `FALSE_ALARM_RATE` of good presses exceed.
+
+    Args:
+        good_misfits: Misfits of good presses, array of any shape.
+    """
     return float(np.percentile(good_misfits, 100.0 * (1.0 - FALSE_ALARM_RATE)))
 
 
 def is_near_1_N(force: Array) -> Booleans:
-    """Return which forces, N, are close enough to 1 N to measure the detection of faults; the same shape."""
+    """Return which forces, N, are close enough to 1 N for a measurement of the detection of faults."""
     low, high = FORCES_NEAR_1_N
     return np.asarray((force >= low) & (force <= high))
 
@@ -189,20 +195,20 @@ def rounded(value: float | np.floating) -> float:
     return float(f"{value:.4g}")
 
 
-def _detected_faults(
+def _measure_detection(
     predict: Predict, presses: LabelledPresses, noise: NoiseModel, threshold: float, seed: int
 ) -> Mapping[str, float]:
-    """Compute the fraction of presses with a faulty electrode whose misfit exceeds a threshold.
+    """Compute the fractions of presses with a faulty electrode whose misfits exceed a threshold.
 
     Args:
-        predict: The network.
+        predict: Function that computes the answers of the network.
         presses: Presses without noise.
         noise: Noise to add.
-        threshold: Misfit of the alarm.
+        threshold: Misfit above which there is an alarm.
         seed: Seed of the noise.
 
     Returns:
-        Fractions for a gain that is wrong by 20 % and for a dead electrode; empty if there are no presses.
+        Fractions by name, for a gain that is wrong by 20 % and for a dead electrode; empty if there are no presses.
     """
     if not len(presses):  # for example, if no force is near 1 N
         return {}
@@ -210,9 +216,9 @@ def _detected_faults(
     n_electrode = charge.shape[1]
 
     def detected_fraction(wrong_gain: float) -> float:
-        """Return the fraction of presses that are detected if one electrode has a wrong gain.
+        """Return the fraction of presses that cause an alarm if one electrode has a wrong gain.
 
-        Each electrode has the wrong gain in turn, and the fraction is the mean over the electrodes.
+        Each electrode is given the wrong gain in turn, and the mean of the fractions is returned.
 
         Args:
             wrong_gain: Gain of the faulty electrode, relative to the true gain; 0 for a dead electrode.
@@ -225,8 +231,8 @@ def _detected_faults(
         _, _, misfit = predict(np.concatenate(faulty_charges))
         return float(np.mean(misfit > threshold))
 
-    detected_gain_errors = 0.5 * (detected_fraction(0.8) + detected_fraction(1.2))  # gains too small and too large
+    detected_wrong_gains = 0.5 * (detected_fraction(0.8) + detected_fraction(1.2))  # 20 % too small and too large
     return {
-        "found_gain_20_percent": rounded(detected_gain_errors),
+        "found_gain_20_percent": rounded(detected_wrong_gains),
         "found_dead_electrode": rounded(detected_fraction(0.0)),
     }

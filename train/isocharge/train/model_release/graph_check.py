@@ -14,10 +14,12 @@ from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 
 OutputFunction = Callable[[Array], tuple[Array, ...]]
-"""Function from charges, shape (n, n_electrode), pC, to the outputs of the graph in their order, as float64."""
+"""Function from charges, shape (n, n_electrode), pC, to the outputs of a network in the order of the graph, float64."""
 
 N_GOLDEN = 64
-"""Number of golden vectors of a model: half of them without noise, a quarter with noise, a quarter extreme."""
+"""Number of golden vectors of a model.
+
+Half of the charges belong to presses without noise, a quarter to presses with noise, and a quarter are extreme."""
 
 TOLERANCES = {
     "contact": 1e-5,
@@ -37,8 +39,8 @@ N_COMPARED = 10_000
 EXTREME_CHARGES_pC = (-LARGEST, LOWEST_CHARGE, LARGEST)
 """Charges for which every output must be finite, pC.
 
-`LARGEST` is the largest float32 number. Smaller positive charges than `LOWEST_CHARGE` are set to this value before the
-logarithm, so it gives the smallest logarithm.
+`LARGEST` is the largest float32 number. Charges below `LOWEST_CHARGE` are set to `LOWEST_CHARGE` before their logarithm
+is computed. It therefore gives the smallest logarithm.
 """
 
 EXTREME_SEED = 4
@@ -47,20 +49,20 @@ EXTREME_SEED = 4
 QUANTILE = 0.999
 """Fraction of the presses that must meet the tolerances.
 
-For the other presses, the position depends so strongly on the charges that float32 has too few digits."""
+For the remaining presses, the position can depend so strongly on the charges that float32 has too few digits."""
 
 STD_FACTOR = 100.0
-"""Smallest divisor of the relative difference of a contact, in standard deviations of the contact.
+"""Smallest number by which a difference of a contact is divided, in standard deviations of the contact.
 
-A difference of a thousandth of a standard deviation, which is negligible, is then within the tolerance."""
+A difference of a thousandth of a standard deviation is negligible. With this divisor, it is within the tolerance."""
 
 EXTREME_FACTOR = 10.0
-"""Factor on the tolerances for the remaining presses and for charges that no film produces."""
+"""Factor by which the tolerances are multiplied for the remaining presses, and for charges that no film produces."""
 
 
 def check_graph(
     graph: bytes,
-    exact: OutputFunction,
+    compute_exact: OutputFunction,
     presses: LabelledPresses,
     noise: Noise,
     floors: Sequence[float] = FLOORS["contact"],
@@ -71,7 +73,7 @@ def check_graph(
 
     Args:
         graph: The ONNX file.
-        exact: The outputs of the network in double precision.
+        compute_exact: Function that computes the outputs of the network in double precision.
         presses: Presses of the film.
         noise: Noise of good presses.
         floors: Values of x and y, mm, and of the force, N, below which differences count as absolute differences.
@@ -83,41 +85,45 @@ def check_graph(
         TrainingError: If an output is not finite, or the graph and the network disagree.
     """
     session = open_session(graph, "the exported graph")
-    ordinary, extreme = _golden_charges(exact, presses, noise)
+    ordinary, extreme = _choose_golden_charges(compute_exact, presses, noise)
     _check_finite_outputs(session, n_electrode=presses.charge.shape[1])
-    _compare(session, exact, extreme, floors, tolerance_factor=EXTREME_FACTOR)
-    repeated_rows = np.arange(N_COMPARED) % len(presses)  # after the last press, the first one follows again
+    _compare(session, compute_exact, extreme, floors, tolerance_factor=EXTREME_FACTOR)
+
+    # After the last press, the first press follows again.
+    repeated_rows = np.arange(N_COMPARED) % len(presses)
     noisy = presses[repeated_rows].noisy(noise, seed=3).astype(np.float32)
-    _compare(session, exact, noisy, floors, tolerance_factor=1.0)
+    _compare(session, compute_exact, noisy, floors, tolerance_factor=1.0)
     return np.concatenate([ordinary, extreme])
 
 
-def _golden_charges(exact: OutputFunction, presses: LabelledPresses, noise: Noise) -> tuple[Singles, Singles]:
+def _choose_golden_charges(
+    compute_exact: OutputFunction, presses: LabelledPresses, noise: Noise
+) -> tuple[Singles, Singles]:
     """Choose charges for the golden vectors: three quarters from presses, and one quarter of extreme charges.
 
-    Only presses whose position has a standard deviation below the median are used. At other presses, a small change of
-    a charge may move the position by millimetres. The rounding of float32 numbers would then cause differences between
-    runtimes that exceed the tolerance of the golden vectors.
+    Only the half of the presses with the smaller standard deviations of the position is used. At the other presses, a
+    small change of a charge may move the estimated position by millimetres. The rounding of float32 numbers could then
+    cause differences between runtimes that exceed the tolerance of the golden vectors.
 
     Args:
-        exact: Network in double precision.
+        compute_exact: Function that computes the outputs of the network in double precision.
         presses: Presses without noise.
         noise: Noise that is added to some of the charges.
 
     Returns:
         Charges of presses, shape (n, n_electrode), and extreme charges, shape (m, n_electrode), pC.
     """
-    _, std, *_ = exact(presses.charge)
+    _, std, *_ = compute_exact(presses.charge)
     position_std = std[:, 0] + std[:, 1]  # a measure of the uncertainty of x and y
     well_determined = presses[np.flatnonzero(position_std <= np.median(position_std))]
 
-    # Half of the charges belong to presses without noise, and a quarter to every second of these presses with noise.
+    # Half of the golden vectors are presses without noise. A quarter are every second of these presses, with noise.
     chosen_rows = np.linspace(0, len(well_determined) - 1, N_GOLDEN // 2).astype(int)
     chosen = well_determined[chosen_rows]
     every_second = chosen[np.arange(0, len(chosen), 2)]
     press_charge = np.concatenate([chosen.charge, every_second.noisy(noise, seed=2)])
 
-    # The last quarter has charges from 0.001 to 1000 times those of the presses, zero charges and negative charges.
+    # The last quarter has charges of presses times factors from 0.001 to 1000, zero charges and negative charges.
     factor = np.geomspace(1e-3, 1e3, len(every_second))
     extreme_charge = every_second.charge * factor[:, None]  # one factor for all charges of a press
     extreme_charge[0] = 0.0
@@ -151,33 +157,35 @@ def _check_finite_outputs(session: ort.InferenceSession, n_electrode: int) -> No
 
 def _compare(
     session: ort.InferenceSession,
-    exact: OutputFunction,
+    compute_exact: OutputFunction,
     charge: Singles,
     floors: Sequence[float],
     tolerance_factor: float,
 ) -> None:
     """Check that the graph and the network agree.
 
-    For each output, the difference of a press is its largest difference among the columns. Nearly all presses must have
-    a difference below the tolerance, and all presses a difference below a larger tolerance.
+    For each output, the difference of a press is the largest relative difference among the columns of the output. For
+    nearly all presses (`QUANTILE`), this difference must be within the tolerance. For all presses, the difference must
+    be within a larger tolerance.
 
     Args:
         session: The graph.
-        exact: The outputs of the network in double precision.
+        compute_exact: Function that computes the outputs of the network in double precision.
         charge: Charges, shape (n, n_electrode), pC.
         floors: Values of x and y, mm, and of the force, N, below which differences count as absolute differences.
-        tolerance_factor: Factor on the tolerances.
+        tolerance_factor: Factor by which the tolerance for nearly all presses is multiplied.
 
     Raises:
         TrainingError: If the graph and the network disagree.
     """
-    expected_outputs = exact(charge.astype(float))
+    expected_outputs = compute_exact(charge.astype(float))
     _, expected_std, *_ = expected_outputs
-    contact_floor = np.maximum(floors, STD_FACTOR * expected_std)
+    # A difference is divided by the magnitude of the expected value, or by the smallest divisor if this is larger.
+    smallest_contact_divisor = np.maximum(floors, STD_FACTOR * expected_std)  # shape (n, 3)
     for expected, (name, graph_output) in zip(expected_outputs, run(session, charge).items(), strict=True):
-        # A difference is divided by the magnitude of the expected value, or by the floor if the floor is larger.
-        floor = contact_floor if name in ("contact", "contact_std") else 1.0
-        relative_difference = np.abs(expected - graph_output) / np.maximum(np.abs(expected), floor)
+        smallest_divisor = smallest_contact_divisor if name in ("contact", "contact_std") else 1.0
+        divisor = np.maximum(np.abs(expected), smallest_divisor)
+        relative_difference = np.abs(expected - graph_output) / divisor  # shape (n, number of columns)
         press_difference = relative_difference.max(axis=1)
         quantile = float(np.quantile(press_difference, QUANTILE))
         largest = float(press_difference.max())

@@ -1,4 +1,4 @@
-"""The card of a model of measured presses alone, and the table of errors on measured presses."""
+"""Card of a model that was trained on measured presses alone, and card section with errors on measured presses."""
 
 from collections.abc import Mapping
 
@@ -8,12 +8,12 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.train.model_release.evaluate import HELD_PRESSES
 
 
-def measured_errors(errors: Mapping[str, float], heading_end: str, explanation: str) -> str:
+def measured_errors_section(errors: Mapping[str, float], heading_end: str, explanation: str) -> str:
     """Return the section of a card with the errors on measured presses.
 
     Args:
         errors: Errors of the model by name.
-        heading_end: Words after "measured presses" in the heading.
+        heading_end: Last words of the heading, after "measured presses".
         explanation: Paragraph about the meaning of the figures.
     """
     return f"""## Errors on {errors[HELD_PRESSES]:.0f} measured presses {heading_end}
@@ -68,7 +68,7 @@ was fitted to measured presses alone, without a simulator.
 | probes | {", ".join(metadata.probes)} |
 {noise_rows}
 
-{measured_errors(metadata.errors, "at places that were left out", error_source)}
+{measured_errors_section(metadata.errors, "at places that were left out", error_source)}
 The misfit is the distance, in units of that noise, of the charges from those of the nearest press, with planes through
 its neighbours between presses; a network gives it. 1 % of the presses are farther from those at other places than
 {metadata.errors["misfit_p99"]:g}.

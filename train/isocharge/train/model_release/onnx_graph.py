@@ -1,7 +1,8 @@
 """Writer of the ONNX graph of a network, and reader that recovers the network from such a graph.
 
-The reader takes the constants out of a graph, writes the graph for these constants again, and compares both graphs node
-by node. The writer is therefore the only description of the graph. Graphs that another program wrote are refused.
+The reader extracts the constants of a graph, writes a new graph with these constants, and compares both graphs node by
+node. Therefore, only the writer defines the structure of the graph. The reader refuses graphs that another program
+wrote.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,7 +30,7 @@ from isocharge.train.training.folded_network import (
 )
 
 OPSET = 17
-"""Version of the ONNX operators; runtimes since 2022 support it."""
+"""Version of the ONNX operators, which runtimes since 2022 support."""
 
 IR_VERSION = 8
 """Version of the ONNX file format that belongs to these operators."""
@@ -45,25 +46,29 @@ class GraphBuilder:
     def add(self, operator: str, *inputs: str, to: str = "", **attributes: Any) -> str:
         """Add a node with one result, and return the name of the result.
 
-        If the argument `to` is given, it is the name of the result.
+        Args:
+            operator: ONNX operator of the node.
+            *inputs: Names of the tensors that are the inputs of the node.
+            to: Name of the result; empty for a generated name.
+            **attributes: Attributes of the node.
         """
         result_name = to or f"t{len(self.nodes)}"
         self.add_many(operator, *inputs, to=(result_name,), **attributes)
         return result_name
 
     def add_many(self, operator: str, *inputs: str, to: tuple[str, ...], **attributes: Any) -> tuple[str, ...]:
-        """Add a node with several results and return their names."""
+        """Add a node with several results, whose names are given by `to`, and return these names."""
         self.nodes.append(helper.make_node(operator, list(inputs), list(to), **attributes))
         return to
 
     def constant(self, values: object, dtype: type = np.float32) -> str:
-        """Add a constant tensor and return its name."""
+        """Add a constant tensor, and return its generated name."""
         name = f"c{len(self.constants)}"
         self.constants.append(numpy_helper.from_array(np.array(values, dtype=dtype, order="C"), name))
         return name
 
     def split(self, data: str, widths: Mapping[str, int]) -> tuple[str, ...]:
-        """Split the columns of a tensor into results with the given names and widths."""
+        """Add a node that splits the columns of a tensor into results with the given names and widths."""
         sizes = self.constant(tuple(widths.values()), np.int64)
         return self.add_many("Split", data, sizes, to=tuple(widths), axis=1)
 
@@ -76,8 +81,8 @@ def write_graph(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
         properties: Metadata, which are written into `metadata_props`.
 
     Returns:
-        The ONNX file: input `charge_pC` [n, n_electrode]; outputs `contact` [n, 3], `contact_std` [n, 3],
-        `contact_correlation` [n, 3] if the network gives it, and `misfit` [n, 1], all float32.
+        The ONNX file. Its input is `charge_pC` [n, n_electrode]. Its outputs are `contact` [n, 3], `contact_std` [n,
+        3], `contact_correlation` [n, 3] if the network has correlations, and `misfit` [n, 1]. All tensors are float32.
     """
     model = _whole_model(network)
     helper.set_model_props(model, dict(properties))
@@ -92,7 +97,7 @@ def write_contact_graph(network: FoldedNetwork) -> bytes:
         network: The network.
 
     Returns:
-        The ONNX file: input `charge_pC` [n, n_electrode], output `contact` [n, 3], both float32.
+        The ONNX file, with the input `charge_pC` [n, n_electrode] and the output `contact` [n, 3], both float32.
     """
     build = GraphBuilder()
     answers = _add_answers(build, network)
@@ -106,8 +111,8 @@ def write_contact_graph(network: FoldedNetwork) -> bytes:
 def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     """Return the ONNX model of a network, without metadata.
 
-    The nodes after the network compute the outputs: contact and standard deviations, correlations if the network has
-    them, and misfit. Tensors are represented by their names.
+    The nodes after the perceptron convert its answers into the outputs: the contact, its standard deviations, the
+    correlations if the network has them, and the misfit. In this function, tensors are represented by their names.
 
     Args:
         network: The network.
@@ -121,13 +126,13 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     answers = _add_answers(build, network)
     position, logarithms, *optional_angles, misfit_vector = build.split(answers, widths)
 
-    # The part `contact_std` is itself an output, so it needs no further node.
+    # The second part, `contact_std`, is an output of the graph, so it needs no further node.
     force, _ = build.split(build.add("Exp", logarithms), {"force": 1, "contact_std": 3})
     build.add("Concat", position, force, to="contact", axis=1)
     for angles in optional_angles:  # one tensor, or none if the network has no correlations
         cosines = build.add("Cos", angles)
         build.add("MatMul", cosines, build.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
-    # The length of the misfit vector is the inverse hyperbolic sine of the misfit over its unit.
+    # The length of the misfit vector is asinh(misfit / MISFIT_UNIT).
     compressed_misfit = build.add("ReduceL2", misfit_vector, axes=[1], keepdims=1)
     build.add("Mul", build.add("Sinh", compressed_misfit), build.constant(MISFIT_UNIT), to="misfit")
 
@@ -136,7 +141,7 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
 
 
 def _add_answers(build: GraphBuilder, network: FoldedNetwork) -> str:
-    """Add the features and the perceptron of a network and return the name of the answers."""
+    """Add the nodes of the features and of the perceptron of a network, and return the name of the answers."""
     features = _add_features(build, network.features)
     return _add_perceptron(build, features, network.layers)
 
@@ -144,8 +149,9 @@ def _add_answers(build: GraphBuilder, network: FoldedNetwork) -> str:
 def _add_features(build: GraphBuilder, features: ChargeFeatures) -> str:
     """Add nodes that compute the input features of the charges.
 
-    The features are ln(Q / typical charge), or asinh(Q / typical charge) - mean if charges may be negative. In the
-    second case the limits are different for each electrode, so two nodes replace `Clip`, which needs single limits.
+    The charges Q are limited first. The features are ln(Q / typical charge), or asinh(Q / typical charge) - mean if
+    charges may be negative. If charges may be negative, each electrode has its own limits. In this case, the operators
+    `Max` and `Min` replace the operator `Clip`, which has the same limits for all electrodes.
 
     Args:
         build: Builder of the graph.
@@ -173,7 +179,7 @@ def _add_perceptron(build: GraphBuilder, inputs: str, perceptron: Perceptron[Arr
     Args:
         build: Builder of the graph.
         inputs: Name of the tensor with the inputs.
-        perceptron: The perceptron.
+        perceptron: Weights and biases of the layers, and the activation.
 
     Returns:
         Name of the tensor with the outputs.
@@ -201,7 +207,11 @@ def _make_model(
     """
 
     def declare(widths: Mapping[str, int]) -> list[onnx.ValueInfoProto]:
-        """Return the declarations of float32 tensors [n, width], whose widths are given by the name of the tensor."""
+        """Return the declarations of float32 tensors [n, width].
+
+        Args:
+            widths: Width of each tensor by its name.
+        """
         return [
             helper.make_tensor_value_info(tensor, TensorProto.FLOAT, ["n", width]) for tensor, width in widths.items()
         ]
@@ -212,14 +222,14 @@ def _make_model(
 
 
 def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
-    """Recover the definition of a network from an ONNX file of `write_graph`.
+    """Recover a network from an ONNX file that `write_graph` wrote.
 
     Args:
         onnx_model: The ONNX file.
         where: Name of the file, for error messages.
 
     Returns:
-        The network. The float32 numbers of the file are stored in float64 arrays.
+        The network. Its arrays are float64, and contain the float32 numbers of the file.
 
     Raises:
         ModelError: If the file is damaged or was not written by `write_graph`.
@@ -234,8 +244,8 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
     if versions != {"": OPSET}:
         _refuse(where, f"expected ONNX operators of version {OPSET} alone, got {versions}")
 
-    # The graph that is written for the recovered network must have the same nodes as the file. The nodes are compared
-    # before their number, because the first different node is the more helpful message.
+    # A graph that is written for the recovered network must have the same nodes as the file. The nodes are compared
+    # before their numbers, because a message about the first different node is more helpful.
     network = _network_of(model.graph, where)
     expected_nodes = list(_plain_nodes(_whole_model(network).graph))
     given_nodes = list(_plain_nodes(model.graph))
@@ -248,7 +258,7 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
 
 
 def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
-    """Return the network that a graph evaluates, if the graph was written by `write_graph`.
+    """Return the network that a graph of `write_graph` evaluates.
 
     Args:
         graph: The graph.
@@ -260,10 +270,10 @@ def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
     operators = [node.op_type for node in graph.node]
     activation = _activation_of(operators, where)
     constants = _constants_in_order(graph, where)
-    is_signed = operators[:1] == ["Max"]  # the first node limits charges of both signs
+    is_signed = operators[:1] == ["Max"]  # the first node of a graph for charges of both signs
     n_hidden = operators.count(activation.onnx_operator)  # each hidden layer has one activation
-    # `write_graph` uses the constants of the features first, then those of the hidden layers, the skip layer, and the
-    # bias and the weights of the last layer.
+    # The order of the next statements is the order in which `write_graph` uses the constants: those of the features,
+    # those of the hidden layers, the weights of the skip layer, and the bias and the weights of the last layer.
     try:
         features = _take_features(constants, is_signed=is_signed)
         hidden = [Layer(weight=next(constants), bias=next(constants)) for _ in range(n_hidden)]
@@ -284,7 +294,7 @@ def _activation_of(operators: Sequence[str], where: str) -> Activation:
         where: Beginning of the error message.
     """
     activation_of_operator = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
-    # The operator `Gemm` is a linear layer. Without any, the search begins at the end and finds no activation.
+    # The operator `Gemm` is a linear layer. In a graph without linear layers, no operator follows the first one.
     first_layer = operators.index("Gemm") if "Gemm" in operators else len(operators)
     following = operators[first_layer + 1 : first_layer + 2]  # one operator, or none at the end of the graph
     if not following or following[0] not in activation_of_operator:
@@ -294,7 +304,7 @@ def _activation_of(operators: Sequence[str], where: str) -> Activation:
 
 
 def _constants_in_order(graph: onnx.GraphProto, where: str) -> Iterator[Array]:
-    """Yield the constants of a graph in the order in which the nodes use them.
+    """Yield the values of the constants of a graph in the order in which the nodes use them.
 
     Args:
         graph: The graph.
@@ -303,7 +313,7 @@ def _constants_in_order(graph: onnx.GraphProto, where: str) -> Iterator[Array]:
     constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
     for node in graph.node:
         for name in node.input:
-            if name not in constants:  # the result of another node, or the charges
+            if name not in constants:  # the input is the result of another node, or the charges
                 continue
             if not np.isfinite(constants[name]).all():
                 _refuse(where, f"node {node.op_type} {list(node.output)}: expected finite constants")
@@ -311,7 +321,7 @@ def _constants_in_order(graph: onnx.GraphProto, where: str) -> Iterator[Array]:
 
 
 def _take_features(constants: Iterator[Array], *, is_signed: bool) -> ChargeFeatures:
-    """Take the constants of the features, which are the first ones of a graph, and return the features.
+    """Take the constants of the features, which are the first constants of a graph, and return the features.
 
     Args:
         constants: Iterator over the constants, which is advanced.
@@ -325,7 +335,7 @@ def _take_features(constants: Iterator[Array], *, is_signed: bool) -> ChargeFeat
 
 
 def _check_shapes(features: ChargeFeatures, perceptron: Perceptron[Array], where: str) -> None:
-    """Raise an error if the shapes of constants do not fit each other.
+    """Raise an error if the shapes of the constants of a network do not fit each other.
 
     Args:
         features: Limits, typical charges and means of the features.
@@ -354,8 +364,8 @@ def _check_shapes(features: ChargeFeatures, perceptron: Perceptron[Array], where
 def _check_feature_shapes(features: ChargeFeatures, where: str) -> None:
     """Raise an error if the limits, the typical charges and the means of features have wrong shapes.
 
-    The limits of logarithmic features are single numbers. The limits for charges of both signs have a value for each
-    electrode, and there are also means.
+    The limits of logarithmic features are single numbers. Features of charges of both signs have limits and a mean for
+    each electrode.
 
     Args:
         features: The features.
@@ -379,13 +389,15 @@ def _check_feature_shapes(features: ChargeFeatures, where: str) -> None:
 
 @dataclass(frozen=True)
 class _PlainNode:
-    """A node without arbitrary names. Two nodes are equal if they compute the same from the same inputs.
+    """Description of a node that does not depend on arbitrary names.
+
+    Two descriptions are equal if their nodes compute the same results from the same inputs.
 
     Attributes:
         operator: The operator.
         inputs: Description of each input: the name of an input of the graph, the node that computes the tensor, or the
             values of a constant.
-        outputs: Name of each output of the graph, or None for other results.
+        outputs: Name of each result of the node that is an output of the graph; None for each other result.
         attributes: Attributes by name.
     """
 
@@ -401,28 +413,28 @@ class _PlainNode:
 
 
 def _plain_nodes(graph: onnx.GraphProto) -> Iterator[_PlainNode]:
-    """Yield the nodes of a graph in a form that can be compared with the nodes of another graph.
+    """Yield descriptions of the nodes of a graph, which can be compared with those of another graph.
 
-    The names of tensors inside a graph are arbitrary. A name is replaced by the number of the node that computes the
-    tensor, and a constant is replaced by its values.
+    The names of the tensors inside a graph are arbitrary. The name of a tensor is replaced by the number of the node
+    that computes it, and the name of a constant is replaced by the values of the constant.
 
     Args:
         graph: The graph.
     """
-    # Descriptions of the tensors that nodes can have as inputs, by the name of the tensor
-    plain_inputs: dict[str, object] = {tensor.name: tensor.name for tensor in graph.input}
+    # Descriptions of all tensors that can be inputs of the next node, by the name of the tensor
+    description_of_tensor: dict[str, object] = {tensor.name: tensor.name for tensor in graph.input}
     for tensor in graph.initializer:
-        plain_inputs[tensor.name] = _plain_constant(numpy_helper.to_array(tensor))
+        description_of_tensor[tensor.name] = _plain_constant(numpy_helper.to_array(tensor))
     graph_outputs = {tensor.name for tensor in graph.output}
     for node_index, node in enumerate(graph.node):
         yield _PlainNode(
             operator=node.op_type,
-            inputs=tuple(plain_inputs.get(name) for name in node.input),
+            inputs=tuple(description_of_tensor.get(name) for name in node.input),
             outputs=tuple(name if name in graph_outputs else None for name in node.output),
             attributes={attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute},
         )
         for output_index, name in enumerate(node.output):
-            plain_inputs[name] = f"result {output_index} of node {node_index}"
+            description_of_tensor[name] = f"result {output_index} of node {node_index}"
 
 
 def _plain_constant(values: NDArray[Any]) -> tuple[object, ...]:
@@ -431,5 +443,5 @@ def _plain_constant(values: NDArray[Any]) -> tuple[object, ...]:
 
 
 def _refuse(where: str, reason: str) -> NoReturn:
-    """Raise the error for a graph that was not written by `write_graph`."""
+    """Raise a ModelError about a graph that was not written by `write_graph`."""
     raise ModelError(f"{where}: {reason}; only models of isocharge can be read")

@@ -28,7 +28,7 @@ from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
 from isocharge.train.model_release.evaluate import evaluate
 from isocharge.train.model_release.graph_check import check_graph
-from isocharge.train.model_release.measured_card import measured_card, measured_errors
+from isocharge.train.model_release.measured_card import measured_card, measured_errors_section
 from isocharge.train.model_release.onnx_graph import write_graph
 from isocharge.train.model_release.unnoticed import unnoticed_presses, unnoticed_section
 from isocharge.train.training.fitted import Fitted
@@ -37,7 +37,7 @@ N_CORNERS = 64
 """Number of corners of the polygon that represents a round working area."""
 
 CORNER_TOLERANCE_mm = 2e-3
-"""Largest distance of a corner from its ideal place for which a polygon represents a round working area, mm.
+"""Largest difference between a coordinate of a corner and that of a regular polygon for a round working area, mm.
 
 The corners in the metadata are rounded to 0.0001 mm.
 """
@@ -89,7 +89,7 @@ HUB_METRICS = {
     "force_median_percent": "force error, median, %",
     "force_rms_percent": "force error, rms, %",
 }
-"""Measured errors that model hubs list, and their names on the hubs."""
+"""Names on model hubs of the measured errors that the hubs list, by the name of the error in the metadata."""
 
 
 def hub_block(metadata: ModelMetadata) -> str:
@@ -99,6 +99,9 @@ def hub_block(metadata: ModelMetadata) -> str:
 
     Source: https://huggingface.co/docs/hub/model-cards. The block names no licence, because the publisher of a model
     chooses it.
+
+    Args:
+        metadata: Metadata of the model, with its errors.
     """
     metrics = "".join(
         f"""
@@ -131,8 +134,8 @@ model-index:
 def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     """Return the text of `card.md`.
 
-    Models of measured presses alone have a card of their own. In all other cards, the sections about the errors and the
-    limits depend on whether the test presses were measured or simulated.
+    For a model of measured presses alone, `measured_card` writes the card. In all other cards, the sections about the
+    errors and the limits depend on whether the test presses were measured or simulated.
 
     Args:
         metadata: Metadata of the model.
@@ -141,7 +144,7 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     if isinstance(fitted.sensor, MeasuredSensor):
         return measured_card(metadata)
     if fitted.test.measured:
-        measured_section = measured_errors(metadata.errors, "that were not used in the training", NO_NOISE)
+        measured_section = measured_errors_section(metadata.errors, "that were not used in the training", NO_NOISE)
         errors_text = fitted.provenance.card + measured_section
         truth_text = MEASURED_TRUTH
     else:
@@ -163,7 +166,7 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
 
 
 def yield_text(metadata: ModelMetadata) -> str:
-    """Return the text about yielding for the row of the forces.
+    """Return the text about yielding for the row of the forces in a card.
 
     The text is empty if the film does not yield within the range of forces.
     """
@@ -176,7 +179,7 @@ def yield_text(metadata: ModelMetadata) -> str:
 
 
 def _interface_section(metadata: ModelMetadata, fitted: Fitted) -> str:
-    """Return the section of the card with inputs, outputs and ranges.
+    """Return the section of the card with the inputs, the outputs and the ranges of validity.
 
     Args:
         metadata: Metadata of the model.
@@ -282,7 +285,7 @@ def release(
 ) -> Release:
     """Write a trained network as a version of a model.
 
-    The errors of the network are measured first, and the written graph is compared with the network.
+    The errors of the network are measured first, and the exported graph is compared with the network.
 
     Args:
         fitted: The network.
@@ -375,7 +378,13 @@ def _yield_force(fitted: Fitted) -> float | None:
 
 
 def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
-    """Return the smallest regular polygon that contains a disk about the origin: corners (x, y), mm."""
+    """Return the corners (x, y), mm, of the smallest regular polygon with `N_CORNERS` corners around a disk.
+
+    The centre of the disk is the origin.
+
+    Args:
+        radius: Radius of the disk, mm.
+    """
     angle = 2.0 * np.pi * np.arange(N_CORNERS) / N_CORNERS
     corner_radius = radius / np.cos(np.pi / N_CORNERS)  # the sides touch the disk
     corners: Array = np.round(corner_radius * np.stack([np.cos(angle), np.sin(angle)], axis=1), 4)
@@ -383,18 +392,18 @@ def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
 
 
 def model_domain(about: ModelMetadata) -> Domain:
-    """Read the contacts for which a model was trained from the metadata of the model.
+    """Return the domain of the contacts for which a model was trained, which is read from its metadata.
 
-    In models of simulated presses, the working area is the polygon of a disk about the origin. The domain is then the
-    largest disk in the polygon, rounded to 0.001 mm. For every other working area, the domain is a `PressedArea` with
-    the same corners.
+    In models of simulated presses, the working area is the polygon of a disk about the origin. For such a polygon, the
+    domain is the largest disk in the polygon, with a radius rounded to 0.001 mm. For every other working area, the
+    domain is a `PressedArea` with the same corners.
 
     Args:
         about: Metadata of the model.
     """
     corners = np.array(about.working_area_mm)
 
-    # Distance of each edge from the origin: the cross product of edge and corner over the length of the edge
+    # The distance of an edge from the origin is the cross product of the edge and a corner over the edge's length.
     edges = np.roll(corners, -1, axis=0) - corners
     cross_product = edges[:, 0] * corners[:, 1] - edges[:, 1] * corners[:, 0]
     edge_distance = np.abs(cross_product) / np.hypot(edges[:, 0], edges[:, 1])

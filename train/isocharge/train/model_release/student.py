@@ -1,8 +1,9 @@
-"""Training data and settings of a student: a small network that learns the answers of a model.
+"""Training data and settings of a student, which is a small network that learns the answers of a model.
 
 A student has the inputs and outputs of the model and about 5,000 weights and biases, so it fits into the flash memory
-of a microcontroller. The student learns the contacts and standard deviations that the model estimates. The misfits of
-the student and of the model are both trained with distances that were computed exactly.
+of a microcontroller. The student learns the contacts and standard deviations that the model estimates. The misfit of
+the student is not learned from the model, but from exact distances of charges, on which the misfit of the model was
+trained, too.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +28,7 @@ def student_config(weights: Literal["float32", "int8"] = "float32") -> FitConfig
     """Return the settings of a student.
 
     Args:
-        weights: Form of the weights between hidden layers.
+        weights: Number type of the weights between hidden layers.
     """
     return FitConfig(
         network=NetworkConfig(hidden=(30, 30), misfit_hidden=(34, 34), weights=weights),
@@ -39,7 +40,7 @@ def student_config(weights: Literal["float32", "int8"] = "float32") -> FitConfig
 class StudentCase:
     """Sensor, probes and contacts of a model.
 
-    These values define a simulation of presses that are distributed as in the training of the model.
+    With these values, presses can be simulated that have the same distribution as in the training of the model.
 
     Attributes:
         sensor: Sensor of the model.
@@ -68,14 +69,14 @@ class StudentCase:
 
 
 def student_data(model: Path, dataset: Dataset) -> TrainingData:
-    """Return the training data of a student, which are presses and the contacts that a model estimates for them.
+    """Return the training data of a student, which are presses and the answers of a model to their charges.
 
     Args:
         model: Version folder of the model.
-        dataset: Simulated presses on the model's sensor without noise, such as a sweep over its `StudentCase`.
+        dataset: Simulated presses without noise on the sensor of the model, such as a sweep over its `StudentCase`.
 
     Raises:
-        DatasetError: If the dataset is of another sensor, or a network cannot be trained on it.
+        DatasetError: If the presses were made on another sensor, or if a network cannot be trained on the dataset.
     """
     predictor = Predictor(model)
     about = predictor.metadata
@@ -85,12 +86,12 @@ def student_data(model: Path, dataset: Dataset) -> TrainingData:
             f"{dataset.sensor.name!r}; simulate them on the model's own sensor"
         )
 
-    def answer(charge: Array) -> tuple[Array, Array]:
-        """Estimate the contacts (x, y, F) and their standard deviations, each of shape (n, 3), mm and N."""
+    def estimate(charge: Array) -> tuple[Array, Array]:
+        """Return the contacts (x, y, F) that the model estimates and their standard deviations, (n, 3), mm and N."""
         answers = predictor.predict_batch(charge)
         contact = np.stack([answers.x_mm, answers.y_mm, answers.force_N], axis=1)
         std = np.stack([answers.x_std_mm, answers.y_std_mm, answers.force_std_N], axis=1)
         return contact.astype(float), std.astype(float)
 
     checksum = sha256_of((model / "model.onnx").read_bytes())
-    return replace(TrainingData.of(dataset), teacher=Teacher(about.label, checksum, answer))
+    return replace(TrainingData.of(dataset), teacher=Teacher(about.label, checksum, estimate))

@@ -1,4 +1,4 @@
-"""Measured fraction of presses outside the working area for which a model gives a wrong answer without a flag."""
+"""Measurement of the share of presses outside the working area to which a model gives a wrong answer without a flag."""
 
 import math
 from collections.abc import Iterator
@@ -25,20 +25,21 @@ CARD_WIDTH = 120
 """Largest length of a line of text in a card, characters."""
 
 MIN_NAMED_SHARE = 0.005
-"""Smallest share of unnoticed presses for which a card contains a table."""
+"""Smallest total share of wrong answers without a flag for which a card contains a table."""
 
 
 def unnoticed_presses(fitted: Fitted, about: ModelMetadata) -> UnnoticedPresses | None:
-    """Measure how many answers are wrong and carry no flag for simulated presses outside the working area.
+    """Measure how often the answer to a simulated press outside the working area is wrong and carries no flag.
 
     An answer is wrong if one of its values differs from the truth by more than `WRONG_STDS` standard deviations.
 
     Args:
         fitted: The network.
-        about: Metadata, which contain the limits of the flags.
+        about: Metadata, which contain the thresholds of the flags.
 
     Returns:
-        The shares by place; None if the film outside the working area was not simulated.
+        The shares of wrong answers without a flag, by place; None if the film outside the working area was not
+        simulated.
     """
     outside = fitted.outside
     if outside is None:
@@ -70,13 +71,15 @@ def is_flagged(about: ModelMetadata, contact: Array, std: Array, misfit: Array) 
 
 
 def unnoticed_section(unnoticed: UnnoticedPresses | None) -> str:
-    """Return the section of a card about presses outside the working area; empty if they were not measured.
+    """Return the section of a card about presses outside the working area.
 
     The shares of wrong answers without a flag are listed by the distance from the centre, unless the total share is
-    very small. Neighbouring rings are joined, so that the table has at most `MAX_CARD_ROWS` rows.
+    very small. The table has at most `MAX_CARD_ROWS` rows, because neighbouring rings are joined. The section is empty
+    if the shares were not measured.
 
     Args:
-        unnoticed: Shares of the presses that are answered wrongly without a flag; None if they were not measured.
+        unnoticed: Shares of the presses to which the model gives a wrong answer without a flag; None if the shares were
+            not measured.
     """
     if unnoticed is None:
         return ""
@@ -90,19 +93,19 @@ def unnoticed_section(unnoticed: UnnoticedPresses | None) -> str:
 
 
 def _ring_rows(unnoticed: UnnoticedPresses) -> Iterator[str]:
-    """Yield the rows of the table of distances from the centre, each with the share of several neighbouring rings.
+    """Yield the rows of the table in a card, each with a range of distances and the share of the rings in this range.
 
     Args:
-        unnoticed: Shares of the presses that are answered wrongly without a flag.
+        unnoticed: Shares of the presses to which the model gives a wrong answer without a flag.
     """
     edges = unnoticed.ring_edges_mm
-    ring_areas = np.diff(edges**2)  # in units of pi
+    ring_areas = np.diff(edges**2)  # divided by pi, in mm^2
     ring_count = len(ring_areas)
     rings_per_row = math.ceil(ring_count / MAX_CARD_ROWS)
     for first_ring in range(0, ring_count, rings_per_row):
         end_ring = min(first_ring + rings_per_row, ring_count)
         rings = slice(first_ring, end_ring)
-        # A ring counts in proportion to its area.
+        # The share of each ring is weighted by the area of the ring.
         row_share = np.average(unnoticed.ring_shares[rings], weights=ring_areas[rings])
         distances = f"{edges[first_ring]:.3g} to {edges[end_ring]:.3g} mm"
         yield f"| {distances} | {percent_text(float(row_share))} |\n"

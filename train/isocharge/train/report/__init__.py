@@ -1,7 +1,7 @@
-"""The report on speed against error. Every method is tested on the same presses and compared with theoretical limits.
+"""Report that compares the speed and the error of methods, which are all tested on the same presses.
 
 Example:
-    The function `write_report` needs a dataset and the released model of its sensor.
+    The function `write_report` needs datasets, each with the folder of the released model of its sensor.
 
     from isocharge.train.report import write_report
 

@@ -1,7 +1,7 @@
-"""Writer of a report, which evaluates each dataset and writes the JSON record, the pictures and the page.
+"""Writer of a report, which evaluates each dataset, and writes the JSON record, the pictures and the page.
 
-The folder of the report appears when the report is complete. A stopped report keeps its completed solves and limits, so
-that the same call continues it.
+The folder of the report appears when the report is complete. A stopped report keeps its completed solves and limits,
+and the same call of `write_report` continues the report.
 """
 
 import json
@@ -35,7 +35,7 @@ def write_report(
     command: str = "",
     fresh: bool = False,
 ) -> dict[str, Any]:
-    """Measure every method on every dataset and write `report.md`, `report.json` and the pictures.
+    """Measure every method on every dataset, and write `report.md`, `report.json` and the pictures.
 
     Methods are fitted to the presses of a dataset and tested on other presses. If the dataset was measured, a fifth of
     its presses is held out for the test. If the dataset was simulated, the test presses are simulated as well. A
@@ -48,7 +48,7 @@ def write_report(
         settings: Settings of the report; None for the settings of a full report.
         students: Version folders of small models. Each of them is compared on the datasets of its sensor.
         command: Command that repeats the report, for the page; empty if there is none.
-        fresh: Whether to delete the results of a stopped report and begin again.
+        fresh: Whether to delete the results of a stopped report, and to begin again.
 
     Returns:
         The content of `report.json`.
@@ -90,8 +90,8 @@ def write_report(
 def _file_stems(sensor_names: Sequence[str]) -> list[str]:
     """Return, for each dataset, the text with which the file names of its pictures begin.
 
-    This text is the name of the sensor. If several datasets have the same sensor, the number of the dataset is
-    appended, counted from 1.
+    The text is the name of the sensor. If several datasets have the same sensor, the number of the dataset, counted
+    from 1, is appended to the name.
 
     Args:
         sensor_names: Name of the sensor of each dataset.

@@ -1,8 +1,9 @@
-"""Settings of a report, the test presses of a dataset, and the theoretical limits of the error on these presses.
+"""Settings of a report, test presses of a dataset, and theoretical limits of the error on these presses.
 
-The test charges come from solves of the film that are not part of the training data. The forward map of the test covers
-a slightly larger range of distances and forces than the forward map of the dataset. The nodes of both maps therefore
-lie at different distances and forces. The theoretical limits are the Bayes limit and the Cramér-Rao limit.
+The test charges are computed from solutions of the film that are not part of the training data. The forward map of the
+test covers a slightly larger range of distances and forces than the forward map of the dataset. The nodes of the two
+maps therefore lie at different distances and forces. The theoretical limits are the Bayes limit and the Cramér-Rao
+limit.
 """
 
 from concurrent.futures import Executor
@@ -49,13 +50,16 @@ class Settings:
         learn_from: Largest number of presses of the dataset that is used.
         sizes: Widths of the hidden layers of each network that is trained for the comparison.
         steps: Number of optimiser steps of these networks.
-        seconds: Time for which the single predictions of a method are timed, and again for its batches, s.
+        seconds: Duration for which single predictions of a method are timed, s. Its predictions of batches are timed
+            for the same duration.
         batch: Number of presses in a batch.
-        draws: Number of noise draws on the test presses, for the error maps and the coverage of the released model.
+        draws: Number of times that noise is drawn for the test presses, for the error maps and the coverage of the
+            released model.
         limited: Number of test presses for which the Bayes limit is computed.
         accuracy: Relative accuracy of the charges in the solves of the film.
         shapes: Probes for which the models were not trained, in the notation of `parse_probe`.
-        mismatch_cases: Whether the methods are also tested on a film with another pretension, which has to be solved.
+        mismatch_cases: Whether the methods are also tested on a film with another pretension. This film has to be
+            solved.
         seed: Seed of all random numbers.
         quick: Whether the methods are fitted with reduced effort.
     """
@@ -93,7 +97,7 @@ QUICK = Settings(
 """Settings for a trial run, which takes less than a minute. Its results are not meaningful."""
 
 TEST_RANGE_FACTOR = 1.03
-"""Factor by which the forward map of the test exceeds the distances and forces of the dataset."""
+"""Factor by which the ranges of the forward map of the test exceed those of the dataset, for distance and force."""
 
 TEST_PRESSES_SEED = 7919
 """Seed of the positions and forces of the test presses, relative to the seed of the case."""
@@ -101,7 +105,7 @@ TEST_PRESSES_SEED = 7919
 
 @dataclass(frozen=True)
 class EvaluationCase:
-    """Conditions under which all methods are evaluated, taken from a dataset.
+    """Conditions under which all methods are evaluated, which are those of a dataset.
 
     Attributes:
         sensor: The sensor of the dataset.
@@ -127,7 +131,7 @@ class EvaluationCase:
 
         Args:
             dataset: The dataset with its sensor, its presses and its manifest.
-            max_presses: Largest number of test presses; it is rounded down to a multiple of the number of probes.
+            max_presses: Largest number of test presses. It is rounded down to a multiple of the number of probes.
             seed: Seed of the test presses and of the noise.
 
         Raises:
@@ -139,7 +143,7 @@ class EvaluationCase:
         return cls(dataset.sensor, probes, domain_of(dataset), is_rotated, noise, seed, press_count)
 
     def test_sweep(self, range_factor: float = 1.0) -> Sweep:
-        """Return the sweep of the test presses, distributed as in the dataset, but with another seed.
+        """Return the sweep of the test presses, which are distributed as in the dataset, but drawn with another seed.
 
         Args:
             range_factor: Factor by which the largest distance and the largest force are multiplied, and by which the
@@ -161,10 +165,10 @@ class EvaluationCase:
         accuracy: float = ACCURACY,
         executor: Executor | None = None,
     ) -> tuple[ForwardMap, ...]:
-        """Solve the film and return the forward map of the sensor for each probe.
+        """Solve the film, and return the forward map of the sensor for each probe.
 
         Args:
-            range_factor: Factor by which the maps exceed the distances and forces of the dataset.
+            range_factor: Factor by which the ranges of distances and forces of the maps exceed those of the dataset.
             accuracy: Relative accuracy of the charges.
             executor: Executor of the solves; None to solve in this process.
         """
@@ -175,8 +179,8 @@ class EvaluationCase:
 def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
     """Return the probes of a dataset, and whether the presses of a probe have several orientations.
 
-    A probe that pressed at a single angle is returned with this rotation. The angles of an axisymmetric probe are not
-    counted, because they have no effect.
+    If a probe pressed at a single angle, it is returned with this rotation. The angles of an axisymmetric probe are
+    ignored, because they have no effect.
 
     Args:
         samples: The presses of the dataset, each with the notation of its probe and its orientation.
@@ -234,11 +238,11 @@ class ErrorBounds:
     """Theoretical limits of the error on the test presses.
 
     Attributes:
-        posterior_mean: Posterior means (x, y, F) of the first m test presses with noise, shape (m, 3), mm and N. Their
-            error is the Bayes limit. None if there are several probes or random rotations, because the posterior would
-            then have to include the unknown probe.
-        cramer_rao: Cramér-Rao limit of each test press, for unbiased estimators. With several probes it is the limit
-            for the first probe.
+        posterior_mean: Posterior means (x, y, F) of the first m test presses with noise, shape (m, 3), mm and N. The
+            error of these means is the Bayes limit. None if there are several probes or random rotations, because the
+            posterior would then have to include the unknown probe.
+        cramer_rao: Cramér-Rao limit of each test press, for unbiased estimators. If there are several probes, it is the
+            limit for the first probe.
     """
 
     posterior_mean: Array | None

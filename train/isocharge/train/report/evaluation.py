@@ -1,4 +1,4 @@
-"""Evaluation of a released model and all other methods on one dataset."""
+"""Evaluation of a released model and of all other methods on one dataset."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -35,7 +35,7 @@ from isocharge.train.report.press_selection import measured_presses_for, select_
 from isocharge.train.training.source import TrainingData
 
 STUDIED_METHODS = (GAUSS_NEWTON, POLYNOMIAL, TABLE, BOOSTING, LINEAR_BAND)
-"""Methods that are studied in more detail, beside the released model."""
+"""Names of the methods that are studied in more detail, in addition to the released model."""
 
 TEST_NOISE_SEED = 4242
 """Seed of the noise on the test presses, relative to the seed of the case."""
@@ -44,15 +44,15 @@ MIN_TRAINING_PRESSES = 30
 """Smallest number of measured presses that must remain for fitting after the test presses are held out."""
 
 PICTURE_FORMATS = ("png", "svg")
-"""File formats of each picture. The page shows the first one."""
+"""File formats in which each picture is saved. The page shows the file in the first format."""
 
 DrawPicture = Callable[[], Figure]
-"""Function that draws a picture."""
+"""Function without arguments that draws a picture."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """Results of one dataset.
+    """Results of the evaluation on one dataset.
 
     Attributes:
         content: Entries of the dataset in `report.json`, except the names of the pictures. The methods are
@@ -64,7 +64,7 @@ class Section:
     drawings: dict[str, DrawPicture]
 
     def save_pictures(self, folder: Path, file_stem: str) -> dict[str, list[str]]:
-        """Draw and save all pictures.
+        """Draw all pictures of the section, and save them.
 
         Args:
             folder: Folder of the pictures.
@@ -85,7 +85,7 @@ class Section:
 
 @dataclass(frozen=True)
 class DatasetEvaluation:
-    """One dataset, prepared for the evaluation of its released model and all other methods.
+    """Dataset that is prepared for the evaluation of its released model and of all other methods.
 
     Attributes:
         dataset: The presses for fitting and validation.
@@ -109,7 +109,7 @@ class DatasetEvaluation:
     def prepare(
         cls, dataset: Dataset, model_folder: Path, students: Sequence[Path], settings: Settings
     ) -> "DatasetEvaluation":
-        """Select the presses on which the model can be evaluated, and split them.
+        """Select the presses of a dataset on which the released model can be evaluated, and split them into parts.
 
         Args:
             dataset: The dataset.
@@ -150,12 +150,12 @@ class DatasetEvaluation:
         return cls(fitting_dataset, ReleasedModel(model_folder), own_students, task, case, settings, held_out_presses)
 
     def identity(self) -> dict[str, Any]:
-        """Return the checksum of the dataset and the folders of the models, which identify the inputs."""
+        """Return the checksum of the dataset and the folders of the models, by which a stopped report is recognised."""
         folders = [self.released.folder, *self.students]
         return {"dataset_sha256": self.dataset.sha256, "models": [str(folder) for folder in folders]}
 
     def measure(self, executor: Executor) -> Section:
-        """Fit and measure all methods, and add a plot of the error against each cost of the methods.
+        """Fit all methods, measure their errors and costs, and prepare the plots of the error against each cost.
 
         Args:
             executor: Executor of the solves and of the integrals of the Bayes limit.
@@ -218,9 +218,14 @@ class DatasetEvaluation:
         return Section(content, _study_drawings(content, case, draws))
 
     def _test_maps(self, forward_maps: tuple[ForwardMap, ...], executor: Executor) -> tuple[ForwardMap, ...]:
-        """Return the forward maps for the test presses.
+        """Return the forward maps from which the charges of the test presses are computed.
 
-        A quick report uses the maps that are passed to this method. Otherwise, the maps are solved separately.
+        A quick report uses the given maps. For a full report, the film is solved again, with slightly larger ranges of
+        distances and forces.
+
+        Args:
+            forward_maps: Forward maps with which the theoretical limits are computed.
+            executor: Executor of the solves.
         """
         if self.settings.quick:
             return forward_maps
@@ -229,9 +234,9 @@ class DatasetEvaluation:
     def _errors_by_force(
         self, fitted_by_name: Mapping[str, FittedMethod], limits: ErrorBounds, test: LabelledPresses
     ) -> dict[str, Any]:
-        """Compute the position errors in bins of the force, for the limits and for some of the methods.
+        """Compute the position errors in bins of the force, for the theoretical limits and for some methods.
 
-        These methods are the released model and the methods of `STUDIED_METHODS`. The Bayes limit is left out if it was
+        The methods are the released model and the methods of `STUDIED_METHODS`. The Bayes limit is left out if it was
         not computed.
 
         Args:
@@ -256,7 +261,17 @@ class DatasetEvaluation:
         threshold: float,
         executor: Executor,
     ) -> list[dict[str, Any]]:
-        """Measure the errors of the released model and of the studied methods for all mismatches."""
+        """Measure the errors of the released model and of the studied methods for all mismatches.
+
+        Args:
+            fitted_by_name: Fitted methods by name.
+            clean: The test presses without noise.
+            threshold: Misfit above which the released model gives an alarm, in standard deviations of the noise.
+            executor: Executor of the solves.
+
+        Returns:
+            The results of `studies.measure_mismatch`, one for each mismatch.
+        """
         methods = [fitted_by_name[name].method for name in STUDIED_METHODS]
         return [
             studies.measure_mismatch(mismatch, RELEASED, self.released, methods, threshold)

@@ -1,8 +1,8 @@
-"""Figures of merit of the compared methods: errors, costs, Pareto fronts, and the comparison with the released model.
+"""Figures of merit of the compared methods: errors, costs, Pareto fronts, and a comparison with the released model.
 
 Each method has one error, which is the root-mean-square position error. Each method has three costs: the time of one
 prediction, the throughput of batches, and the memory. A method is on the Pareto front of a cost unless another method
-is better in error or cost, and at least as good in the other.
+is better in one of error and cost, and at least as good in the other.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,8 @@ def round_significant(value: float | None, digits: int = 4) -> float | None:
 class ContactErrors:
     """Errors of estimated contacts over the presses for which a method returned an estimate.
 
-    A figure is None if the method returned no estimate at all. The names of the attributes are keys of `report.json`.
+    A number is None if the method returned no estimate for any press. The names of the attributes are keys of
+    `report.json`.
 
     Attributes:
         position_rms_mm: Root mean square of the distance from the true position, mm.
@@ -88,7 +89,7 @@ class ContactErrors:
 
 
 Cost = Literal["latency", "throughput", "memory"]
-"""Name of a cost of a method. For each cost the report has a plot of the error against the cost."""
+"""Name of a cost of a method. The report has a plot of the error against each cost."""
 
 COST_SIGNS: dict[Cost, float] = {"latency": 1.0, "throughput": -1.0, "memory": 1.0}
 """Sign of each cost: 1 if a smaller value is better, -1 if a larger value is better."""
@@ -121,17 +122,17 @@ class MethodRecord:
 
     @property
     def label(self) -> str:
-        """The name of the method, and the name of the library that computes the method."""
+        """Name of the method, and in brackets the library that computes it."""
         return f"{self.method.name} ({self.method.computed_by})"
 
     @property
     def is_comparable(self) -> bool:
-        """Whether the method solves the same task as the others: it answers all presses, from the charges alone."""
+        """Whether the method answers all presses from the charges alone, which is the task that is compared."""
         return not self.method.given_force and self.errors.answered == 1.0
 
     @property
     def error_mm(self) -> float:
-        """The root-mean-square position error, mm; NaN if the method returned no estimate."""
+        """Root-mean-square position error, mm; NaN if the method returned no estimate."""
         if self.errors.position_rms_mm is None:
             return float("nan")
         return self.errors.position_rms_mm
@@ -143,7 +144,8 @@ class MethodRecord:
             cost: Name of the cost.
 
         Returns:
-            The median duration of one prediction in us, the predictions per second in batches, or the memory in bytes.
+            The median duration of one prediction in us, the number of predictions per second in batches, or the memory
+            in bytes.
         """
         if cost == "latency":
             return self.single_timing.p50_us
@@ -172,10 +174,10 @@ class MethodRecord:
 
 
 def with_pareto_fronts(records: Sequence[MethodRecord]) -> list[MethodRecord]:
-    """Return the records in which `pareto_costs` states the costs for which the method is on the Pareto front.
+    """Return the records with `pareto_costs`, the costs for which the method is on the Pareto front.
 
-    The function `pareto_front` defines when a method is on the Pareto front of a cost. Methods that are not comparable
-    are on no Pareto front, and do not exclude other methods from a front.
+    The function `pareto_front` states when a method is on the Pareto front of a cost. Methods that are not comparable
+    are on no Pareto front, and are ignored when the fronts are determined.
 
     Args:
         records: Records of all methods.
@@ -197,7 +199,8 @@ def with_pareto_fronts(records: Sequence[MethodRecord]) -> list[MethodRecord]:
 def pareto_front(cost: Array, error: Array) -> Booleans:
     """Determine which methods are on the Pareto front of cost and error.
 
-    A method is on the front unless another method is better in cost or error, and at least as good in the other.
+    A method is on the front unless another method is better in one of cost and error, and at least as good in the
+    other.
 
     Args:
         cost: Costs of the methods, shape (n,); smaller is better.
@@ -206,7 +209,7 @@ def pareto_front(cost: Array, error: Array) -> Booleans:
     Returns:
         Whether each method is on the front, shape (n,).
     """
-    # The entry (i, j) of each matrix, shape (n, n), states whether method j is better than method i, or as good.
+    # The entry (i, j) of each matrix, shape (n, n), compares method j with method i.
     is_no_worse = (cost[None] <= cost[:, None]) & (error[None] <= error[:, None])
     is_better_in_one = (cost[None] < cost[:, None]) | (error[None] < error[:, None])
     is_dominated = (is_no_worse & is_better_in_one).any(axis=1)
@@ -232,7 +235,7 @@ def interval_coverage(estimate: Array, std: Array, truth: Array, levels: Array) 
 
 
 SPEED_NAMES: dict[Cost, str] = {"latency": "single predictions", "throughput": "batches"}
-"""The two costs that are speeds, with their names in the sentences of the report."""
+"""Names of the two costs that are speeds in the sentences of the report, by the cost."""
 
 
 def compare_with_released(records: Sequence[MethodRecord]) -> dict[str, Any]:
@@ -242,9 +245,9 @@ def compare_with_released(records: Sequence[MethodRecord]) -> dict[str, Any]:
         records: Records of all methods; the first one is the record of the released model.
 
     Returns:
-        The entry "verdict" of `report.json`. Its entry "sentences" is a list of sentences. Its entry "both" contains
-        two lists of labels, for "latency" and "throughput". Each list names the methods that are both faster and more
-        accurate than the released model.
+        The value of "verdict" in `report.json`, which has two entries. The entry "sentences" is a list of sentences.
+        The entry "both" contains a list of labels for "latency" and one for "throughput". Each list names the methods
+        that are both faster and more accurate than the released model.
     """
     released = records[0]
     comparable = [record for record in records[1:] if record.is_comparable]
@@ -264,7 +267,13 @@ def compare_with_released(records: Sequence[MethodRecord]) -> dict[str, Any]:
 
 
 def _speed_ratio(record: MethodRecord, released: MethodRecord, cost: Cost) -> float:
-    """Return the speed of a method divided by the speed of the released model."""
+    """Return the speed of a method divided by the speed of the released model.
+
+    Args:
+        record: Record of the method.
+        released: Record of the released model.
+        cost: Kind of speed: "latency" or "throughput".
+    """
     cost_ratio = released.cost(cost) / record.cost(cost)
     return float(cost_ratio ** COST_SIGNS[cost])
 
@@ -275,10 +284,10 @@ def _faster_records(records: Sequence[MethodRecord], released: MethodRecord, cos
 
 
 def _comparison_sentence(cost: Cost, released: MethodRecord, group: Sequence[MethodRecord], group_name: str) -> str:
-    """Return the text that says how many methods of a group are faster and more accurate than the released model.
+    """Return the sentences that state how many methods of a group are faster and more accurate than the released model.
 
-    The text also compares the released model with the most accurate of the faster methods. If no method is faster, the
-    text says only this.
+    The sentences also compare the released model with the most accurate of the faster methods. If no method is faster
+    than the released model, a single sentence states this.
 
     Args:
         cost: The kind of speed: "latency" or "throughput".
@@ -289,15 +298,15 @@ def _comparison_sentence(cost: Cost, released: MethodRecord, group: Sequence[Met
     faster = _faster_records(group, released, cost)
     if not faster:
         return f"In {SPEED_NAMES[cost]}, none of {len(group)} {group_name} is faster than the released model."
-    more_accurate_count = sum(record.error_mm < released.error_mm for record in faster)
-    verb = "are" if more_accurate_count > 1 else "is"
+    n_more_accurate = sum(record.error_mm < released.error_mm for record in faster)
+    verb = "are" if n_more_accurate > 1 else "is"
 
     most_accurate = min(faster, key=lambda record: record.error_mm)
     speed_ratio = _speed_ratio(most_accurate, released, cost)
     error_change_percent = 100.0 * (most_accurate.error_mm / released.error_mm - 1.0)
     comparative = "less" if error_change_percent < 0.0 else "more"
     return (
-        f"In {SPEED_NAMES[cost]}, {more_accurate_count or 'none'} of {len(group)} {group_name} {verb} both faster and "
+        f"In {SPEED_NAMES[cost]}, {n_more_accurate or 'none'} of {len(group)} {group_name} {verb} both faster and "
         f"more accurate than the released model. The most accurate of the faster ones is {most_accurate.label}: it is "
         f"{speed_ratio:.3g} times as fast as the released model, with {abs(error_change_percent):.2g} % {comparative} "
         "error."

@@ -20,13 +20,13 @@ from isocharge.train.report.case import Settings
 from isocharge.train.report.measures import ContactErrors, MethodRecord, round_significant, with_pareto_fronts
 
 SINGLE_PRESSES = 64
-"""Number of presses that the timed predictions of one press cycle through."""
+"""Number of different presses that are predicted in turn when single predictions are timed."""
 
 MAX_BATCH_SECONDS = 0.1
 """Estimated duration of a batch, s, above which a smaller batch is timed."""
 
 BATCH_REDUCTION = 64
-"""Factor by which a batch is made smaller if its prediction would take longer than `MAX_BATCH_SECONDS`."""
+"""Factor by which the size of a batch is divided if its prediction would take longer than `MAX_BATCH_SECONDS`."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class FittedMethod:
 def fit_all(
     methods: Sequence[ComparedMethod], task: FittingTask, test: LabelledPresses
 ) -> tuple[list[FittedMethod], dict[str, str]]:
-    """Fit all methods and predict the test presses with each of them.
+    """Fit all methods, and estimate the contacts of the test presses with each of them.
 
-    If a method cannot be fitted to measured presses, the reason is recorded and the next method is fitted. If a method
-    cannot be fitted to simulated presses, the error is raised.
+    If a method cannot be fitted to measured presses, the reason is recorded, and the next method is fitted. If a method
+    cannot be fitted to simulated presses, an error is raised.
 
     Args:
         methods: The methods to fit.
@@ -59,8 +59,8 @@ def fit_all(
         test: The test presses, with the noise in their charges.
 
     Returns:
-        The fitted methods, and the reasons of the methods that cannot be fitted to so few measured presses, by the name
-        of the method.
+        The fitted methods; and, by the name of the method, the reasons why other methods cannot be fitted to the
+        measured presses.
 
     Raises:
         DatasetError: If a method cannot be fitted to simulated presses.
@@ -92,14 +92,14 @@ def measure_methods(
 ) -> list[MethodRecord]:
     """Measure the errors, durations and sizes of all methods.
 
-    After all methods are fitted, their durations are measured alternately. A change of the machine's speed therefore
-    affects all methods in the same way.
+    The predictions of all methods are timed in turns. A change of the speed of the machine therefore affects all
+    methods in the same way.
 
     Args:
         fitted_methods: The fitted methods with their estimates.
         test: The test presses, with the noise in their charges.
         settings: Settings of the report: the time for timing and the size of a batch.
-        posterior_mean: Posterior means (x, y, F) of the first m test presses, shape (m, 3), mm and N. Their error is
+        posterior_mean: Posterior means (x, y, F) of the first m test presses, shape (m, 3), mm and N, whose error is
             the Bayes limit. None if the limit was not computed.
 
     Returns:
@@ -122,15 +122,15 @@ def measure_methods(
 
 
 def _test_inputs(method: ComparedMethod, test: LabelledPresses) -> Array:
-    """Return the inputs of a method for the test presses, shape (n, n_input)."""
+    """Return the inputs of a method for the test presses, shape (n, n_input): charges, maybe with the true force."""
     return method.inputs(test.charge, test.contact[:, 2])
 
 
 def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callable[[], object]:
     """Return a function without arguments that predicts one press.
 
-    Each call predicts the next of the first `SINGLE_PRESSES` presses. After the last of these presses, the first one
-    follows again. For ONNX networks the arrays of each press are bound before the timing, as `Predictor` binds them.
+    Each call predicts the next of the first `SINGLE_PRESSES` presses. After the last of these presses, the first press
+    follows again. For ONNX networks, the arrays of each press are bound before the timing, as `Predictor` binds them.
 
     Args:
         method: Fitted method.
@@ -149,10 +149,10 @@ def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callabl
 
 
 def _batch_contender(method: ComparedMethod, test: LabelledPresses, batch_size: int) -> Contender:
-    """Return the timed prediction of a batch.
+    """Return the prediction of a batch that is timed for a method.
 
-    A small batch is predicted first. If its duration shows that the whole batch would take longer than
-    `MAX_BATCH_SECONDS`, the small batch is timed instead.
+    A small batch is predicted first. If the duration of this prediction shows that the whole batch would take longer
+    than `MAX_BATCH_SECONDS`, the small batch is timed instead of the whole batch.
 
     Args:
         method: The fitted method.
@@ -175,17 +175,17 @@ def _batch_contender(method: ComparedMethod, test: LabelledPresses, batch_size: 
 def _method_record(
     fitted: FittedMethod, truth: Array, posterior_mean: Array | None, single_timing: Timing, batch_timing: Timing
 ) -> MethodRecord:
-    """Return the record of a method, with its errors, times and memory.
+    """Return the record of a method with its errors, durations and memory.
 
-    A method that is given the true force has no force error.
+    The record of a method that is given the true force contains no force error.
 
     Args:
         fitted: Fitted method and its estimates of the contacts.
         truth: True contacts, shape (n, 3), mm and N.
-        posterior_mean: Posterior means of the first m contacts, shape (m, 3), mm and N, for the ratio of the error to
-            the Bayes limit. None if the means are not computed.
-        single_timing: Time of the prediction of one press.
-        batch_timing: Time of the prediction of many presses.
+        posterior_mean: Posterior means (x, y, F) of the first m presses, shape (m, 3), mm and N, for the ratio of the
+            error to the Bayes limit. None if the means were not computed.
+        single_timing: Durations of predictions of one press.
+        batch_timing: Durations of predictions of a batch of presses.
     """
     errors = ContactErrors.of(fitted.estimate, truth)
     if fitted.method.given_force:
@@ -224,7 +224,7 @@ def bayes_ratio(estimate: Array, posterior_mean: Array, truth: Array) -> float |
 
 
 def _serialised_bytes(method: ComparedMethod) -> int:
-    """Return the serialised size of a fitted method, bytes: the ONNX file of a network, the pickle of the others."""
+    """Return the size of a fitted method, bytes: of the ONNX file of a network, or of the pickle of a regressor."""
     regressor = method.regressor
     if isinstance(regressor, OnnxContact | ReleasedModel):
         return len(regressor.graph)

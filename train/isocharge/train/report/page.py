@@ -1,6 +1,6 @@
-"""The page of the report in Markdown, with a summary, a table of all methods, and pictures.
+"""Writer of the page of a report in Markdown, with a summary, tables of all methods, and pictures.
 
-The page is written only from the content of `report.json`. Each method in this content is a `MethodRecord` here.
+The page is written from the content of `report.json`, in which each method is given as a `MethodRecord`.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -10,8 +10,8 @@ from isocharge.train.model_release.evaluate import FALSE_ALARM_RATE
 from isocharge.train.report.measures import MethodRecord
 from isocharge.train.report.studies import CLIP_LIMIT, GAIN_STD, PRETENSION_ERROR_MPa
 
-Section = Mapping[str, Any]
-"""Section of the report: the results of one dataset."""
+SectionContent = Mapping[str, Any]
+"""Content of a section of the report, which contains the results of one dataset."""
 
 
 def report_page(record: Mapping[str, Any]) -> str:
@@ -33,13 +33,13 @@ def report_page(record: Mapping[str, Any]) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def _summary_lines(section: Section) -> Iterator[str]:
+def _summary_lines(section: SectionContent) -> Iterator[str]:
     """Yield the lines of the summary: the errors of the released model, and its comparison with the other methods.
 
-    The comparison with the Bayes limit is left out if this limit was not computed.
+    The line about the Bayes limit is left out if this limit was not computed.
 
     Args:
-        section: Section of the report.
+        section: Content of the section.
     """
     released: MethodRecord = section["methods"][0]  # the released model is always listed first
     errors = released.errors
@@ -60,11 +60,11 @@ def _summary_lines(section: Section) -> Iterator[str]:
         yield f"- {sentence}"
 
 
-def _simulated_section(section: Section) -> Iterator[str]:
+def _simulated_section(section: SectionContent) -> Iterator[str]:
     """Yield the blocks of the section of a simulated dataset.
 
     Args:
-        section: Section of the report.
+        section: Content of the section.
     """
     min_force, max_force = section["force_N"]
     presses = section["presses"]
@@ -88,11 +88,11 @@ def _simulated_section(section: Section) -> Iterator[str]:
     yield from _chosen_parameters(section["methods"])
 
 
-def _measured_section(section: Section) -> Iterator[str]:
+def _measured_section(section: SectionContent) -> Iterator[str]:
     """Yield the blocks of the section of a measured dataset.
 
     Args:
-        section: Section of the report.
+        section: Content of the section.
     """
     min_force, max_force = section["force_N"]
     presses = section["presses"]
@@ -132,13 +132,13 @@ TEXT_COLUMNS = 2
 """Number of columns with text at the left of a table; the other columns contain numbers."""
 
 
-def _method_comparison(section: Section) -> Iterator[str]:
-    """Yield the table of limits and methods, an explanation, and the plots of the error against each cost.
+def _method_comparison(section: SectionContent) -> Iterator[str]:
+    """Yield the table of limits and methods, an explanation of the table, and the plots of the error against each cost.
 
     The methods are sorted by their position error.
 
     Args:
-        section: Section of the report.
+        section: Content of the section.
     """
     records: Sequence[MethodRecord] = section["methods"]
     sorted_records = sorted(records, key=_error_and_latency)
@@ -160,7 +160,7 @@ def _error_and_latency(record: MethodRecord) -> tuple[float, float]:
 
 
 def _limit_rows(limits: Mapping[str, Any]) -> Iterator[list[str]]:
-    """Yield the rows of the limits that were computed, for the table of methods."""
+    """Yield rows for the table of methods, one for each theoretical limit that was computed."""
     for name, key, bayes_ratio in (("*Bayes limit*", "bayes", "1"), ("*Cramér-Rao limit, unbiased*", "cramer_rao", "")):
         limit = limits[key]
         if limit:
@@ -209,11 +209,11 @@ def _method_row(record: MethodRecord) -> list[str]:
     return [f"**{cell}**" if cell else "" for cell in cells]
 
 
-def _mismatch_effects(section: Section) -> Iterator[str]:
-    """Yield the blocks on the errors if the film, the probe or the electronics differ from the models' assumptions.
+def _mismatch_effects(section: SectionContent) -> Iterator[str]:
+    """Yield the blocks about the errors if the film, the probe or the electronics differ from the assumptions.
 
     Args:
-        section: Section of a simulated dataset.
+        section: Content of the section of a simulated dataset.
     """
     yield "### Errors if the film, the probe or the electronics differ from the assumptions"
     yield _picture(section, "noise")
@@ -234,7 +234,7 @@ def _mismatch_effects(section: Section) -> Iterator[str]:
 
 
 def _mismatch_row(result: Mapping[str, Any], method_names: Sequence[str]) -> list[str]:
-    """Return the row of a mismatch.
+    """Return the row of a mismatch in the table of mismatches.
 
     Args:
         result: Result of `studies.measure_mismatch`.
@@ -259,7 +259,7 @@ def _chosen_parameters(records: Sequence[MethodRecord]) -> Iterator[str]:
 
 
 def _conditions(record: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the blocks on how the durations were measured, on which machine, and with which command.
+    """Yield the blocks that state how the report was measured, on which machine, and with which command.
 
     Args:
         record: The content of `report.json`.
@@ -299,7 +299,7 @@ CAPTIONS = {
 """Caption of each picture, by the name of the picture."""
 
 
-def _picture(section: Section, name: str) -> str:
+def _picture(section: SectionContent, name: str) -> str:
     """Return the Markdown of a picture with its caption."""
     files = section["pictures"][name]
     return f"![{name}]({files[0]})\n\n*{CAPTIONS[name]}*"
@@ -323,10 +323,10 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], text_co
 
 
 def _number_text(value: float | None) -> str:
-    """Format a number for a table: three significant digits, or a rounded integer from 1000; empty for None.
+    """Format a number for a table, with three significant digits or, if it is 1000 or more, as a rounded integer.
 
     Args:
-        value: The number, or None if there is none.
+        value: The number; None for an empty cell.
     """
     if value is None:
         return ""

@@ -1,4 +1,4 @@
-"""Pictures of the report: the error against cost, film and force, the coverage, and the effects of mismatches."""
+"""Pictures of a report: errors against costs, place and force, coverage of intervals, and effects of mismatches."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -41,7 +41,7 @@ Other methods have the style `DEFAULT_LINE_STYLE`.
 """
 
 DEFAULT_LINE_STYLE: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 1.3}
-"""Matplotlib style of a method that is not in `LINE_STYLES`; its colour is the next of Matplotlib's colour cycle."""
+"""Matplotlib style of a method that is not in `LINE_STYLES`. Its colour is the next colour of Matplotlib's cycle."""
 
 COST_LABELS: dict[Cost, str] = {
     "latency": "time of one prediction, median, us",
@@ -63,15 +63,15 @@ def cost_plot(records: Sequence[MethodRecord], cost: Cost, limits: Mapping[str, 
     Args:
         records: Records of the methods.
         cost: Name of the cost.
-        limits: Theoretical limits of the position error, mm, by name. A limit is drawn as a horizontal line.
-            The limit for unbiased estimators can be larger than the errors of all methods without the true force. It is
-            then left out.
+        limits: Theoretical limits of the position error, mm, by name. Each limit is drawn as a horizontal line. A limit
+            that is larger than the errors of all methods without the true force is left out, which can happen for the
+            limit of unbiased estimators.
 
     Returns:
         Figure with logarithmic axes and the Pareto front.
     """
     figure, axes = new_axes(10.5, 6.0)
-    # Methods without an estimate, and methods with an error of zero, have no place on a logarithmic axis.
+    # A logarithmic axis can show neither methods without an estimate nor methods with an error of zero.
     drawn_records = [record for record in records if record.errors.position_rms_mm]
     drawn_records.sort(key=lambda record: record.error_mm)
     _draw_methods(axes, drawn_records, cost)
@@ -120,6 +120,11 @@ def _draw_pareto_front(axes: Axes, records: Sequence[MethodRecord], cost: Cost) 
 
     The error between two methods of the front is the error of the method with the lower cost. For the throughput, a
     higher value is a lower cost, so the direction of the steps is reversed.
+
+    Args:
+        axes: Axes of matplotlib.
+        records: Results of the methods.
+        cost: Cost on the horizontal axis.
     """
     front = sorted((record.cost(cost), record.error_mm) for record in records if cost in record.pareto_costs)
     costs, errors_mm = zip(*front, strict=True)
@@ -128,7 +133,7 @@ def _draw_pareto_front(axes: Axes, records: Sequence[MethodRecord], cost: Cost) 
 
 
 def _set_logarithmic_axes(axes: Axes, x_label: str, y_label: str) -> None:
-    """Set both axes to logarithmic scales, labelled with plain numbers instead of powers of ten.
+    """Set both axes to logarithmic scales, which are labelled with plain numbers instead of powers of ten.
 
     An axis that covers less than three decades also has labels at 2 and 5 times the powers of ten.
 
@@ -151,7 +156,7 @@ def _set_logarithmic_axes(axes: Axes, x_label: str, y_label: str) -> None:
 def error_maps(sensor: Sensor, domain: Domain, draws: NoiseDraws) -> Figure:
     """Draw maps of the root-mean-square errors of the released model over the film.
 
-    The left map shows the position error in mm, the right map the relative error of the force in %.
+    The left map shows the position error in mm, and the right map shows the relative error of the force in %.
 
     Args:
         sensor: The sensor, whose electrodes are drawn.
@@ -204,21 +209,21 @@ def error_lines(x: Sequence[float], lines: Mapping[str, Sequence[float | None]],
 
 
 def _line_style(name: str) -> dict[str, Any]:
-    """Return the Matplotlib style of a method or limit."""
+    """Return the Matplotlib style of the line of a method or limit, by its name."""
     return DEFAULT_LINE_STYLE | LINE_STYLES.get(name, {})
 
 
 def coverage_plot(record: Mapping[str, Any]) -> Figure:
-    """Draw how far the coverage of the released model's intervals is from the nominal level, in percentage points.
+    """Draw the coverage of the intervals of the released model minus the nominal level, in percentage points.
 
-    A shaded band shows the tolerance. Points above zero mean that the intervals contain more true values than they
-    state.
+    A shaded band shows the tolerance. If a point is above zero, the intervals contain more true values than their
+    nominal level states.
 
     Args:
         record: Result of `studies.coverage_by_level`, with the nominal levels and the coverage of each coordinate.
 
     Returns:
-        Figure with one curve for x, y and the force.
+        Figure with one curve for each of x, y and the force.
     """
     figure, axes = new_axes(6.5, 4.4)
     level_percent = 100.0 * np.array(record["levels"])
@@ -233,7 +238,7 @@ def coverage_plot(record: Mapping[str, Any]) -> Figure:
 
 
 def mismatch_plot(results: Sequence[Mapping[str, Any]], nominal_error_mm: float | None) -> Figure:
-    """Draw the position errors and the alarms for all mismatches except other noise.
+    """Draw the position errors and the alarms for all mismatches except those of the noise.
 
     Each mismatch is one row, which both panels of the figure share.
 
@@ -269,7 +274,7 @@ def mismatch_plot(results: Sequence[Mapping[str, Any]], nominal_error_mm: float 
 def _draw_alarms(axes: Axes, labels: Sequence[str], alarms_percent: Sequence[float]) -> None:
     """Draw the percentage of presses with an alarm as one bar for each mismatch.
 
-    A dashed line shows the percentage among good presses.
+    A dashed line shows the percentage of good presses with an alarm.
 
     Args:
         axes: Axes of matplotlib.

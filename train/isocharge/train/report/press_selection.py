@@ -16,11 +16,11 @@ from isocharge.train.data.presses import LabelledPresses, check_enough, domain_o
 from isocharge.train.model_release.release import model_domain
 
 RANGE_TOLERANCE = 1.0 + 1e-6
-"""Factor by which a force or a radius may exceed the range of a model because of rounding."""
+"""Largest factor by which a force or a radius may exceed the range of a model because of rounding."""
 
 
 def select_presses(dataset: Dataset, is_selected: Booleans) -> Dataset:
-    """Return the dataset with some of its presses.
+    """Return a dataset with only some of its presses.
 
     Args:
         dataset: The dataset.
@@ -67,13 +67,16 @@ def simulated_presses_for(model: ModelMetadata, dataset: Dataset) -> Dataset:
 
 
 def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
-    """Raise an error if a model was trained for another sensor than the sensor of a dataset.
+    """Raise an error if a model was not trained for the sensor of a dataset.
 
-    All values of the two sensors are compared except their names, which may differ.
+    All values of the two sensors are compared, except their names, which may differ.
 
     Args:
         model: Metadata of the model.
         dataset: The dataset.
+
+    Raises:
+        ModelError: If the sensors differ. The message names the values that differ.
     """
     dataset_sensor = sensor_to_dict(dataset.sensor)
     model_sensor = dict(model.sensor)
@@ -88,9 +91,10 @@ def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
 
 
 def measured_presses_for(model: ModelMetadata, dataset: Dataset) -> Dataset:
-    """Return the measured presses that lie within the working area and the range of forces of a model.
+    """Return the presses of a measured dataset that lie within the working area and the range of forces of a model.
 
-    The returned dataset has an empty manifest, because the ranges of the manifest include the excluded presses.
+    The manifest of the returned dataset is empty, because the ranges in the original manifest include the excluded
+    presses.
 
     Args:
         model: Metadata of the model.

@@ -1,8 +1,8 @@
-"""Studies of the released model beyond its mean error.
+"""Studies of the released model in addition to its mean error.
 
-The studies compute the errors over the film and the force, and the coverage of the reported standard deviations. The
-studies also compute the errors under conditions that differ from the training: other noise, another probe, another
-pretension, wrong gains or a dead electrode.
+One study computes the errors as a function of the place and of the force. Another study computes the coverage of the
+reported standard deviations. A third study computes the errors under conditions that differ from the training: other
+noise, another probe, another pretension, wrong gains or a dead electrode.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,7 +32,7 @@ FORCE_BINS = 12
 """Number of force bins in which the position error is computed."""
 
 COORDINATES = ("x", "y", "force")
-"""Names of the three estimated quantities, in the order of the columns of a contact."""
+"""Names of the three quantities of a contact, in the order of its columns."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class NoiseDraws:
 
     @classmethod
     def of(cls, released: ReleasedModel, clean: LabelledPresses, case: EvaluationCase, draw_count: int) -> "NoiseDraws":
-        """Draw the noise of the case several times and predict all presses each time.
+        """Draw the noise of the test presses several times, and estimate all contacts each time.
 
         Args:
             released: The released model.
@@ -109,7 +109,7 @@ def errors_by_force(
 
 
 def _rms_in_bins(errors: Array, bin_index: Integers) -> list[float | None]:
-    """Return the root mean square of the finite errors in each force bin.
+    """Return the root mean square of the finite errors of the presses in each force bin.
 
     Args:
         errors: Errors of the presses, shape (n,), mm.
@@ -129,6 +129,9 @@ def _rms_in_bins(errors: Array, bin_index: Integers) -> list[float | None]:
 
 def coverage_by_level(draws: NoiseDraws) -> dict[str, Any]:
     """Compute the coverage of the central intervals at many nominal levels.
+
+    Args:
+        draws: Estimates of the released model under several draws of the noise, with their standard deviations.
 
     Returns:
         The nominal levels ("levels"), and for x, y and the force the fractions of true values inside the intervals
@@ -151,19 +154,19 @@ PRETENSION_ERROR_MPa = 0.2
 """Difference between the pretension of the tested film and the pretension that the models assume, MPa."""
 
 GAIN_STD = 0.01
-"""Relative standard deviation of the gains if all of them are wrong."""
+"""Relative standard deviation of the gains in the mismatch in which all gains are wrong."""
 
 SINGLE_GAIN_ERROR = 0.2
-"""Relative error of the gain if only one of them is wrong."""
+"""Relative error of the gain in the mismatches in which only one gain is wrong."""
 
 MISMATCH_ACCURACY = 2e-3
 """Relative accuracy of the simulated charges for other probes and pretensions.
 
-The errors are small compared with the changes of the charges by another probe or pretension.
+This error is small compared with the change of the charges by another probe or pretension.
 """
 
 CLIP_LIMIT = 50.0
-"""Magnitude, mm or N, to which estimates are clipped, because polynomials diverge outside their training range."""
+"""Largest magnitude of an estimate, mm or N. Larger estimates are clipped, because polynomials can diverge."""
 
 MISMATCH_NOISE_SEED = 515
 """Seed of the noise on the charges of a mismatch, relative to the seed of the case."""
@@ -191,7 +194,7 @@ def mismatches(
 ) -> Iterator[Mismatch]:
     """Yield the presses of all mismatches: other noise, other probes, another pretension, wrong gains, dead electrodes.
 
-    The film is solved again only for the other probes and for the other pretension.
+    Only the other probes and the other pretension need new solutions of the film.
 
     Args:
         case: The conditions that the models assume.
@@ -287,8 +290,8 @@ def measure_mismatch(
 ) -> dict[str, Any]:
     """Measure the errors of the released model and of other methods under a mismatch.
 
-    The estimates of the other methods are clipped to plus or minus `CLIP_LIMIT`, because polynomials diverge for
-    charges outside their training range.
+    The estimates of the other methods are clipped to the range from -`CLIP_LIMIT` to `CLIP_LIMIT`, because polynomials
+    diverge for charges outside their training range.
 
     Args:
         mismatch: The presses with their charges.
@@ -298,14 +301,14 @@ def measure_mismatch(
         alarm_threshold: Misfit above which the released model gives an alarm, in standard deviations of the noise.
 
     Returns:
-        One entry of "cases" in `report.json`. The entry contains the errors of each method. For the released model, the
-        entry also contains the percentage of presses with an alarm. A further number is the fraction of true values
-        within one standard deviation of the estimate.
+        One entry of "cases" in `report.json`. It contains the errors of each method. For the released model, it also
+        contains the percentage of presses with an alarm, and the fraction of the true values within one standard
+        deviation of the estimate.
     """
     estimate, std, misfit = released.answer(mismatch.charge)
     errors = {released_name: asdict(ContactErrors.of(estimate, mismatch.truth))}
     for method in other_methods:
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore"):  # a diverging polynomial may overflow
             method_estimate = method.regressor.predict(mismatch.charge)
         clipped_estimate = np.clip(method_estimate, -CLIP_LIMIT, CLIP_LIMIT)
         errors[method.name] = asdict(ContactErrors.of(clipped_estimate, mismatch.truth))

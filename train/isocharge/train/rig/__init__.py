@@ -1,1 +1,1 @@
-"""Training data from a described sensor that is corrected by measured presses, for films that cannot be calibrated."""
+"""Training data from the simulation of a sensor that measured presses correct, for films that cannot be calibrated."""

@@ -1,10 +1,10 @@
 """Smooth correction of the charges of a forward map, fitted to measured presses by generalised least squares.
 
-The correction is a factor on the charge of each electrode. The logarithm of this factor is a sum of the polynomials of
-`calibration.discrepancy` in the place and the logarithm of the force. The covariance of the residuals contains the
-noise of the charges. The covariance also contains the errors of the measured places and forces, which are converted to
-charges with the derivatives of the map. Several sizes of the correction are tried, and the most probable size is used.
-If the most probable size is zero, the charges are not corrected.
+The correction is a factor on the charge of each electrode. The logarithm of this factor is a sum of polynomials in the
+place and in the logarithm of the force, which `calibration.discrepancy` defines. The covariance of the residuals
+contains the noise of the charges, and the errors of the measured places and forces. These errors are converted to
+errors of the charges by the derivatives of the map. Several sizes of the correction are tried, and the most probable
+size is used. If the most probable size is zero, the charges are not corrected.
 """
 
 from dataclasses import dataclass
@@ -26,10 +26,10 @@ Large sizes are needed for a sensor that is not calibrated.
 """
 
 MIN_RATIO = 0.5
-"""Ratio of the measured charge to that of the map below which the logarithm is continued by its tangent."""
+"""Ratio of the measured charge to the charge of the map below which the logarithm is replaced by its tangent."""
 
 CHUNK_SIZE = 2048
-"""Number of presses whose equations are in memory at the same time."""
+"""Largest number of presses whose equations are in memory at the same time."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class Residuals:
     Attributes:
         contact: Measured contacts (x, y, F), shape (n, 3), mm and N.
         log_ratio: ln(measured charge / charge of the map), shape (n, n_electrode); see `_log_ratio`.
-        covariance: Covariance of the logarithms by noise and by errors of the contacts, shape
-            (n, n_electrode, n_electrode).
+        covariance: Covariance of the logarithms that is caused by noise and by errors of the contacts, shape (n,
+            n_electrode, n_electrode).
     """
 
     contact: Array
@@ -58,7 +58,8 @@ class Residuals:
     def of(cls, presses: MeasuredPresses, charge_map: ChargeMap, noise: NoiseModel) -> "Residuals":
         """Compute the residuals of presses whose places, forces and charges are known.
 
-        The covariance of the residuals is the sum of two parts: the noise of the charges, and the errors of the
+        A residual is the logarithm of the ratio of the measured charge to the charge of the map. The covariance of the
+        residuals is the sum of two parts, which are caused by the noise of the charges and by the errors of the
         measured contacts.
 
         Args:
@@ -66,16 +67,21 @@ class Residuals:
             charge_map: Charges as a function of the contact.
             noise: Noise of the charges.
         """
-        charge = charge_map.charges(presses.contact)
-        log_ratio = _log_ratio(presses.charge_pC / charge)
+        map_charge = charge_map.charges(presses.contact)
+        log_ratio = _log_ratio(presses.charge_pC / map_charge)
 
-        # Covariance by errors of the contacts: J diag(std^2) J' for each press n, with J = d ln Q / d(x, y, ln F)
-        log_slopes = differences(charge_map.charges, presses.contact, CONTACT_STEPS) / charge[:, :, None]
+        # Covariance by errors of the contacts: J diag(std^2) J' for each press n, with J = d ln Q / d(x, y, ln F). The
+        # relative standard deviation of the force is the standard deviation of ln F.
+        charge_slopes = differences(charge_map.charges, presses.contact, CONTACT_STEPS)
+        log_slopes = charge_slopes / map_charge[:, :, None]
         contact_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
         contact_covariance = np.einsum("nei,ni,nfi->nef", log_slopes, contact_std**2, log_slopes)
 
-        noise_variance = (noise.sigma(charge) / charge) ** 2
-        noise_covariance = noise_variance[:, :, None] * np.eye(charge.shape[1])
+        # The noise of the electrodes is independent, so its covariance is diagonal. The variance of ln Q is
+        # (sigma / Q)^2.
+        noise_variance = (noise.sigma(map_charge) / map_charge) ** 2
+        n_electrode = map_charge.shape[1]
+        noise_covariance = noise_variance[:, :, None] * np.eye(n_electrode)
         return cls(presses.contact, log_ratio, contact_covariance + noise_covariance)
 
     def chi2(self, correction: Array) -> Array:
@@ -122,81 +128,92 @@ class Correction:
 def fit_correction(residuals: Residuals) -> Correction:
     """Fit a correction to residuals by generalised least squares.
 
-    The correction is a series of polynomials for each electrode. Several sizes of the correction are compared as
-    hypotheses, one of which is no correction.
+    For each electrode, the logarithm of the correction is a sum of polynomials. The size of the correction is the prior
+    standard deviation of the coefficients of these polynomials. Each size in `SIZES` is a hypothesis, and the size zero
+    means that there is no correction. The coefficients are averaged over the hypotheses, with the probabilities of the
+    hypotheses as weights.
 
     Args:
         residuals: Differences between measured presses and a forward map.
 
     Returns:
-        The correction. It is zero if the residuals are most probable without a correction.
+        The correction. It is zero if the most probable size is zero.
     """
     # The domain of the polynomials is the range of the presses.
     x, y, force = residuals.contact.T
-    n_electrode = residuals.log_ratio.shape[1]
     radius = float(np.hypot(x, y).max())
     force_range = (float(force.min()), float(force.max()))
     domain = Domain(radius, force_range)
-    n_coefficient = term_count() * n_electrode
+
+    n_term = term_count()
+    n_electrode = residuals.log_ratio.shape[1]
+    n_coefficient = n_term * n_electrode
 
     def prior_covariance(hypothesis: Hypothesis) -> Array:
-        """Return the covariance of the coefficients before the presses. The coefficients are independent."""
+        """Return the prior covariance of the coefficients, which are independent of each other."""
         return hypothesis.discrepancy**2 * np.eye(n_coefficient)
 
-    # Average over the hypotheses about the size of the correction, with their probabilities as weights.
     model = _normal_equations(residuals, domain, n_coefficient)
+    models_by_force_scatter = {0.0: model}  # none of the hypotheses has an additional scatter of the forces
     hypotheses = [Hypothesis(discrepancy=size) for size in SIZES]
-    model_without_force_scatter = {0.0: model}
-    mixture = mix_hypotheses(model_without_force_scatter, prior_covariance, hypotheses)
+    mixture = mix_hypotheses(models_by_force_scatter, prior_covariance, hypotheses)
 
-    is_best_without_correction = mixture.best.discrepancy == 0.0
-    if is_best_without_correction:
-        return Correction(domain, np.zeros((term_count(), n_electrode)), 0.0)
+    most_probable_size = mixture.best.discrepancy
+    if most_probable_size == 0.0:
+        return Correction(domain, coefficients=np.zeros((n_term, n_electrode)), freedom=0.0)
+    coefficients = mixture.mean.reshape(n_term, n_electrode)
     # The effective number of determined coefficients is the trace of the posterior covariance times the information.
     effective_count = float(np.trace(mixture.covariance @ model.normal))
-    return Correction(domain, mixture.mean.reshape(term_count(), -1), effective_count)
+    return Correction(domain, coefficients, effective_count)
 
 
 def _normal_equations(residuals: Residuals, domain: Domain, n_coefficient: int) -> LinearModel:
-    """Return the normal equations of all residuals, summed over chunks of presses to limit the memory.
+    """Return the sum of the squared residuals of all presses as a quadratic function of the coefficients.
+
+    The function is computed for one chunk of presses after the other, which limits the memory.
 
     Args:
         residuals: Differences between measured presses and a forward map.
         domain: Domain of the polynomials.
         n_coefficient: Number of coefficients of the correction.
+
+    Returns:
+        The matrix and the right-hand side of the normal equations, and the sum of squares without a correction.
     """
     normal = np.zeros((n_coefficient, n_coefficient))
     moment = np.zeros(n_coefficient)
     square = 0.0
     for start in range(0, len(residuals), CHUNK_SIZE):
         rows = np.arange(start, min(start + CHUNK_SIZE, len(residuals)))
-        chunk = _linearised(residuals[rows], domain)
-        normal += chunk.normal
-        moment += chunk.moment
-        square += chunk.square
+        chunk_model = _linear_model(residuals[rows], domain)
+        normal += chunk_model.normal
+        moment += chunk_model.moment
+        square += chunk_model.square
     return LinearModel(normal, moment, square)
 
 
-def _linearised(residuals: Residuals, domain: Domain) -> LinearModel:
+def _linear_model(residuals: Residuals, domain: Domain) -> LinearModel:
     """Return the sum of the squared residuals as a function of the coefficients of the correction.
 
-    A residual is the difference between the correction and the measured ln(Q / expected Q), so it is linear in the
-    coefficients. Each residual is whitened with the covariance of its press.
+    Let P be the polynomials of a press, c the coefficients, and l the measured ln(Q / charge of the map). The whitened
+    residuals of the press are W (P c - l), which are linear in c. The whitening matrix W is the inverse of the Cholesky
+    factor of the covariance, so that the covariance of the whitened residuals is the unit matrix.
 
     Args:
         residuals: Residuals of n presses.
         domain: Domain of the polynomials.
     """
-    # The whitened residuals have unit covariance. These are the residuals without a correction.
-    whitening = np.linalg.inv(np.linalg.cholesky(residuals.covariance))
-    whitened_residuals = -(whitening @ residuals.log_ratio[:, :, None])[:, :, 0]
+    whitening = np.linalg.inv(np.linalg.cholesky(residuals.covariance))  # shape (n, n_electrode, n_electrode)
+    log_ratio_column = residuals.log_ratio[:, :, None]
+    uncorrected = -(whitening @ log_ratio_column)[:, :, 0]  # residuals with c = 0, shape (n, n_electrode)
 
     # Derivatives of residual g of press n with respect to the coefficient of term t for electrode e, shape (n, g, t, e)
     polynomials = terms(residuals.contact, domain)
     derivatives = polynomials[:, None, :, None] * whitening[:, :, None, :]
     n_coefficient = term_count() * residuals.log_ratio.shape[1]
     design = derivatives.reshape(-1, n_coefficient)
-    return LinearModel.of(design, whitened_residuals.ravel(), np.zeros(n_coefficient))
+    deviation_from_prior_mean = np.zeros(n_coefficient)  # the prior mean of the coefficients is c = 0
+    return LinearModel.of(design, uncorrected.ravel(), deviation_from_prior_mean)
 
 
 def _log_ratio(ratio: Array) -> Array:

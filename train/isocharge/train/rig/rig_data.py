@@ -1,7 +1,7 @@
-"""Training data from measured presses on a sensor for which no network for all films exists.
+"""Training data from measured presses on a sensor for which there is no network for all films.
 
-The film of such a sensor cannot be calibrated. Instead, the forward map of the described sensor is corrected by the
-presses. A network is then trained on presses of the corrected map.
+The film of such a sensor cannot be calibrated. Instead, measured presses correct the forward map of the described
+sensor. A network is then trained on simulated presses whose charges the corrected map computes.
 """
 
 import logging
@@ -44,14 +44,14 @@ TRAINING_PRESSES = 24_000
 """Number of presses of the corrected map on which the network is trained."""
 
 MAP_MARGIN = 1.01
-"""Factor by which the radius and the range of the forces of a forward map exceed those of its domain, dimensionless.
+"""Factor by which the radius and the range of forces of a forward map exceed those of the domain, dimensionless.
 
-The margin is needed for finite differences at the edge of the domain."""
+The margin is needed in order to compute finite differences at the edge of the domain."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Measured presses, with the sensor and the probe of these presses.
+    """Measured presses, with the sensor and the probe with which they were made.
 
     Attributes:
         presses: The presses. Presses with an unknown place, force or charge are not used.
@@ -94,35 +94,40 @@ def rig_data(rig: Rig, *, training_presses: int = TRAINING_PRESSES, seed: int = 
     min_force, max_force = domain.force_range
     map_radius = domain.radius * MAP_MARGIN
     map_force_range = (min_force / MAP_MARGIN, max_force * MAP_MARGIN)
-    forward_map = ForwardMap.build(rig.sensor, rig.probe, map_radius, map_force_range)
+    described_map = ForwardMap.build(rig.sensor, rig.probe, map_radius, map_force_range)
 
-    film = correct_film(presses[~is_held_out], forward_map, domain, noise_model("reference"))
-    if film.is_scattered:
+    corrected_film = correct_film(presses[~is_held_out], described_map, domain, noise_model("reference"))
+    if corrected_film.is_scattered:
         _log.warning(
             "the presses scatter about the corrected map %.2g times as much as noise and errors of the contacts "
             "explain; the model's standard deviations are those for the noise of its training (training.noise in "
             "--config)",
-            film.scatter,
+            corrected_film.scatter,
         )
-    training_data = TrainingData.of(_draw_dataset(film, training_presses, seed))
+    random_presses = _draw_dataset(corrected_film, training_presses, seed)
     test_presses = LabelledPresses(presses.contact[is_held_out], presses.charge_pC[is_held_out], measured=True)
-    return replace(training_data, test=test_presses, provenance=_provenance(film, presses, is_held_out))
+    provenance = _provenance(corrected_film, presses, is_held_out)
+    return replace(TrainingData.of(random_presses), test=test_presses, provenance=provenance)
 
 
 def _usable_presses(rig: Rig, domain: Domain) -> MeasuredPresses:
-    """Return the complete presses within the domain, and log a warning about the others.
+    """Return the complete presses within the domain, and log a warning about the other presses.
+
+    A press is complete if its place, its force and the charges of all electrodes are known.
 
     Args:
         rig: Measured presses and the sensor on which they were made.
         domain: Positions and forces that are used.
 
+    Returns:
+        The usable presses, with charges in the order of the sensor's electrodes.
+
     Raises:
         PressError: If too few presses remain.
     """
     presses = rig.presses.of_electrodes(rig.sensor.electrode_names, rig.sensor.name)
-    min_force, max_force = domain.force_range
     is_incomplete = ~complete(presses)
-    is_outside = ~is_incomplete & domain.is_outside(presses.contact)  # each press is left out for one reason only
+    is_outside = ~is_incomplete & domain.is_outside(presses.contact)  # so that each press counts for one reason only
     is_usable = ~(is_incomplete | is_outside)
     check_enough(int(is_usable.sum()), len(presses), rig.sensor.name)
 
@@ -130,6 +135,7 @@ def _usable_presses(rig: Rig, domain: Domain) -> MeasuredPresses:
     if is_incomplete.any():
         reasons.append(f"{is_incomplete.sum()} with an unknown place, force or charge")
     if is_outside.any():
+        min_force, max_force = domain.force_range
         reasons.append(
             f"{is_outside.sum()} beyond {domain.radius:g} mm from the centre, or outside {min_force:.3g} to "
             f"{max_force:.3g} N"
@@ -140,7 +146,7 @@ def _usable_presses(rig: Rig, domain: Domain) -> MeasuredPresses:
 
 
 def _draw_dataset(film: CorrectedFilm, count: int, seed: int) -> Dataset:
-    """Draw presses of the corrected map, as a dataset on which a network can be trained.
+    """Draw presses whose charges the corrected map computes, as a dataset on which a network can be trained.
 
     Args:
         film: Corrected film.
@@ -152,7 +158,12 @@ def _draw_dataset(film: CorrectedFilm, count: int, seed: int) -> Dataset:
     """
     contact = draw_contacts(np.random.default_rng(seed), film.domain, count)
     charge = film.charges(contact)
-    # Because of its entry for the solver, the dataset counts as simulated.
+    x_mm, y_mm, force_N = contact.T
+    probe_column = np.full(count, film.forward_map.probe.notation)
+    orientation_deg = np.zeros(count)  # the probe is not turned against its notation
+    samples = Samples(x_mm, y_mm, force_N, probe_column, orientation_deg, charge)
+
+    # A dataset with an entry for the solver counts as simulated, not as measured.
     manifest = {
         "ranges": {"radius_mm": film.domain.radius, "force_N": list(film.domain.force_range)},
         SOLVER: {"map": "forward map of the film, corrected by measured presses"},
@@ -160,15 +171,17 @@ def _draw_dataset(film: CorrectedFilm, count: int, seed: int) -> Dataset:
     contact_bytes = np.ascontiguousarray(contact).tobytes()
     charge_bytes = np.ascontiguousarray(charge).tobytes()
     checksum = sha256_of(contact_bytes + charge_bytes)
-    x_mm, y_mm, force_N = contact.T
-    probe = np.full(count, film.forward_map.probe.notation)
-    orientation = np.zeros(count)
-    samples = Samples(x_mm, y_mm, force_N, probe, orientation, charge)
     return Dataset(film.forward_map.sensor, samples, manifest, checksum)
 
 
 def _provenance(film: CorrectedFilm, presses: MeasuredPresses, is_held_out: Booleans) -> Provenance:
-    """Return the card section, the metadata and the files of a model of the corrected film."""
+    """Return the section of the model card, the metadata and the files of a model of the corrected film.
+
+    Args:
+        film: Corrected film.
+        presses: All usable presses.
+        is_held_out: Whether each press is held out for the test, shape (n_press,).
+    """
     measured = {
         "presses_sha256": presses_sha256(presses),
         "trained_on": int((~is_held_out).sum()),
@@ -189,34 +202,38 @@ def _provenance(film: CorrectedFilm, presses: MeasuredPresses, is_held_out: Bool
 
 
 def _sentences(film: CorrectedFilm, presses: MeasuredPresses, is_held_out: Booleans) -> Iterator[str]:
-    """Yield the sentences of the card about the presses and the correction.
+    """Yield the sentences of the model card about the presses and the correction.
 
     Args:
         film: Corrected film.
         presses: All usable presses.
         is_held_out: Whether each press is held out for the test, shape (n_press,).
     """
+    n_fitted = (~is_held_out).sum()
     yield (
-        f"The model was fitted to {(~is_held_out).sum()} measured presses of one film. {is_held_out.sum()} other "
+        f"The model was fitted to {n_fitted} measured presses of one film. {is_held_out.sum()} other "
         f"presses, in `{HELD_OUT}`, were held out, and the errors below are those of these presses."
     )
+    position_std_mm = np.median(presses.position_std_mm)
+    force_std_percent = 100.0 * np.median(presses.force_std)
     yield (
-        f"The places of the presses are known to {np.median(presses.position_std_mm):.3g} mm and the forces to "
-        f"{100.0 * np.median(presses.force_std):.3g} %, as stated with the presses."
+        f"The places of the presses are known to {position_std_mm:.3g} mm and the forces to {force_std_percent:.3g} %, "
+        "as stated with the presses."
     )
     yield (
         "The film was not calibrated, because no network for all films fits its layout and probe. The presses correct "
         "the sensor as described. Where the presses are far apart, the film may differ from the corrected sensor."
     )
-    correction = film.correction
-    min_force, max_force = correction.domain.force_range
-    if correction.is_zero:
+    if film.correction.is_zero:
         yield "The charges are not corrected, because the presses are most probable without a correction."
     else:
+        correction_percent = film.correction_percent(presses.contact)
+        presses_domain = film.correction.domain  # range of the presses to which the correction was fitted
+        min_force, max_force = presses_domain.force_range
         yield (
-            f"The charges are corrected by {film.correction_percent(presses.contact):.2g} % (root mean square), "
+            f"The charges are corrected by {correction_percent:.2g} % (root mean square), "
             "smoothly in place and logarithm of the force. No press was made farther than "
-            f"{correction.domain.radius:.3g} mm from the centre, or outside {min_force:.3g} to {max_force:.3g} N; "
+            f"{presses_domain.radius:.3g} mm from the centre, or outside {min_force:.3g} to {max_force:.3g} N; "
             "there the correction is that of the nearest press."
         )
     if film.is_scattered:

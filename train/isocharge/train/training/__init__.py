@@ -1,1 +1,1 @@
-"""The network and how it is fitted: configuration, optimisers, fit."""
+"""Training of the network that estimates contacts from charges, with its configuration and its optimisers."""

@@ -1,4 +1,7 @@
-"""Settings of a training, which a TOML file with the tables `network` and `training` can change."""
+"""Settings of a training.
+
+A TOML file with the tables `network` and `training` can replace the default values of the settings.
+"""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -17,7 +20,7 @@ MAX_ELECTRODES = 64
 
 
 class DefaultSizes(NamedTuple):
-    """Default sizes of a training, which depend on the number of electrodes.
+    """Default values of the settings that depend on the number of electrodes.
 
     Attributes:
         width: Width of the hidden layers of the contact network.
@@ -26,8 +29,8 @@ class DefaultSizes(NamedTuple):
         steps: Number of optimiser steps of the contact network.
         misfit_steps: Number of optimiser steps of the misfit network.
         misfit_charges: Number of sets of charges from which the misfit network learns.
-        rate_factor: Factor on the learning rate of the contact network. With more electrodes, the loss of a training
-            with the whole rate increases at times.
+        rate_factor: Factor by which the learning rate of the contact network is multiplied. It is less than 1 for many
+            electrodes, because the loss sometimes increases with the full learning rate.
     """
 
     width: int
@@ -60,16 +63,16 @@ Count = Annotated[int, Meta(ge=1, le=10_000_000)]
 
 
 class NetworkConfig(Settings, frozen=True):
-    """Sizes of the contact perceptron and of the misfit perceptron.
+    """Sizes and number format of the contact network and of the misfit network.
 
     Attributes:
         hidden: Widths of the hidden layers of the contact network; None for the width in `DefaultSizes`.
-        misfit_hidden: Widths of the hidden layers of the misfit network, which has the same number of hidden layers;
-            None for the width in `DefaultSizes`.
-        electrodes: Number of electrodes that the dataset must have; 0 for any number.
+        misfit_hidden: Widths of the hidden layers of the misfit network, which must have as many hidden layers as the
+            contact network; None for the width in `DefaultSizes`.
+        electrodes: Number of electrodes that the dataset must have; 0 if every number is allowed.
         activation: Name of the activation of the hidden layers (`isocharge.common.activations`).
-        weights: "int8" rounds the weights between hidden layers to 8 bits and then trains the other weights further.
-            In C the rounded weights take a quarter of the memory.
+        weights: "float32", or "int8" to round the weights between hidden layers to 8 bits and then train the other
+            weights further. In C, the rounded weights take a quarter of the memory.
     """
 
     hidden: Widths | None = None
@@ -79,10 +82,10 @@ class NetworkConfig(Settings, frozen=True):
     weights: Literal["float32", "int8"] = "float32"
 
     def __post_init__(self) -> None:
-        """Check the settings, and raise WrongKey for the first one that is wrong.
+        """Check the settings, and raise WrongKey for the first setting that is wrong.
 
-        If the widths of both perceptrons are given, both need the same number of layers, because the perceptrons are
-        folded into one.
+        If the widths of both networks are given, both networks must have the same number of hidden layers, because they
+        are folded into one perceptron.
         """
         if self.hidden is not None and self.misfit_hidden is not None:
             layer_count = len(self.hidden)
@@ -91,30 +94,38 @@ class NetworkConfig(Settings, frozen=True):
                 raise WrongKey("misfit_hidden", expected, list(self.misfit_hidden))
         if self.activation not in ACTIVATIONS:
             raise WrongKey("activation", f"one of {', '.join(ACTIVATIONS)}", self.activation)
-        is_any_number = self.electrodes == 0
+        allows_every_number = self.electrodes == 0
         is_in_range = 3 <= self.electrodes <= MAX_ELECTRODES
-        if not (is_any_number or is_in_range):
+        if not (allows_every_number or is_in_range):
             raise WrongKey("electrodes", f"0 (as the dataset) or 3 to {MAX_ELECTRODES}", self.electrodes)
 
     def contact_widths(self, n_electrode: int) -> Widths:
-        """Return the widths of the hidden layers of the contact network for a number of electrodes."""
+        """Return the widths of the hidden layers of the contact network.
+
+        Args:
+            n_electrode: Number of electrodes, which determines the widths if no widths are given.
+        """
         if self.hidden is not None:
             return self.hidden
         sizes = DefaultSizes.of(n_electrode)
         return (sizes.width,) * self._layer_count(sizes)
 
     def misfit_widths(self, n_electrode: int) -> Widths:
-        """Return the widths of the hidden layers of the misfit network for a number of electrodes."""
+        """Return the widths of the hidden layers of the misfit network.
+
+        Args:
+            n_electrode: Number of electrodes, which determines the widths if no widths are given.
+        """
         if self.misfit_hidden is not None:
             return self.misfit_hidden
         sizes = DefaultSizes.of(n_electrode)
         return (sizes.misfit_width,) * self._layer_count(sizes)
 
     def _layer_count(self, sizes: DefaultSizes) -> int:
-        """Return the number of given widths, or the default number of hidden layers if no widths are given.
+        """Return the number of hidden layers, which is the number of given widths or the default number.
 
         Args:
-            sizes: Default sizes.
+            sizes: Default sizes, which are used if no widths are given.
         """
         given_widths = self.hidden or self.misfit_hidden
         return sizes.layers if given_widths is None else len(given_widths)
@@ -128,16 +139,16 @@ class TrainingConfig(Settings, frozen=True):
         misfit_steps: Number of optimiser steps of the misfit network; None for the number in `DefaultSizes`.
         misfit_charges: Number of sets of charges from which the misfit network learns; None for the number in
             `DefaultSizes`.
-        batch: Number of samples in a batch.
+        batch: Number of presses in a batch.
         learning_rate: Largest learning rate of the optimiser SOAP.
         patience: Number of steps without a better validation score after which the training stops. The network then
-            gets the best weights.
-        hold_out: Fraction of the positions that are used for testing; half as many are used for validation. Of measured
-            presses, every command uses the same fifth for testing.
-        noise: Noise that is drawn again in every step: a `NoiseModel`, or a name that `noise_model` takes.
-        seed: Seed of weights, batches, noise and split.
-        threads: Number of CPU threads. One thread is nearly as fast as two for these sizes, and it is not delayed by
-            other programs on the second core.
+            gets the weights with the best score.
+        hold_out: Fraction of the positions that are used for testing. Half as many positions are used for validation.
+            If the presses are measured, the same fifth of them is always used for testing.
+        noise: Noise that is drawn again in every step, as a `NoiseModel` or as a name that `noise_model` accepts.
+        seed: Seed of the initial weights, the batches, the noise and the split of the presses.
+        threads: Number of CPU threads. For networks of these sizes, one thread is nearly as fast as two threads, and
+            programs on the second core do not delay it.
     """
 
     steps: Count | None = None
@@ -152,23 +163,35 @@ class TrainingConfig(Settings, frozen=True):
     threads: Annotated[int, Meta(ge=1, le=64)] = 1
 
     def contact_step_count(self, n_electrode: int) -> int:
-        """Return the number of optimiser steps of the contact network for a number of electrodes."""
+        """Return the number of optimiser steps of the contact network.
+
+        Args:
+            n_electrode: Number of electrodes, which determines the number of steps if the setting is None.
+        """
         return self.steps if self.steps is not None else DefaultSizes.of(n_electrode).steps
 
     def misfit_step_count(self, n_electrode: int) -> int:
-        """Return the number of optimiser steps of the misfit network for a number of electrodes."""
+        """Return the number of optimiser steps of the misfit network.
+
+        Args:
+            n_electrode: Number of electrodes, which determines the number of steps if the setting is None.
+        """
         return self.misfit_steps if self.misfit_steps is not None else DefaultSizes.of(n_electrode).misfit_steps
 
     def misfit_charge_count(self, n_electrode: int) -> int:
-        """Return the number of sets of charges from which the misfit network learns, for a number of electrodes."""
+        """Return the number of sets of charges from which the misfit network learns.
+
+        Args:
+            n_electrode: Number of electrodes, which determines the result if the setting is None.
+        """
         return self.misfit_charges if self.misfit_charges is not None else DefaultSizes.of(n_electrode).misfit_charges
 
     @property
     def noise_model(self) -> NoiseModel:
-        """Noise model of the setting `noise`.
+        """Noise model that the setting `noise` contains or names.
 
         Raises:
-            InputError: If its name is unknown.
+            InputError: If the name is unknown.
         """
         return noise_model(self.noise) if isinstance(self.noise, str) else self.noise
 
@@ -180,7 +203,7 @@ class FitConfig(Settings, frozen=True):
     training: TrainingConfig = TrainingConfig()
 
     def for_electrodes(self, n_electrode: int) -> "FitConfig":
-        """Return the settings with numbers instead of the default sizes, which depend on the number of electrodes."""
+        """Return a copy of the settings in which the default sizes for a number of electrodes replace None."""
         network = replace(
             self.network,
             hidden=self.network.contact_widths(n_electrode),
@@ -195,11 +218,11 @@ class FitConfig(Settings, frozen=True):
         return FitConfig(network, training)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the settings as tables for JSON."""
+        """Return the settings as nested dictionaries that can be written to JSON."""
         return json.decode(json.encode(self), type=dict[str, Any])
 
     def checked(self) -> "FitConfig":
-        """Check the ranges of all settings, as for a file, and return the settings.
+        """Check the ranges of all settings as if they were read from a file, and return a copy of the settings.
 
         Raises:
             ConfigError: If a setting is out of its range.
@@ -208,7 +231,7 @@ class FitConfig(Settings, frozen=True):
 
 
 def load_config(path: Path) -> FitConfig:
-    """Read the settings of a training from a TOML file; missing keys have their default values.
+    """Read the settings of a training from a TOML file. Missing keys have their default values.
 
     Raises:
         ConfigError: If the file cannot be read, a key is unknown, or a value has the wrong type or range.

@@ -1,16 +1,17 @@
-"""Correlations of the errors of x, y and ln F, as additional answers of a trained network.
+"""Additional answers of a trained network for the correlations between its errors of x, y and ln F.
 
-The other answers of the network do not change. A correlation matrix is the Gram matrix of three unit vectors. The
-vectors (1, 0, 0), (cos a, sin a, 0), (cos b, sin b cos c, sin b sin c) give a valid matrix for any angles a, b and c.
-These vectors are the rows of the Cholesky factor of the matrix. Products of sines and cosines are sums of cosines, so
-the correlations are linear in eight cosines:
+The other answers of the network do not change. Every matrix of correlations between three errors is the Gram matrix of
+three unit vectors. The vectors (1, 0, 0), (cos a, sin a, 0) and (cos b, sin b cos c, sin b sin c) have unit length for
+all angles a, b and c, so they always give a valid correlation matrix. The vectors are also the rows of the Cholesky
+factor of this matrix. Products of sines and cosines can be written as sums of cosines. The correlations are therefore
+linear in eight cosines:
 
     xy = cos a,  xF = cos b,
     yF = (cos(a - b) + cos(a + b)) / 2 + (cos(a - b - c) + cos(a - b + c) - cos(a + b - c) - cos(a + b + c)) / 4.
 
-In the exported graph, one node computes the cosines and one node their sums. The angles are linear functions of the
-last hidden layer of the contact perceptron and of the input features. These functions are fitted to the errors of the
-network by maximum likelihood.
+In the exported graph, one node computes the cosines, and one node computes their weighted sums. The angles are linear
+functions of the last hidden layer of the contact perceptron and of the input features. The linear functions are fitted
+to the errors of the network by maximum likelihood.
 """
 
 import logging
@@ -36,32 +37,34 @@ RIDGE = 1e-4
 """Weight of the squared coefficients in the loss, for inputs of unit variance. It keeps a fit to few presses stable."""
 
 MIN_RELATIVE_STD = 0.02
-"""Standard deviation of a principal component of the inputs, relative to the largest, below which the component is not
-scaled to unit variance. Its coefficients would otherwise be too large for float32."""
+"""Smallest standard deviation of a principal component of the inputs that is scaled to unit variance.
+
+It is relative to the largest standard deviation. The coefficients of smaller components would be too large for float32.
+"""
 
 WHITENING_STRIDE = 7
-"""The whitening of the inputs is computed from every seventh example."""
+"""Distance between the examples from which the whitening of the inputs is computed. All other examples are skipped."""
 
 GRADIENT_TOLERANCE = 2e-3
 """Largest derivative of the loss at which the minimisation stops."""
 
 MAX_STARTS = 5
-"""Number of times that the minimisation may be started. A line search can fail where two unit vectors nearly meet."""
+"""Largest number of starts of the minimisation. A line search can fail if two unit vectors are nearly equal."""
 
 MAX_ITERATIONS = 90
-"""Number of iterations of all starts. More iterations change the coverage by less than 0.005."""
+"""Largest total number of iterations of all starts. More iterations hardly change the coverage."""
 
 N_UPDATES = 20
 """Number of past updates that L-BFGS keeps."""
 
 FIRST_STEP = 0.125
-"""Length of the first step of the minimisation. A longer step leads to angles at which unit vectors meet."""
+"""Length of the first step of the minimisation. A longer step can lead to angles with two equal unit vectors."""
 
 MAX_DEVIATION = 5.0
-"""Largest error, in standard deviations, that the loss distinguishes; larger errors are not Gaussian."""
+"""Largest error in the loss, in standard deviations. Larger errors are reduced to it, because they are not Gaussian."""
 
 MIN_SINE = 1e-4
-"""Smallest absolute value of the sine of an angle, so that quotients stay within the range of float32."""
+"""Smallest absolute value of a sine by which the loss divides, so that quotients stay within the range of float32."""
 
 ANGLES_TO_COSINE_ARGUMENTS = np.array(
     [
@@ -80,9 +83,9 @@ The arguments are a, b, a - b, a + b, a - b - c, a - b + c, a + b - c and a + b 
 def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: NoiseModel, seed: int) -> FoldedNetwork:
     """Return a network that also estimates the correlations between its errors of x, y and ln F.
 
-    Three angles a, b and c determine the correlations; see the description of this module. Each angle is a linear
-    function of the input features and of the hidden units that influence the contact. The linear functions are fitted
-    to the errors of the network for presses with noise. The other outputs do not change.
+    Three angles a, b and c determine the correlations, as the description of this module explains. Each angle is a
+    linear function of the input features and of the hidden units that influence the contact. The linear functions are
+    fitted to the errors of the network for presses with noise. The other outputs of the network do not change.
 
     Args:
         network: The trained network.
@@ -91,27 +94,31 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
         seed: Seed of the noise.
 
     Returns:
-        Network with eight additional answers: the arguments of the cosines from which the correlations are computed.
+        Network with eight additional answers, which are the arguments of the cosines.
     """
     # Errors of (x, y, ln F) and their estimated standard deviations, each of shape (n, 3)
     layers = network.layers
     examples = presses.repeated(N_EXAMPLES)
     features = network.features.evaluate(examples.noisy(noise, seed))
     hidden_output = evaluate_hidden_layers(layers.hidden, layers.activation, features)
-    contact, std, *_ = network.outputs_from_answers(evaluate_output_layer(layers, hidden_output, features))
-    truth = examples.contact
-    error = np.column_stack([truth[:, :2] - contact[:, :2], np.log(truth[:, 2] / contact[:, 2])])
-    error_std = np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]])
+    answers = evaluate_output_layer(layers, hidden_output, features)
+    contact, std, *_ = network.outputs_from_answers(answers)
+    true_contact = examples.contact
+    position_error = true_contact[:, :2] - contact[:, :2]
+    log_force_error = np.log(true_contact[:, 2] / contact[:, 2])
+    log_force_std = std[:, 2] / contact[:, 2]
+    error = np.column_stack([position_error, log_force_error])
+    error_std = np.column_stack([std[:, :2], log_force_std])
 
     # Fit the angles a, b and c.
     contact_weight = layers.last.weight[:, :N_CONTACT_ANSWERS]  # shape (n_hidden, N_CONTACT_ANSWERS)
     is_contact_unit = np.any(contact_weight != 0.0, axis=1)
     inputs = np.hstack([hidden_output[:, is_contact_unit], features])
-    with threadpool_limits(1):  # the steps are small: two threads would take three times as long
+    with threadpool_limits(1):  # the steps are so small that two threads would be slower than one
         angles = _fit_angles(inputs, error / error_std)
 
-    # The inputs of the fit were the hidden units of the contact, followed by the features. The hidden units of the
-    # misfit get the weight zero.
+    # The inputs of the fit were the hidden units that influence the contact, followed by the features. All other hidden
+    # units get the weight zero.
     n_contact_unit = np.count_nonzero(is_contact_unit)
     contact_unit_weight, skip_weight = np.split(angles.weight, [n_contact_unit])
     hidden_weight = np.zeros((hidden_output.shape[1], 3))
@@ -128,7 +135,7 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
 
     The inputs are whitened for the fit. The returned layer includes this whitening. The minimised function is
     `correlation_loss` plus a penalty on the squared weights. The first step of the L-BFGS method has a length of about
-    1, so the variables of the minimisation are the bias and the weights in units of `FIRST_STEP`.
+    1. The variables of the minimisation are therefore the bias and the weights divided by `FIRST_STEP`.
 
     Args:
         inputs: Inputs of the layer, shape (n, k).
@@ -139,45 +146,48 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
     """
     whitening_inputs = inputs[::WHITENING_STRIDE]
     mean, matrix = whitening(whitening_inputs, MIN_RELATIVE_STD)
-    white_inputs = np.ascontiguousarray((inputs - mean) @ matrix, dtype=np.float32)
+    whitened_inputs = np.ascontiguousarray((inputs - mean) @ matrix, dtype=np.float32)
     clipped_deviation = np.clip(deviation, -MAX_DEVIATION, MAX_DEVIATION)
-    targets = np.ascontiguousarray(clipped_deviation.T, dtype=np.float32)  # shape (3, n)
+    transposed_deviation = np.ascontiguousarray(clipped_deviation.T, dtype=np.float32)  # shape (3, n)
     n_input = inputs.shape[1]
 
-    def loss(scaled: Array) -> tuple[float, Array]:
-        """Return the loss and its gradient with respect to bias and weights in units of FIRST_STEP.
+    def loss(scaled_parameters: Array) -> tuple[float, Array]:
+        """Return the loss and its gradient with respect to the scaled parameters.
 
         Args:
-            scaled: Bias and weights of the three angles divided by FIRST_STEP, flattened, shape (3 (1 + n_input),).
+            scaled_parameters: Bias and weights of the three angles divided by `FIRST_STEP`, shape (3 * (1 + n_input),).
         """
-        bias, weight = np.split(FIRST_STEP * scaled.reshape(-1, 3), [1])  # shapes (1, 3) and (n_input, 3)
+        parameters = FIRST_STEP * scaled_parameters.reshape(-1, 3)
+        bias, weight = np.split(parameters, [1])  # shapes (1, 3) and (n_input, 3)
         float32_weight = weight.astype(np.float32)
-        angles = float32_weight.T @ white_inputs.T + bias.astype(np.float32).T  # shape (3, n)
-        correlation_part, angle_gradient = correlation_loss(angles, targets)
+        angles = float32_weight.T @ whitened_inputs.T + bias.astype(np.float32).T  # shape (3, n)
+        loss_without_penalty, angle_gradient = correlation_loss(angles, transposed_deviation)
         penalty = RIDGE * float((weight**2).sum())
 
         bias_gradient = angle_gradient.sum(axis=1, dtype=float)
-        weight_gradient = white_inputs.T @ angle_gradient.T + 2.0 * RIDGE * float32_weight
-        gradient = np.vstack([bias_gradient, weight_gradient])
-        return correlation_part + penalty, FIRST_STEP * gradient.ravel()
+        weight_gradient = whitened_inputs.T @ angle_gradient.T + 2.0 * RIDGE * float32_weight
+        parameter_gradient = np.vstack([bias_gradient, weight_gradient])
+        return loss_without_penalty + penalty, FIRST_STEP * parameter_gradient.ravel()
 
     # The search begins without correlations: all angles are right angles, whose cosines are zero.
-    start = np.zeros((1 + n_input, 3))
+    start = np.zeros((1 + n_input, 3))  # the first row contains the bias
     start[0] = 0.5 * np.pi / FIRST_STEP
     scaled_solution = _minimise(loss, start.ravel())
-    bias, white_weight = np.split(FIRST_STEP * scaled_solution.reshape(start.shape), [1])
-    # ((inputs - mean) @ matrix) @ white_weight + bias = inputs @ weight + (bias - mean @ weight)
-    weight = matrix @ white_weight
+    solution = FIRST_STEP * scaled_solution.reshape(start.shape)
+    bias, weight_of_whitened = np.split(solution, [1])
+    # ((inputs - mean) @ matrix) @ weight_of_whitened + bias = inputs @ weight + (bias - mean @ weight)
+    weight = matrix @ weight_of_whitened
     return Layer(weight, bias[0] - mean @ weight)
 
 
 def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Array:
     """Minimise a loss by the L-BFGS method, which is started again if a line search fails.
 
-    The search ends if the gradient is below the tolerance, or after `MAX_ITERATIONS`. If it ends because the line
-    searches of all starts have failed, a warning is logged.
+    The search ends if all derivatives are below a tolerance, or after `MAX_ITERATIONS` iterations. If the line search
+    has failed in all `MAX_STARTS` starts, the search ends as well, and a warning is logged.
 
-    The position is given in units of `FIRST_STEP`, so its gradient is `FIRST_STEP` times that of the loss.
+    A position contains parameters divided by `FIRST_STEP`. The derivatives with respect to the position are therefore
+    `FIRST_STEP` times the derivatives with respect to the parameters.
 
     Args:
         loss: Function that returns the loss and its gradient at a position.
@@ -186,7 +196,7 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Arr
     Returns:
         Position at which the search ended, shape (n,).
     """
-    tolerance = FIRST_STEP * GRADIENT_TOLERANCE
+    tolerance = FIRST_STEP * GRADIENT_TOLERANCE  # for derivatives with respect to the position
     # With ftol = 0, a small change of the loss does not end the search.
     options = {"ftol": 0.0, "gtol": tolerance, "maxcor": N_UPDATES}
     position = start
@@ -199,16 +209,17 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Arr
         is_converged = np.abs(result.jac).max() <= tolerance
         if is_converged or remaining_iterations <= 0:
             return np.asarray(position)
-    largest_gradient = np.abs(result.jac).max() / FIRST_STEP
+    largest_gradient = np.abs(result.jac).max() / FIRST_STEP  # in the last start, with respect to the parameters
     _log.warning("the training of the correlations has not converged: the gradient is %.1g", largest_gradient)
     return np.asarray(position)
 
 
 def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tuple[float, Array | Singles]:
-    """Compute the negative logarithm of a Gaussian likelihood with unit variances, without its constant.
+    """Compute the negative logarithm of the Gaussian likelihood of correlated errors with unit variances.
 
-    The rows (1, 0, 0), (cos a, sin a, 0) and (cos b, sin b cos c, sin b sin c) are the Cholesky factor of the matrix of
-    correlations. The errors are whitened with it. Sines are limited to at least `MIN_SINE` in magnitude.
+    The constant term is omitted. The Cholesky factor of the correlation matrix has the rows (1, 0, 0), (cos a, sin a,
+    0) and (cos b, sin b cos c, sin b sin c). The errors are whitened with the inverse of this factor. The absolute
+    values of the sines are limited to at least `MIN_SINE`.
 
     Args:
         angles: Angles a, b and c, shape (3, n), rad.
@@ -217,19 +228,19 @@ def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tup
     Returns:
         Mean of the loss over the n errors, and the derivatives of the mean with respect to the angles, shape (3, n).
     """
-    sine = np.sin(angles)
+    sines = np.sin(angles)
     cos_a, cos_b, cos_c = np.cos(angles)
-    sin_a, sin_b, sin_c = np.copysign(np.maximum(np.abs(sine), MIN_SINE), sine)
+    sin_a, sin_b, sin_c = np.copysign(np.maximum(np.abs(sines), MIN_SINE), sines)
 
-    # The Cholesky factor is inverted row by row: the covariance of the whitened errors is the identity matrix. The
-    # determinant of the factor is sin a sin b sin c. The square of the first error does not depend on the angles.
+    # Whiten the errors by the inverse of the Cholesky factor, row by row. The determinant of the factor is
+    # sin a sin b sin c. The loss does not include the square of the first error, which does not depend on the angles.
     x_deviation, y_deviation, force_deviation = deviation
     white_x = x_deviation
     white_y = (y_deviation - cos_a * white_x) / sin_a
     white_force = (force_deviation - cos_b * white_x - sin_b * cos_c * white_y) / (sin_b * sin_c)
     loss = np.log(np.abs(sin_a * sin_b * sin_c)) + 0.5 * (white_y**2 + white_force**2)
 
-    # Derivatives of the loss with respect to a, b and c, in which the cotangents replace quotients
+    # Derivatives of the loss with respect to a, b and c
     cot_a = cos_a / sin_a
     cot_b = cos_b / sin_b
     cot_c = cos_c / sin_c

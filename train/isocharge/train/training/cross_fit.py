@@ -1,14 +1,14 @@
 """Training of a network on measured presses alone, for a sensor that is not simulated.
 
-Five networks are trained, each without a fifth of the places (cross-validation). The errors of the model are measured
-with the answers of each network at the places on which it was not trained. The same answers give factors by which the
-standard deviations are multiplied. The intervals then contain the truth as often as they state (split conformal
-prediction, Papadopoulos et al., 2002). The mean of the five networks has smaller errors than a single network. One
-further network learns this mean (Hinton et al., 2015), so that the released model is as small and fast as the models of
-simulated sensors.
+For a cross-validation, five networks are trained, each without the presses at a fifth of the places. The errors of the
+model are estimated from the answers of each network to the presses that were left out of its training. The same answers
+determine factors by which the standard deviations are multiplied. With these factors, the confidence intervals contain
+the true values as often as they should (split conformal prediction, Papadopoulos et al., 2002). The mean answer of the
+five networks has smaller errors than the answer of a single network. One further network learns this mean answer
+(Hinton et al., 2015). The released model is therefore as small and fast as the models of simulated sensors.
 
-The noise of the presses is estimated from the presses (`isocharge.train.data.channel_noise`). In every training step,
-half of this noise is added to the charges as a regularisation.
+The noise of the charges is estimated from the presses themselves (`isocharge.train.data.channel_noise`). In every
+training step, random noise with half of the estimated size is added to the charges as a regularisation.
 """
 
 import logging
@@ -50,21 +50,21 @@ from isocharge.train.training.network import InverseNetwork, TrainablePerceptron
 _log = logging.getLogger(__name__)
 
 N_FOLDS = 5
-"""Number of folds of the cross-validation, and of networks that are trained for it."""
+"""Number of folds of the cross-validation, which is also the number of networks that are trained for it."""
 
 CHANNELS = (3, 8)
 """Smallest and largest number of channels."""
 
 DEFAULT_LARGEST_STEPS = 2_000
-"""Default of the largest number of steps, unless the default for simulated presses is larger."""
+"""Default of the largest number of steps. The default for simulated presses is used instead if it is larger."""
 
 FIRST_STEPS = 1_200
-"""Number of steps that is tried first. It is doubled as long as the validation score improves, because networks soon
-overfit presses with noise."""
+"""Number of steps of the first training. It is doubled only as long as the validation score improves, because networks
+soon overfit presses with noise."""
 
 TRAINING_NOISE_FACTOR = 0.5
 """Noise that is added in every step, relative to the noise of the presses. With a larger factor, the network cannot
-resolve the map. With a smaller factor, it overfits the presses."""
+resolve the map from charges to contacts. With a smaller factor, it overfits the presses."""
 
 DISTILLATION_NOISE_FACTORS = (0.0, 0.5, 0.5, 1.0, 1.0, 2.0)
 """Noise that is added to each copy of the presses from which the last network learns, relative to the noise of the
@@ -94,19 +94,20 @@ def fit_presses(
 ) -> Fitted:
     """Train a network on measured presses of any sensor with three to eight channels.
 
-    Several networks are trained for a cross-validation. One further network then learns the mean outputs of these
-    networks (distillation), and the misfits. A warning is logged if presses are left out, and another one if all
-    presses have the same force.
+    Several networks are trained for a cross-validation. One further network is then trained on the mean outputs of
+    these networks (distillation) and on misfits. A warning is logged if presses are left out. Another warning is logged
+    if all presses have nearly the same force.
 
     Args:
         presses: At least 500 presses at 50 places. Presses with an unknown place, force or charge are left out.
         name: Name of the sensor.
-        config: Settings. `steps` is the largest number of steps; `noise` and `hold_out` are not used.
+        config: Settings. The setting `steps` is the largest number of steps. The settings `noise` and `hold_out` are
+            not used.
         probes: Notations of the probes.
         run: Run that saves the state, so that an interrupted training can be continued.
 
     Returns:
-        The network that learned from the others, with everything that a release needs.
+        The network that learned the mean outputs, with everything that a release needs.
 
     Raises:
         PressError: If there are too few presses or places, fewer than three or more than eight channels, or if
@@ -122,14 +123,14 @@ def fit_presses(
     noise = ChannelNoise.of(labelled.charge, domain.to_unit(labelled.contact))
     with threads_and_seed(training.threads, training.seed):
         features = WhitenedFeatures.fit_signed(labelled.charge, noise.transition_charge(labelled.charge))
-        # The last training uses the first network. The other networks are the members of the cross-validation.
-        network, *members = (InverseNetwork(domain, features, settings.network) for _ in range(1 + N_FOLDS))
+        # The first network is trained last, on the mean outputs of the other networks. Each of these belongs to a fold.
+        network, *fold_networks = (InverseNetwork(domain, features, settings.network) for _ in range(1 + N_FOLDS))
         fold = folds_by_place(labelled.contact, N_FOLDS)
-        steps = _train_members(members, labelled, fold, noise, training, run)
-        contact, std = _cross_validated_contact(members, labelled.charge, fold)
+        steps = _train_fold_networks(fold_networks, labelled, fold, noise, training, run)
+        contact, std = _cross_validated_contact(fold_networks, labelled.charge, fold)
         position_factor, force_factor = std_factors(contact, std, labelled.contact)
 
-        distillation = _distillation_stage(network, members, labelled, noise, training)
+        distillation = _distillation_stage(network, fold_networks, labelled, noise, training)
         train_perceptron(distillation, network.contact, settings, run)
         draw = partial(_misfit_examples, labelled, domain, noise, training)
         examples = _saved_or_drawn(draw, run)
@@ -167,7 +168,7 @@ def fit_presses(
 
 
 def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, object]:
-    """Return everything that determines the weights, as the identity of a resumable run."""
+    """Return all values on which the trained weights depend. They identify a resumable run."""
     return {
         "presses_sha256": presses_sha256(presses),
         "electrodes": list(presses.electrodes),
@@ -178,26 +179,28 @@ def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, o
 
 
 def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
-    """Return the presses whose place, force and charges are all known, after a check that they suffice for a training.
+    """Select the presses whose place, force and charges are all known, and check that they suffice for a training.
 
-    A warning is logged if presses are left out, and another one if all presses have nearly the same force.
+    A warning is logged if presses are left out. Another warning is logged if all presses have nearly the same force.
 
     Args:
-        presses: All presses of the file.
+        presses: All presses of a file.
 
     Raises:
         PressError: If there are too few presses or places, fewer than three or more than eight channels, or if
             `check_measured_presses` finds a fault.
     """
-    names = presses.electrodes
+    channel_names = presses.electrodes
     fewest_channels, most_channels = CHANNELS
-    if not fewest_channels <= len(names) <= most_channels:
+    if not fewest_channels <= len(channel_names) <= most_channels:
         raise PressError(
-            f"expected {fewest_channels} to {most_channels} channels, got {len(names)} ({cut(', '.join(names))}): "
-            "every column without another meaning is one; leave other columns out of the file"
+            f"expected {fewest_channels} to {most_channels} channels, got {len(channel_names)} "
+            f"({cut(', '.join(channel_names))}): every column without another meaning is one; leave other columns out "
+            "of the file"
         )
 
-    usable = presses[complete(presses)]
+    is_complete = complete(presses)  # whether the place, the force and all charges of each press are known
+    usable = presses[is_complete]
     rounded_places_mm = np.round(usable.contact[:, :2], 3)  # places within a micrometre count as the same place
     place_count = len(np.unique(rounded_places_mm, axis=0))
     if len(usable) < FEWEST or place_count < FEWEST_POSITIONS:
@@ -217,14 +220,14 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
 
 
 def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]:
-    """Compute the factors by which standard deviations must be multiplied to agree with the errors.
+    """Compute the factors by which standard deviations must be multiplied in order to agree with the observed errors.
 
-    With one factor, the 68 % intervals contain 68 % of the true values. With another factor, the 95 % intervals contain
-    95 %. The geometric mean of both factors is returned.
+    With a first factor, the intervals of one standard deviation contain 68 % of the true values. With a second factor,
+    the 95 % intervals contain 95 % of the true values. The result is the geometric mean of these two factors.
 
     Args:
-        contact: Contacts (x, y, F) that were estimated by networks without training on these presses, shape (n, 3), mm
-            and N.
+        contact: Contacts (x, y, F) that were estimated by networks that were not trained on these presses, shape (n,
+            3), mm and N.
         std: Standard deviations of the estimated contacts, shape (n, 3).
         truth: True contacts, shape (n, 3).
 
@@ -236,24 +239,24 @@ def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]
 
 
 def _std_factor(deviation: Array) -> float:
-    """Compute one factor; see `std_factors`.
+    """Compute one of the factors that `std_factors` returns.
 
     Args:
         deviation: Absolute errors divided by their standard deviations, any shape.
     """
-    # The deviations that the stated fractions of the errors do not exceed. For a normal distribution with the reported
-    # standard deviations, they would be 1 and `TWO_STD_LIMIT`, so each gives a factor.
-    one_std, two_std = np.quantile(deviation, [ONE_STD_COVERAGE, TWO_STD_COVERAGE])
-    return float(np.sqrt(one_std * two_std / TWO_STD_LIMIT))
+    # If the standard deviations were right, the first quantile would be 1 and the second would be `TWO_STD_LIMIT`.
+    first_quantile, second_quantile = np.quantile(deviation, [ONE_STD_COVERAGE, TWO_STD_COVERAGE])
+    return float(np.sqrt(first_quantile * second_quantile / TWO_STD_LIMIT))  # geometric mean of two factors
 
 
 def _with_defaults_for_measured(config: TrainingConfig, n_electrode: int) -> TrainingConfig:
-    """Return the settings with a default for each number of steps or charges that is not given.
+    """Return a copy of the settings in which missing numbers of steps and charges have defaults for measured presses.
 
-    The defaults are larger than for simulated presses of a few electrodes, because measured presses are few and noisy.
+    Measured presses are few and noisy. Their defaults are therefore larger than the defaults for simulated presses of
+    sensors with few electrodes.
 
     Args:
-        config: Settings of the training.
+        config: Settings in which the numbers may be missing.
         n_electrode: Number of electrodes.
     """
     default_steps = max(config.contact_step_count(n_electrode), DEFAULT_LARGEST_STEPS)
@@ -265,35 +268,35 @@ def _with_defaults_for_measured(config: TrainingConfig, n_electrode: int) -> Tra
     )
 
 
-def _train_members(
-    members: list[InverseNetwork],
+def _train_fold_networks(
+    fold_networks: list[InverseNetwork],
     presses: LabelledPresses,
     fold: Integers,
     noise: ChannelNoise,
     config: TrainingConfig,
     run: ResumableRun | None,
 ) -> int:
-    """Train each network on the presses of the other folds.
+    """Train one network for each fold on the presses of all other folds.
 
-    The number of steps is doubled until the validation score of the first network no longer improves. All networks are
-    then trained with the best number of steps.
+    The number of steps is doubled until the validation score of the first network no longer improves. The other
+    networks are then trained with the number of steps that was best for the first network.
 
     Args:
-        members: Networks, one for each fold.
+        fold_networks: Networks to train, one for each fold.
         presses: All presses.
-        fold: Fold of each press, shape (n,).
-        noise: Noise of the presses.
+        fold: Index of the fold of each press, shape (n,).
+        noise: Noise of the charges.
         config: Largest number of steps, learning rate and seed.
         run: Run that saves the state; None to save nothing.
 
     Returns:
-        Number of steps.
+        Number of steps that was best for the first network.
     """
 
     def train(fold_index: int, steps: int) -> Descent:
         """Train the network of one fold with a number of steps, and return the finished training.
 
-        The presses of the fold are used for validation, and those of the other folds for training.
+        The presses of this fold are used for validation. The presses of all other folds are used for training.
 
         Args:
             fold_index: Index of the fold and of its network.
@@ -301,22 +304,23 @@ def _train_members(
         """
         is_validation = fold == fold_index
         stage = contact_stage(
-            members[fold_index],
+            fold_networks[fold_index],
             presses[~is_validation],
             presses[is_validation],
             noise.scaled(TRAINING_NOISE_FACTOR),
             structs.replace(config, steps=steps),
         )
         named_stage = replace(stage, name=f"contact-{fold_index + 1}-{steps}")
-        patience = max(steps // 2, 1)  # end after half of the steps without a better score
+        patience = max(steps // 2, 1)  # the training ends after half of its steps without a better score
         descent = Descent(named_stage, config.learning_rate, patience, config.seed + fold_index)
         descent.run(run)
         return descent
 
-    first_member = members[0]
-    largest_steps = config.contact_step_count(first_member.n_electrode)
-    steps = _train_with_best_steps(first_member.contact, partial(train, 0), largest_steps)
-    for fold_index in range(1, len(members)):
+    first_network = fold_networks[0]
+    largest_steps = config.contact_step_count(first_network.n_electrode)
+    train_first_network = partial(train, 0)  # function of the number of steps
+    steps = _train_with_best_steps(first_network.contact, train_first_network, largest_steps)
+    for fold_index in range(1, len(fold_networks)):
         train(fold_index, steps)
     return steps
 
@@ -324,11 +328,12 @@ def _train_members(
 def _train_with_best_steps(network: TrainablePerceptron, train: Callable[[int], Descent], largest_steps: int) -> int:
     """Train a network with more and more steps, and keep the weights of the best training.
 
-    Each training begins at the same initial weights and has twice the steps of the training before. The trainings end
-    if the validation score is no better than before, or if twice the steps would exceed `largest_steps`.
+    Each training begins with the same initial weights, and has twice as many steps as the previous training. The
+    function stops if the validation score of a training is not better than that of the previous training, or if the
+    number of steps would exceed `largest_steps`.
 
     Args:
-        network: The network, which is trained.
+        network: Network to train. Its present weights are the initial weights.
         train: Function that trains the network with a number of steps, and returns the finished training.
         largest_steps: Largest number of steps.
 
@@ -350,47 +355,49 @@ def _train_with_best_steps(network: TrainablePerceptron, train: Callable[[int], 
     return steps
 
 
-def _cross_validated_contact(members: list[InverseNetwork], charge: Array, fold: Integers) -> tuple[Array, Array]:
-    """Estimate each contact with the network that was not trained on it.
+def _cross_validated_contact(fold_networks: list[InverseNetwork], charge: Array, fold: Integers) -> tuple[Array, Array]:
+    """Estimate the contact of each press with the network that was not trained on this press.
 
     Args:
-        members: Networks, one for each fold.
+        fold_networks: Networks, one for each fold, which were trained on the presses of all other folds.
         charge: Charges of all presses, shape (n, n_electrode), pC.
-        fold: Fold of each press, shape (n,).
+        fold: Index of the fold of each press, shape (n,).
 
     Returns:
         Contacts, shape (n, 3), mm and N, and their standard deviations, shape (n, 3).
     """
     contact = np.empty((len(charge), 3))
     std = np.empty((len(charge), 3))
-    for fold_index, member in enumerate(members):
-        # The network estimates all presses, of which those of its own fold are kept.
+    for fold_index, network in enumerate(fold_networks):
+        # The network estimates the contacts of all presses. Only the contacts of its own fold are used.
         with torch.no_grad():
-            member_contact, member_std, _ = member(as_tensor(charge))
+            estimated_contact, estimated_std, _ = network(as_tensor(charge))
         is_in_fold = fold == fold_index
-        contact[is_in_fold] = member_contact.double().numpy()[is_in_fold]
-        std[is_in_fold] = member_std.double().numpy()[is_in_fold]
+        contact[is_in_fold] = estimated_contact.double().numpy()[is_in_fold]
+        std[is_in_fold] = estimated_std.double().numpy()[is_in_fold]
     return contact, std
 
 
 def _distillation_stage(
     network: InverseNetwork,
-    members: list[InverseNetwork],
+    fold_networks: list[InverseNetwork],
     presses: LabelledPresses,
     noise: ChannelNoise,
     config: TrainingConfig,
 ) -> TrainingStage:
-    """Return the training of a network whose targets are the mean outputs of other networks (distillation).
+    """Define the training of a network on the mean outputs of other networks (distillation).
+
+    The inputs are copies of the charges of the presses with noise of several sizes, in random order. The last copies
+    are used for validation. The number of copies for validation is half the number of presses.
 
     Args:
-        network: The network that is trained.
-        members: Networks whose mean outputs are the targets.
-        presses: All presses. The inputs are copies of their charges with noise of several sizes, in random order. The
-            last copies, half as many as there are presses, are used for validation.
-        noise: Noise of the presses.
+        network: Network to train.
+        fold_networks: Networks whose mean outputs are the targets.
+        presses: All presses.
+        noise: Noise of the charges.
         config: Number of steps, batch size and seed.
     """
-    # Inputs: copies of the charges with noise, in random order
+    # Inputs: copies of the charges with noise, in random order, shape (n_copy * n_press, n_electrode)
     rng = np.random.default_rng(config.seed)
     copies = [noise.scaled(factor).add(presses.charge, rng) for factor in DISTILLATION_NOISE_FACTORS]
     order = rng.permutation(len(copies) * len(presses))
@@ -398,14 +405,15 @@ def _distillation_stage(
     n_validation = len(presses) // 2
     n_train = len(charge) - n_validation
 
-    # Targets: mean and logarithm of the standard deviation, averaged over the networks
+    # Targets: outputs of the networks, averaged over the networks. The outputs of one network have the shape (2, n, 3):
+    # means of the unit coordinates, and logarithms of their standard deviations.
     with torch.no_grad():
-        member_outputs = [torch.stack(member.posterior(charge)) for member in members]
-    target_mean, target_log_std = torch.stack(member_outputs).mean(dim=0)
+        outputs = [torch.stack(fold_network.posterior(charge)) for fold_network in fold_networks]
+    target_mean, target_log_std = torch.stack(outputs).mean(dim=0)
     network.contact.fit_linear_part(network.inputs(charge[:n_train]), target_mean[:n_train])
 
     def divergence(rows: Tensor | slice) -> Tensor:
-        """Return the divergence of the outputs of the network from the targets for some of the inputs."""
+        """Return the divergence between the outputs of the network and the targets for some rows of the inputs."""
         mean, log_std = network.posterior(charge[rows])
         return distillation_loss(mean, log_std, target_mean[rows], target_log_std[rows])
 
@@ -415,9 +423,9 @@ def _distillation_stage(
         return divergence(batch_rows)
 
     def score() -> tuple[float, str]:
-        """Return the divergence for the validation charges, and a text with it."""
+        """Return the divergence for the validation charges, and a text that reports it."""
         validation_loss = divergence(slice(n_train, None)).item()
-        return validation_loss, f"{validation_loss:.4f} from the mean of {len(members)} networks"
+        return validation_loss, f"{validation_loss:.4f} from the mean of {len(fold_networks)} networks"
 
     steps = max(config.contact_step_count(network.n_electrode) // 2, 1)
     return TrainingStage(
@@ -433,14 +441,14 @@ def _distillation_stage(
 def _misfit_examples(
     presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, config: TrainingConfig
 ) -> Array:
-    """Draw charges of many kinds, and compute their residuals at the nearest press.
+    """Draw charges of many kinds, and compute their residuals with respect to the nearest contact.
 
-    The charges near the measured presses are approximated by local planes.
+    The charges of contacts near a measured press are approximated by a plane, which is fitted to neighbouring presses.
 
     Args:
         presses: All presses.
-        domain: Area of the presses.
-        noise: Noise of the presses.
+        domain: Area of the presses, which defines the unit coordinates.
+        noise: Noise of the charges.
         config: Number of charges and seed.
 
     Returns:
@@ -457,7 +465,7 @@ def _misfit_examples(
 
 
 def _saved_or_drawn(draw: Callable[[], Array], run: ResumableRun | None) -> Array:
-    """Return the examples that a run has saved. If there are none, draw the examples and save them.
+    """Return the examples that a run has saved. If the run has no examples, draw the examples and save them.
 
     Args:
         draw: Function that draws the examples.
@@ -472,13 +480,13 @@ def _saved_or_drawn(draw: Callable[[], Array], run: ResumableRun | None) -> Arra
 def _cross_validated_misfit(
     presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, fold: Integers
 ) -> Array:
-    """Compute the misfit of each press with planes through the presses of the other folds.
+    """Compute the misfit of each press with local planes through the presses of all other folds.
 
     Args:
         presses: All presses.
-        domain: Area of the presses.
-        noise: Noise of the presses.
-        fold: Fold of each press, shape (n,).
+        domain: Area of the presses, which defines the unit coordinates.
+        noise: Noise of the charges.
+        fold: Index of the fold of each press, shape (n,).
 
     Returns:
         Misfits, shape (n, 1), in standard deviations of the noise.

@@ -1,7 +1,7 @@
-"""Training of one network by gradient descent: learning rate, early stopping, checkpoints.
+"""Training of one network by gradient descent with early stopping and checkpoints.
 
-The usual optimiser is SOAP (`isocharge.train.training.soap`). The learning rate rises during the first tenth of the
-steps and then falls to zero along a cosine.
+The usual optimiser is SOAP (`isocharge.train.training.soap`). The learning rate increases during the first tenth of the
+steps and then decreases to zero along a cosine.
 """
 
 import copy
@@ -20,8 +20,8 @@ from isocharge.common.progress import report
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.train.training.soap import Soap
 
-WARM_UP_FRACTION = 0.1
-"""Fraction of the steps during which the learning rate rises, dimensionless."""
+RATE_INCREASE_FRACTION = 0.1
+"""Fraction of the steps during which the learning rate increases, dimensionless."""
 
 SLOW_RATE_FACTOR = 0.1
 """Learning rate of slow parameters, relative to the learning rate of the other parameters."""
@@ -49,29 +49,32 @@ class Optimiser(Protocol):
         """Change the parameters."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that a checkpoint holds."""
+        """Return the state that a checkpoint contains."""
 
     def load_state_dict(self, state: dict[str, Any], /) -> None:
         """Continue from a result of `state_dict`."""
 
 
 def soap_optimiser(stage: "TrainingStage") -> list[Optimiser]:
-    """Return the optimiser SOAP for the parameters of a stage's network.
+    """Create the optimiser SOAP for the network of a training stage.
 
-    The slow parameters of the stage have a smaller learning rate. Rounded weights, which need no gradient, are not
-    trained.
+    The slow parameters of the stage have a smaller learning rate. Weights that require no gradient, such as rounded
+    weights, are not trained.
 
     Args:
-        stage: The training of the network.
+        stage: Training stage with the network and its slow parameters.
+
+    Returns:
+        A list with the optimiser.
     """
     # Tensors are compared by identity, because == compares their elements.
     slow_ids = {id(parameter) for parameter in stage.slow_parameters}
-    trained = [parameter for parameter in stage.network.parameters() if parameter.requires_grad]
-    slow = [parameter for parameter in trained if id(parameter) in slow_ids]
-    fast = [parameter for parameter in trained if id(parameter) not in slow_ids]
+    trained_parameters = [parameter for parameter in stage.network.parameters() if parameter.requires_grad]
+    slow_parameters = [parameter for parameter in trained_parameters if id(parameter) in slow_ids]
+    other_parameters = [parameter for parameter in trained_parameters if id(parameter) not in slow_ids]
     groups: list[dict[str, Any]] = [
-        {"params": fast, "rate_factor": 1.0},
-        {"params": slow, "rate_factor": SLOW_RATE_FACTOR},
+        {"params": other_parameters, "rate_factor": 1.0},
+        {"params": slow_parameters, "rate_factor": SLOW_RATE_FACTOR},
     ]
     groups_with_parameters = [group for group in groups if group["params"]]
     return [Soap(groups_with_parameters)]
@@ -79,20 +82,21 @@ def soap_optimiser(stage: "TrainingStage") -> list[Optimiser]:
 
 @dataclass(frozen=True)
 class TrainingStage:
-    """A training of one network.
+    """Definition of the training of one network.
 
     Attributes:
         name: Name of the stage, for checkpoints and messages.
-        network: The network to train.
-        loss: Function from the number of the step and a random generator to the loss of a new batch.
+        network: Network to train.
+        loss: Function that computes the loss of a new batch from the number of the step and a random generator.
         score: Function that returns the loss on validation data and a text for the progress report.
         steps: Number of steps.
-        warm_up_steps: Number of first steps with another loss. Weights of these steps are never the best ones.
-        rate_factor: Factor by which the learning rate of the training's settings is multiplied.
-        largest_gradient: Norm to which larger gradients are clipped after the warm-up.
+        warm_up_steps: Number of steps at the beginning that minimise another loss. The weights of these steps are never
+            kept as the best weights.
+        rate_factor: Factor by which the learning rate of the settings is multiplied.
+        largest_gradient: Largest norm of the gradient after the warm-up. A larger gradient is scaled to this norm.
         slow_parameters: Parameters of the network that have a smaller learning rate in SOAP.
-        optimisers: Function from this stage to the optimisers of its network. The key `rate_factor` of each group of
-            parameters is a further factor on the learning rate.
+        optimisers: Function that creates the optimisers for the network of a stage. Each of their groups of parameters
+            has a key `rate_factor`, by which the learning rate of the group is multiplied.
     """
 
     name: str
@@ -109,10 +113,10 @@ class TrainingStage:
 
 
 class Descent:
-    """One run of a training stage. It can be continued from a checkpoint.
+    """One run of a training stage, which can be continued from a checkpoint.
 
     Args:
-        stage: What to train.
+        stage: Network, loss and validation score.
         rate: Largest learning rate.
         patience: Number of steps without a better validation score after which the training stops.
         seed: Seed of the batches and the noise.
@@ -123,10 +127,10 @@ class Descent:
     """
 
     def __init__(self, stage: TrainingStage, rate: float, patience: int, seed: int) -> None:
-        """Prepare the training; the weights of the stage's network are the initial weights.
+        """Prepare a training that begins with the present weights of the network.
 
         Args:
-            stage: Network, loss and validation.
+            stage: Network, loss and validation score.
             rate: Largest learning rate.
             patience: Number of steps without a better validation score after which the training ends.
             seed: Seed of the batches and of the noise.
@@ -141,21 +145,21 @@ class Descent:
         self.best_step = 0
         self.best_weights = copy.deepcopy(stage.network.state_dict())
 
-    def run(self, run: ResumableRun | None = None) -> None:
+    def run(self, resumable_run: ResumableRun | None = None) -> None:
         """Train the network, and give it the weights with the best validation score.
 
-        The training ends after the steps of the stage, or earlier if the validation score no longer improves.
+        The training ends after all steps of the stage, or earlier if the validation score no longer improves.
 
         Args:
-            run: Saves the state every few seconds, so that an interrupted training can be continued and ends with the
-                same weights.
+            resumable_run: Run that saves the state every few seconds. An interrupted training can then be continued,
+                and ends with the same weights. None to save nothing.
 
         Raises:
             TrainingError: If the loss is not finite.
         """
-        saved_at = time.monotonic()
-        if run is not None:
-            state = run.load(self.stage.name, tensors_from_bytes)  # None if nothing was saved
+        last_save_s = time.monotonic()
+        if resumable_run is not None:
+            state = resumable_run.load(self.stage.name, tensors_from_bytes)  # None if nothing was saved
             if state is not None:
                 self._restore(state)
 
@@ -164,18 +168,18 @@ class Descent:
             is_last_step = self.step == self.stage.steps
             if is_last_step or self.step % REPORT_EVERY == 0:
                 self._evaluate(loss.item())
-            if run is not None and time.monotonic() - saved_at >= SAVE_EVERY_S:
-                run.save(self.stage.name, tensor_bytes(self._state()))
-                saved_at = time.monotonic()
+            if resumable_run is not None and time.monotonic() - last_save_s >= SAVE_EVERY_S:
+                resumable_run.save(self.stage.name, tensor_bytes(self._state()))
+                last_save_s = time.monotonic()
 
-        if run is not None:
-            run.save(self.stage.name, tensor_bytes(self._state()))
+        if resumable_run is not None:
+            resumable_run.save(self.stage.name, tensor_bytes(self._state()))
         self.stage.network.load_state_dict(self.best_weights)
 
     def take_step(self) -> Tensor:
-        """Change the weights by one step of the optimisers, and return the loss before the step.
+        """Change the weights by one step of the optimisers, and return the loss before this step.
 
-        The gradient is limited to the largest gradient of the stage, except during the warm-up.
+        After the warm-up steps, a gradient whose norm exceeds `largest_gradient` is scaled down to this norm.
         """
         stage = self.stage
         rate = self.rate * stage.rate_factor * _relative_rate(self.step / stage.steps)
@@ -197,10 +201,10 @@ class Descent:
     def _evaluate(self, loss: float) -> None:
         """Compute the validation score, keep the weights if they are the best so far, and report the progress.
 
-        Weights of the warm-up are never kept, because the warm-up minimises another loss.
+        Weights of the warm-up steps are never kept, because these steps minimise another loss.
 
         Args:
-            loss: Loss of the last batch.
+            loss: Loss of the latest batch.
 
         Raises:
             TrainingError: If the loss or the score is not finite.
@@ -220,14 +224,14 @@ class Descent:
         report(f"training the {self.stage.name} network", self.step, self.stage.steps, f"loss {loss:.3f}, {text}")
 
     def _is_stalled(self) -> bool:
-        """Return whether the score has not improved for `patience` steps after the warm-up."""
-        counted_from = max(self.best_step, self.stage.warm_up_steps)
-        return self.step - counted_from >= self.patience
+        """Return whether the validation score has not improved in the last `patience` steps after the warm-up."""
+        first_counted_step = max(self.best_step, self.stage.warm_up_steps)
+        return self.step - first_counted_step >= self.patience
 
     def _state(self) -> dict[str, Any]:
-        """Return everything that a checkpoint holds."""
+        """Return the state that a checkpoint contains."""
         return {
-            "part": self.stage.network.state_dict(),
+            "part": self.stage.network.state_dict(),  # the present weights
             "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
             "random": self.random.get_state(),
             "step": self.step,
@@ -251,16 +255,16 @@ class Descent:
 
 
 def tensor_bytes(state: object) -> bytes:
-    """Return tensors, numbers and texts as bytes for a `ResumableRun`."""
+    """Convert tensors, numbers and texts to bytes, which a `ResumableRun` can save."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
     return buffer.getvalue()
 
 
 def tensors_from_bytes(data: bytes) -> Any:
-    """Return the tensors, numbers and texts that `tensor_bytes` converted into bytes.
+    """Return the tensors, numbers and texts that `tensor_bytes` has converted to bytes.
 
-    Code in the bytes is not executed.
+    No code in the bytes is executed.
     """
     return torch.load(io.BytesIO(data), weights_only=True)
 
@@ -268,14 +272,14 @@ def tensors_from_bytes(data: bytes) -> Any:
 def _relative_rate(progress: float) -> float:
     """Return the learning rate relative to its largest value.
 
-    During the warm-up, the rate rises from `INITIAL_RATE` to 1 along half a period of a cosine. After the warm-up, it
-    falls to 0 along another half period.
+    The relative rate first increases from `INITIAL_RATE` to 1 along half a period of a cosine. The relative rate then
+    decreases from 1 to 0 along another half period of a cosine.
 
     Args:
-        progress: Number of completed steps relative to the number of all steps.
+        progress: Number of completed steps divided by the number of all steps.
     """
-    if progress < WARM_UP_FRACTION:
-        rise = 0.5 * (1.0 - math.cos(math.pi * progress / WARM_UP_FRACTION))
-        return INITIAL_RATE + (1.0 - INITIAL_RATE) * rise
-    angle = math.pi * (progress - WARM_UP_FRACTION) / (1.0 - WARM_UP_FRACTION)  # 0 after the warm-up, pi at the end
+    if progress < RATE_INCREASE_FRACTION:
+        increase = 0.5 * (1.0 - math.cos(math.pi * progress / RATE_INCREASE_FRACTION))  # from 0 to 1
+        return INITIAL_RATE + (1.0 - INITIAL_RATE) * increase
+    angle = math.pi * (progress - RATE_INCREASE_FRACTION) / (1.0 - RATE_INCREASE_FRACTION)  # from 0 to pi
     return 0.5 * (1.0 + math.cos(angle))

@@ -1,4 +1,4 @@
-"""Whitened input features of a network, fitted to the charges of presses."""
+"""Whitened input features of a network, which are fitted to the charges of presses."""
 
 from dataclasses import dataclass
 
@@ -10,19 +10,21 @@ from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 
 CLIPPING_MARGIN = 1.0
 """Distance of the clipping limits from the extreme charges of the presses, relative to the range of these charges.
-Charges of both signs are clipped. Distance and range are differences of asinh(Q / typical charge)."""
+
+The limits apply to charges of both signs. The distance and the range are differences of asinh(Q / typical charge).
+"""
 
 MIN_SINGULAR_VALUE = 1e-12
-"""Singular value below which the whitening does not enlarge a direction further."""
+"""Smallest singular value by which the whitening divides, so that no division by zero occurs."""
 
 
 @dataclass(frozen=True)
 class WhitenedFeatures:
-    """Features with zero mean and unit covariance: (features of the charges - mean) @ matrix.
+    """Input features with zero mean and unit covariance, which are (charge features - mean) @ matrix.
 
     Attributes:
-        charge_features: Logarithms or inverse hyperbolic sines of the charges.
-        mean: Mean of these features over the presses, shape (n_electrode,).
+        charge_features: Charge features, which are logarithms or inverse hyperbolic sines of the charges.
+        mean: Mean of the charge features over the presses, shape (n_electrode,).
         matrix: Whitening matrix, shape (n_electrode, n_electrode).
     """
 
@@ -32,7 +34,11 @@ class WhitenedFeatures:
 
     @classmethod
     def fit_logarithms(cls, charge: Array) -> "WhitenedFeatures":
-        """Fit whitened logarithms to positive charges without noise, shape (n, n_electrode), pC."""
+        """Fit whitened logarithms to positive charges.
+
+        Args:
+            charge: Charges of presses without noise, shape (n, n_electrode), pC.
+        """
         clipped = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
         return cls._fit(logarithmic_features(np.log(clipped).mean(axis=0)), charge)
 
@@ -48,16 +54,21 @@ class WhitenedFeatures:
 
     @classmethod
     def _fit(cls, charge_features: ChargeFeatures, charge: Array) -> "WhitenedFeatures":
-        """Fit mean and whitening matrix to the features of charges, shape (n, n_electrode), pC."""
+        """Fit the mean and the whitening matrix to the charge features of presses.
+
+        Args:
+            charge_features: Charge features before the whitening.
+            charge: Charges of the presses, shape (n, n_electrode), pC.
+        """
         mean, matrix = whitening(charge_features.evaluate(charge))
         return cls(charge_features, mean, matrix)
 
 
 def logarithmic_features(mean_logarithm: Array) -> ChargeFeatures:
-    """Return features for positive charges.
+    """Return features for positive charges, which are the logarithms of charge / typical charge.
 
-    The typical charge is the power of two that is nearest to the geometric mean. The division by a power of two is
-    exact in float32, and the logarithms are then small enough to keep their digits.
+    The typical charge of an electrode is the power of two nearest to the geometric mean of its charges. A division by a
+    power of two is exact in float32. The logarithms of the quotients are near 0, where float32 has the smallest errors.
 
     Args:
         mean_logarithm: Mean of the logarithms of the charges in pC, shape (n_electrode,).
@@ -70,43 +81,45 @@ def logarithmic_features(mean_logarithm: Array) -> ChargeFeatures:
 
 
 def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
-    """Return features for charges of both signs: inverse hyperbolic sines of the charges divided by typical charges.
+    """Return features for charges of both signs, which are the inverse hyperbolic sines of charge / typical charge.
 
-    Charges are limited to the range of the given charges, enlarged by a margin on both sides.
+    The features limit each charge to the range of the given charges, which is enlarged by a margin on both sides.
 
     Args:
         charge: Charges of presses, shape (n, n_electrode), pC.
-        typical: Charge by which each charge is divided, shape (n_electrode,), pC.
+        typical: Typical charge of each electrode, shape (n_electrode,), pC.
     """
-    levels = np.arcsinh(charge / typical)
-    lowest = levels.min(axis=0)
-    highest = levels.max(axis=0)
+    asinh_charge = np.arcsinh(charge / typical)
+    lowest = asinh_charge.min(axis=0)
+    highest = asinh_charge.max(axis=0)
     margin = CLIPPING_MARGIN * (highest - lowest)
     return ChargeFeatures(
         typical_pC=typical,
         low_pC=np.sinh(lowest - margin) * typical,
         high_pC=np.sinh(highest + margin) * typical,
-        mean=levels.mean(axis=0),
+        mean=asinh_charge.mean(axis=0),
     )
 
 
 def whitening(values: Array, min_relative_std: float = 0.0) -> tuple[Array, Array]:
     """Compute the whitening transform of values by a principal component analysis.
 
+    The transformed values (values - mean) @ matrix have a covariance that is the identity matrix.
+
     Args:
         values: Values, shape (n, k).
-        min_relative_std: Smallest standard deviation of a principal component, relative to the largest one, for which
-            the component is scaled to unit variance. A smaller component is scaled as if it had this standard
-            deviation.
+        min_relative_std: Smallest standard deviation of a principal component that is scaled to unit variance, relative
+            to the largest standard deviation. A component with a smaller standard deviation is scaled as if it had this
+            smallest standard deviation.
 
     Returns:
-        Mean, shape (k,), and matrix M, shape (k, k): (values - mean) @ M has unit covariance.
+        Mean, shape (k,), and matrix, shape (k, k).
     """
-    # The principal axes are the rows of `axes`, and the singular values are the standard deviations along them times
-    # the root of the number of values.
+    # The rows of `axes` are the principal axes. The standard deviation of the values along an axis is its singular
+    # value divided by the square root of the number of values.
     mean = values.mean(axis=0)
     _, singular_values, axes = np.linalg.svd(values - mean, full_matrices=False)
-    largest_singular_value = singular_values[0]
-    smallest_used = max(MIN_SINGULAR_VALUE, min_relative_std * largest_singular_value)
-    inverse_std = np.sqrt(len(values)) / np.maximum(singular_values, smallest_used)
+    largest_singular_value = singular_values[0]  # they are in descending order
+    min_singular_value = max(MIN_SINGULAR_VALUE, min_relative_std * largest_singular_value)
+    inverse_std = np.sqrt(len(values)) / np.maximum(singular_values, min_singular_value)
     return mean, axes.T * inverse_std

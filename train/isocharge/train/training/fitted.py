@@ -1,4 +1,4 @@
-"""A trained network with everything that a release needs."""
+"""The result of a training, which is a network with all information that a release needs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,12 +16,14 @@ from isocharge.train.training.folded_network import FoldedNetwork
 
 @dataclass(frozen=True)
 class Provenance:
-    """Additional information about the origin of a model, which a release writes beside the usual information.
+    """Additional information about the origin of a model.
+
+    A release writes this information together with the information that it writes for every model.
 
     Attributes:
-        card: Section for the model card, in Markdown.
-        made_with: Entries for the metadata.
-        files: Additional files for the version folder, by name.
+        card: Additional section of the model card, in Markdown.
+        made_with: Additional entries of the metadata.
+        files: Contents of additional files in the version folder, by file name.
     """
 
     card: str = ""
@@ -30,7 +32,7 @@ class Provenance:
 
 
 class Answers(NamedTuple):
-    """What networks estimate from the charges of n presses.
+    """Estimates of networks from the charges of n presses.
 
     Attributes:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -45,7 +47,7 @@ class Answers(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """A trained network, and the presses and conditions for which it was trained.
+    """A trained network, the presses of its training, and the conditions for which it was trained.
 
     Attributes:
         network: The network in NumPy.
@@ -53,16 +55,16 @@ class Fitted:
         probes: Notations of the probes.
         domain: Contacts for which the network was trained.
         noise: Noise for which the network was trained.
-        test: Presses for measuring errors. The network was not trained on them, unless `cross_validated` is given.
+        test: Presses for measuring errors. The network was trained on other presses, unless `cross_validated` is given.
         good: Presses without faults, whose misfits determine the threshold of the alarm.
         sha256: Checksum of the training data.
         provenance: Additional information for the release.
         requested_domain: Contacts for which a network was requested. This domain is larger than `domain` if the map
-            folds, that is, if different contacts have the same charges.
+            from contacts to charges folds, which means that different contacts have the same charges.
         cautions: Sentences that users of the network should read.
-        cross_validated: Answers to the charges of `test` by networks that were not trained on them. They are given if
-            this network was trained on all presses of `test`.
-        outside: The film outside the working area; None if it was not simulated.
+        cross_validated: Answers to the charges of `test` by networks that were not trained on these presses; None if
+            `network` itself was not trained on them.
+        outside: Presses outside the working area; None if they were not simulated.
     """
 
     network: FoldedNetwork

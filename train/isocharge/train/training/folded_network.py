@@ -1,14 +1,16 @@
-"""The definition of a whole network, from charges to contacts, and its evaluation with NumPy in double precision.
+"""Definition of a whole network that computes contacts from charges, and its evaluation with NumPy in double precision.
 
 The network has three parts:
 
-- Input features: logarithms of the charges (`isocharge.common.charge_features`).
-- A perceptron (`isocharge.common.perceptron`), whose outputs are called answers here. Whitening and units are folded
-  into its first and last layer (`isocharge.train.training.folding`).
-- Output functions, which turn the answers into position, force, standard deviations, correlations and misfit.
+- The input features are computed from the charges. For example, they are the logarithms of positive charges
+  (`isocharge.common.charge_features`).
+- A perceptron (`isocharge.common.perceptron`) computes a vector from the input features. The entries of this vector are
+  called answers. The whitening of the features and the units of the answers are folded into the first and the last
+  layer of the perceptron (`isocharge.train.training.folding`).
+- The output functions convert the answers to position, force, standard deviations, correlations and misfit.
 
 The ONNX export (`isocharge.train.model_release.onnx_graph`) and the C export (`isocharge.train.export_c.model_source`)
-write this definition.
+write networks of this form.
 """
 
 from dataclasses import dataclass, replace
@@ -32,7 +34,7 @@ LOG_STD = slice(3, 6)
 """Columns of the answers with the logarithms of the standard deviations of x and y in mm and of the force in N."""
 
 N_CONTACT_ANSWERS = 6
-"""Number of answers about the contact, which come before the angles and the misfit vector."""
+"""Number of answers about the contact. They come before the angles of the correlations and before the misfit vector."""
 
 COSINES_TO_CORRELATIONS = np.array(
     [
@@ -46,22 +48,28 @@ COSINES_TO_CORRELATIONS = np.array(
         [0, 0, -1],
     ]
 ) / [1, 1, 4]
-"""Matrix from the cosines of the eight angles to the correlations of x with y, x with the force, and y with the force
-(`isocharge.train.training.correlation`)."""
+"""Matrix, shape (8, 3), by which the cosines of the eight angles are multiplied to get the correlations.
+
+The correlations are those of x with y, of x with the force, and of y with the force
+(`isocharge.train.training.correlation`).
+"""
 
 MISFIT_UNIT = 5.0
-"""Scale of the misfit, in standard deviations of the noise: misfit = MISFIT_UNIT * sinh(|misfit vector|). The network
-learns smaller misfits on a linear scale and larger ones on a logarithmic scale."""
+"""Scale of the misfit, in standard deviations of the noise: misfit = MISFIT_UNIT * sinh(|misfit vector|).
+
+The network learns misfits below this value on a linear scale and misfits above this value on a logarithmic scale.
+"""
 
 
 @dataclass(frozen=True)
 class FoldedNetwork:
-    """A whole network.
+    """A whole network that computes contacts from charges.
 
     Attributes:
         features: Input features.
-        layers: Perceptron from the features to the answers: x and y (2), ln F (1), logarithms of the standard
-            deviations (3), angles of the correlations (8, or 0 without correlations), misfit vector (n_electrode).
+        layers: Perceptron that computes the answers from the features. The answers are x and y (2), ln F (1),
+            logarithms of the standard deviations (3), angles of the correlations (8, or 0 without correlations), and
+            the misfit vector (n_electrode).
     """
 
     features: ChargeFeatures
@@ -69,16 +77,23 @@ class FoldedNetwork:
 
     @property
     def n_angle(self) -> int:
-        """Number of angles of the correlations: 8, or 0 if the network gives no correlations."""
+        """Number of answers that are angles of the correlations: 8, or 0 if the network estimates no correlations."""
         return int(self.layers.skip.shape[1]) - N_CONTACT_ANSWERS - self.features.n_electrode
 
     @property
     def angle_columns(self) -> slice:
-        """Columns of the answers with the angles."""
+        """Columns of the answers with the angles of the correlations."""
         return slice(N_CONTACT_ANSWERS, N_CONTACT_ANSWERS + self.n_angle)
 
     def answers(self, charge: Array) -> Array:
-        """Compute the answers to charges of shape (n, n_electrode), pC; shape (n, n_answer)."""
+        """Compute the answers of the perceptron, from which the outputs are computed.
+
+        Args:
+            charge: Charges, shape (n, n_electrode), pC.
+
+        Returns:
+            Answers, shape (n, n_answer).
+        """
         return np.asarray(evaluate(self.layers, self.features.evaluate(charge)), dtype=float)
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
@@ -101,69 +116,77 @@ class FoldedNetwork:
             charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
-            Contacts and standard deviations as `predict` returns them. Correlations, shape (n, 3), if the network gives
-            them. Misfits, shape (n, 1).
+            Contacts and standard deviations, as `predict` returns them. Correlations, shape (n, 3), if the network
+            estimates them. Misfits, shape (n, 1).
         """
         return self.outputs_from_answers(self.answers(charge))
 
     def outputs_from_answers(self, answers: Array) -> tuple[Array, ...]:
-        """Compute the outputs of the model from the outputs of the last layer.
+        """Compute the outputs of the model from the answers, which are the outputs of the last layer.
 
         Args:
-            answers: Outputs of the last layer, shape (n, n_answer): x, y and ln F, the logarithms of the standard
-                deviations, the angles of the correlations if there are any, and the misfit vector.
+            answers: Answers, shape (n, n_answer): x, y and ln F, the logarithms of the standard deviations, the angles
+                of the correlations if the network estimates them, and the misfit vector.
 
         Returns:
-            Contact, standard deviations, correlations if there are any, and misfit. Each of them has one row for each
-            press.
+            Contacts, shape (n, 3), standard deviations, shape (n, 3), correlations, shape (n, 3), if the network
+            estimates them, and misfits, shape (n, 1).
         """
         force = np.exp(answers[:, LOG_FORCE])
-        outputs = [
-            np.concatenate([answers[:, POSITION], force], axis=1),
-            np.exp(answers[:, LOG_STD]),
-        ]
-        if self.n_angle:
+        contact = np.concatenate([answers[:, POSITION], force], axis=1)
+        std = np.exp(answers[:, LOG_STD])
+        outputs = [contact, std]
+        if self.n_angle > 0:
             # Each correlation is a weighted sum of the cosines of the eight angles.
-            outputs.append(np.cos(answers[:, self.angle_columns]) @ COSINES_TO_CORRELATIONS)
-        # The misfit vector follows the angles. Its length is the inverse hyperbolic sine of the misfit over its unit.
+            correlations = np.cos(answers[:, self.angle_columns]) @ COSINES_TO_CORRELATIONS
+            outputs.append(correlations)
+        # The misfit vector follows the angles. Its length is asinh(misfit / MISFIT_UNIT).
         misfit_vector = answers[:, self.angle_columns.stop :]
         compressed_misfit = np.linalg.norm(misfit_vector, axis=1, keepdims=True)
         outputs.append(MISFIT_UNIT * np.sinh(compressed_misfit))
         return tuple(outputs)
 
     def with_scaled_std(self, position_factor: float, force_factor: float) -> "FoldedNetwork":
-        """Return the network with the standard deviations of position and force multiplied by two factors."""
+        """Return a network whose standard deviations of position and force are multiplied by two given factors."""
         weight, bias = self.layers.last
-        added = np.zeros_like(bias)
-        added[LOG_STD] = np.log([position_factor, position_factor, force_factor])
-        return replace(self, layers=replace(self.layers, last=Layer(weight, bias + added)))
+        bias_change = np.zeros_like(bias)
+        bias_change[LOG_STD] = np.log([position_factor, position_factor, force_factor])
+        return replace(self, layers=replace(self.layers, last=Layer(weight, bias + bias_change)))
 
-    def with_angles(self, last: Layer[Array], skip: Array) -> "FoldedNetwork":
-        """Return the network with eight additional answers, from whose cosines the correlations are computed.
+    def with_angles(self, angle_layer: Layer[Array], angle_skip: Array) -> "FoldedNetwork":
+        """Return a network with eight additional answers, which are the angles of the correlations.
+
+        The correlations are computed from the cosines of these angles.
 
         Args:
-            last: Output layer of these angles: weight, shape (n_hidden, 8), and bias, shape (8,).
-            skip: Weights from the input features to these angles, shape (n_electrode, 8).
+            angle_layer: Output layer of the angles: weight, shape (n_hidden, 8), and bias, shape (8,).
+            angle_skip: Weights from the input features to the angles, shape (n_electrode, 8).
         """
 
-        def with_columns(values: Array, angle_values: Array) -> Array:
-            """Insert the columns of the angles between those of the contact and those of the misfit vector."""
+        def insert_columns(values: Array, angle_values: Array) -> Array:
+            """Insert the columns of the angles after the columns of the contact, before those of the misfit vector."""
             contact_values, misfit_values = np.split(values, [N_CONTACT_ANSWERS], axis=-1)
             return np.concatenate([contact_values, angle_values, misfit_values], axis=-1)
 
-        output_layer = self.layers.last
-        new_output_layer = Layer(
-            with_columns(output_layer.weight, last.weight),
-            with_columns(output_layer.bias, last.bias),
+        last = self.layers.last
+        new_last = Layer(
+            insert_columns(last.weight, angle_layer.weight),
+            insert_columns(last.bias, angle_layer.bias),
         )
-        layers = replace(self.layers, last=new_output_layer, skip=with_columns(self.layers.skip, skip))
-        return replace(self, layers=layers)
+        new_skip = insert_columns(self.layers.skip, angle_skip)
+        return replace(self, layers=replace(self.layers, last=new_last, skip=new_skip))
 
 
 def relative_log_std(answers: Array) -> Array:
-    """Return the logarithms of the standard deviations of x, y and ln F, shape (n, 3), from answers (n, n_answer).
+    """Compute the logarithms of the standard deviations of x, y and ln F from the answers of a network.
 
     The standard deviation of ln F is the standard deviation of F divided by F.
+
+    Args:
+        answers: Answers of the network, shape (n, n_answer).
+
+    Returns:
+        Logarithms of the standard deviations, shape (n, 3).
     """
     log_std = answers[:, LOG_STD].copy()
     log_std[:, 2:] -= answers[:, LOG_FORCE]  # the last column belongs to the force

@@ -1,8 +1,8 @@
-"""Folding of trained perceptrons into one perceptron with few, larger layers.
+"""Folding of several trained perceptrons into one perceptron that has fewer but larger layers.
 
-In a prediction for a single press, each node of the graph costs more time than its arithmetic. The whitening of the
-inputs is therefore multiplied into the first layer and the units of the outputs into the last layer. Two perceptrons
-with the same inputs become one perceptron whose hidden layers have block-diagonal weights.
+In a prediction for a single press, the overhead of each node of the graph takes more time than the arithmetic. The
+whitening of the inputs is therefore included in the first layer, and the scaling of the outputs is included in the last
+layer. Two perceptrons with the same inputs become one perceptron, whose later layers have block-diagonal weights.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,32 +21,33 @@ LOG_FORCE_STD = slice(LOG_STD.stop - 1, LOG_STD.stop)
 
 
 def fold(
-    perceptrons: Sequence[Perceptron[Array]], mean: Array, matrix: Array, units: Layer[Array]
+    perceptrons: Sequence[Perceptron[Array]], mean: Array, matrix: Array, answer_map: Layer[Array]
 ) -> Perceptron[Array]:
-    """Fold perceptrons with the same inputs, number of layers and activation into one perceptron.
+    """Fold several perceptrons into one perceptron, which computes answers from features that are not whitened.
 
-    The whitening of the features becomes part of the first layer and of the skip layer. The linear map to the answers
-    becomes part of the last layer and of the skip layer.
+    The whitening of the features becomes part of the first layer and of the skip layer. The linear map from the outputs
+    to the answers becomes part of the last layer and of the skip layer.
 
     Args:
-        perceptrons: Perceptrons whose inputs are (features - mean) @ matrix.
+        perceptrons: Perceptrons whose inputs are (features - mean) @ matrix. All perceptrons must have the same number
+            of layers and the same activation.
         mean: Mean of the features, shape (n_electrode,).
         matrix: Whitening matrix, shape (n_electrode, n_electrode).
-        units: Linear map from the outputs of all perceptrons, one after the other, to the answers: weight of shape
-            (n_output, n_answer) and bias of shape (n_answer,).
+        answer_map: Linear map from the outputs of all perceptrons, one after the other, to the answers: weight, shape
+            (n_output, n_answer), and bias, shape (n_answer,).
 
     Returns:
-        Perceptron from the features to the answers.
+        Perceptron that computes the answers from the features.
     """
     joined = _join_perceptrons(perceptrons)
     first, *other_hidden = joined.hidden
-    # ((features - mean) @ matrix) @ W + b  =  features @ (matrix W) + (b - mean @ (matrix W))
+    # ((features - mean) @ matrix) @ weight + bias  =  features @ (matrix @ weight) + (bias - mean @ matrix @ weight)
     first_weight = matrix @ first.weight
     first_bias = first.bias - mean @ first_weight
-    skip = matrix @ joined.skip @ units.weight
-    last_weight = joined.last.weight @ units.weight
-    # The skip layer has no bias, so its part - mean @ skip becomes part of the bias of the last layer.
-    last_bias = joined.last.bias @ units.weight + units.bias - mean @ skip
+    skip = matrix @ joined.skip @ answer_map.weight
+    last_weight = joined.last.weight @ answer_map.weight
+    # The skip layer has no bias. The term - mean @ skip is therefore added to the bias of the last layer.
+    last_bias = joined.last.bias @ answer_map.weight + answer_map.bias - mean @ skip
     return replace(
         joined,
         hidden=(Layer(first_weight, first_bias), *other_hidden),
@@ -56,44 +57,47 @@ def fold(
 
 
 def transform_inputs(perceptron: Perceptron[Array], transform: Layer[Array]) -> Perceptron[Array]:
-    """Return the perceptron whose output for x is the output of the given perceptron for x @ weight + bias.
+    """Return a perceptron that first transforms its inputs linearly and then evaluates the given perceptron.
 
     Args:
         perceptron: The given perceptron.
-        transform: Weight, shape (n_input, n_input), and bias, shape (n_input,).
+        transform: Linear transform of the inputs, x @ weight + bias: weight, shape (n_input, n_input), and bias, shape
+            (n_input,).
     """
-    first, *others = perceptron.hidden
+    first, *other_hidden = perceptron.hidden
+    new_first = Layer(transform.weight @ first.weight, first.bias + transform.bias @ first.weight)
     last = perceptron.last
     return replace(
         perceptron,
-        hidden=(Layer(transform.weight @ first.weight, first.bias + transform.bias @ first.weight), *others),
+        hidden=(new_first, *other_hidden),
         last=Layer(last.weight, last.bias + transform.bias @ perceptron.skip),
         skip=transform.weight @ perceptron.skip,
     )
 
 
-def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: int) -> Layer[Array]:
-    """Return the linear map from the outputs of the contact and misfit perceptrons to the answers.
+def linear_answer_map(domain: Domain, rotation: Array, offset: Array, n_electrode: int) -> Layer[Array]:
+    """Return the linear map from the outputs of the contact perceptron and the misfit perceptron to the answers.
 
-    The outputs contain the relative standard deviation of the force, and the answers contain the absolute one. To
-    convert it, ln F is added to the logarithm of the relative standard deviation.
+    The outputs contain the logarithm of the relative standard deviation of the force. The answers contain the logarithm
+    of the absolute standard deviation, which is larger by ln F. The map therefore adds ln F.
 
     Args:
-        domain: Centre and scale of the unit coordinates.
-        rotation: Matrix T, shape (3, 3). If the contact perceptron gives u, the unit coordinates are T u + o.
+        domain: Domain that defines the centre and the scale of the unit coordinates.
+        rotation: Matrix T, shape (3, 3). If the contact perceptron computes the means u, the unit coordinates are
+            T u + o.
         offset: Vector o, shape (3,).
-        n_electrode: Width of the misfit vector.
+        n_electrode: Number of electrodes, which is also the number of entries of the misfit vector.
     """
-    # The identity matrix leaves the logarithms of the standard deviations and the misfit vector as they are.
+    # The identity matrix leaves the logarithms of the standard deviations and the misfit vector unchanged.
     n_answer = N_CONTACT_ANSWERS + n_electrode
     weight = np.eye(n_answer)
     bias = np.zeros(n_answer)
 
-    # Mean: (T u + o) * scale + centre. Layers multiply row vectors from the right, so the matrix is transposed.
+    # Means: (T u + o) * scale + centre. Layers multiply row vectors by the weight, so the matrix T is transposed.
     weight[MEAN, MEAN] = rotation.T * domain.scale
     bias[MEAN] = offset * domain.scale + domain.centre
 
-    # Logarithms of the standard deviations: add ln(scale), and for the force also ln F.
+    # Logarithms of the standard deviations: add ln(scale). For the force, also add ln F as the map above computes it.
     bias[LOG_STD] = np.log(domain.scale)
     weight[MEAN, LOG_FORCE_STD] = weight[MEAN, LOG_FORCE]
     bias[LOG_FORCE_STD] += bias[LOG_FORCE]
@@ -101,7 +105,7 @@ def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: in
 
 
 def _join_perceptrons(perceptrons: Sequence[Perceptron[Array]]) -> Perceptron[Array]:
-    """Return one perceptron that gives the outputs of several perceptrons with the same inputs, one after the other."""
+    """Join several perceptrons with the same inputs into one perceptron that computes the outputs of all of them."""
     # Each entry of `first` and `others` contains the layers of all perceptrons at one depth.
     first, *others = zip(*(perceptron.hidden for perceptron in perceptrons), strict=True)
     hidden = [_join_layers(first, np.hstack)]  # the first layers have the same inputs
@@ -115,12 +119,12 @@ def _join_perceptrons(perceptrons: Sequence[Perceptron[Array]]) -> Perceptron[Ar
 
 
 def _join_layers(layers: Sequence[Layer[Array]], join_weights: Callable[[Sequence[Array]], Array]) -> Layer[Array]:
-    """Return one layer that gives the outputs of several layers, one after the other.
+    """Join several layers into one layer, whose outputs are the outputs of all these layers in order.
 
     Args:
-        layers: The layers.
-        join_weights: Function that joins the weights: `np.hstack` if the layers have the same inputs, `_block_diagonal`
-            if each layer has its own inputs.
+        layers: Layers to join.
+        join_weights: Function that joins the weights, which is `np.hstack` if the layers have the same inputs, and
+            `_block_diagonal` if each layer has its own inputs.
     """
     weight = join_weights([layer.weight for layer in layers])
     bias = np.concatenate([layer.bias for layer in layers])
@@ -128,5 +132,5 @@ def _join_layers(layers: Sequence[Layer[Array]], join_weights: Callable[[Sequenc
 
 
 def _block_diagonal(matrices: Sequence[Array]) -> Array:
-    """Return a matrix with the given matrices along its diagonal and zeros elsewhere."""
+    """Return a block-diagonal matrix with the given matrices as its blocks."""
     return np.asarray(block_diag(*matrices))

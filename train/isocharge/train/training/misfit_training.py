@@ -1,7 +1,7 @@
-"""Training of the misfit perceptron: the examples from which it learns, and its loss.
+"""Examples and loss for the training of the misfit perceptron.
 
-An example consists of the charges of one press and the residuals of these charges at the nearest contact. A search
-finds the nearest contact.
+An example consists of a set of charges and the residuals of these charges with respect to the nearest contact. The
+nearest contact is found by a search.
 """
 
 from collections.abc import Callable
@@ -32,41 +32,49 @@ from isocharge.train.training.network import InverseNetwork, as_tensor, compress
 from isocharge.train.training.split import VALIDATION_FRACTION, Split
 
 MISFIT_RATE_FACTOR = 1.5
-"""Learning rate of the misfit network, relative to the learning rate of the contact network. The targets of the misfit
-network have no noise."""
+"""Learning rate of the misfit network, relative to the learning rate of the contact network. It can be larger, because
+the targets of the misfit network have no noise."""
 
 N_OUTSIDE_PRESSES = 6_000
 """Number of presses outside the working area from which charges for the misfit network are drawn."""
 
 OUTSIDE_SHARE = 0.15
-"""Share of the examples of the misfit network that are presses outside the working area, dimensionless. The share is
-zero if these presses are not simulated."""
+"""Share of the examples of the misfit network that are presses outside the working area, dimensionless.
+
+If these presses are not simulated, there are no such examples.
+"""
 
 MANY_OUTSIDE_SHARE = 0.3
-"""Share of presses outside the working area for sensors with more than `FEW_ELECTRODES` electrodes, dimensionless. The
-misfit of these sensors can reveal nearly all presses outside the working area."""
+"""Share of presses outside the working area for sensors with more than `FEW_ELECTRODES` electrodes, dimensionless.
+
+It is larger, because the misfit of these sensors can reveal nearly all presses outside the working area.
+"""
 
 SEARCH_STARTS = 2
 """Number of starts of a search for the nearest contact."""
 
 MANY_SEARCH_STARTS = 4
-"""Number of starts of a search for sensors with more than `FEW_ELECTRODES` electrodes, whose misfit has more local
-minima."""
+"""Number of starts of a search for sensors with more than `FEW_ELECTRODES` electrodes.
+
+It is larger, because the misfit of these sensors has more local minima.
+"""
 
 FOCUS_MISFIT = 10.0
-"""Misfit at which the weight of an example of the misfit network is half of the largest weight, in standard deviations.
-It is twice the smallest limit of the flag `misfit`."""
+"""Misfit at which the weight of an example is half of the largest weight, in standard deviations of the noise.
+
+It is twice the smallest threshold of the flag `misfit`.
+"""
 
 
 @dataclass(frozen=True)
 class MisfitExamples:
-    """Source of the examples for the misfit network.
+    """Source of the examples from which the misfit network learns.
 
-    The run saves the examples, because the search for the nearest contacts takes long.
+    The examples are saved in the run, because the search for the nearest contacts takes long.
 
     Attributes:
-        split: Presses for training, and the charge field in which the nearest contacts are searched for.
-        features: Features of the network, which limit the charges.
+        split: Presses for training, and the charge field in which the search finds the nearest contacts.
+        features: Input features of the network. Their limits are also the limits of the charges of both signs.
         config: Noise, number of examples and seed.
         run: Run that saves the examples; None if they are not saved.
     """
@@ -77,7 +85,7 @@ class MisfitExamples:
     run: ResumableRun | None
 
     def inner(self) -> Array:
-        """Draw examples from presses in the working area (`draw_misfit_examples`).
+        """Draw examples from presses inside the working area with the function `draw_misfit_examples`.
 
         Returns:
             Charges, pC, and residuals, shape (2, n, n_electrode).
@@ -94,14 +102,15 @@ class MisfitExamples:
         return self._saved_or_drawn("misfit-charges", draw)
 
     def with_outside(self, inner_examples: Array, outside: OutsidePresses | None) -> Array:
-        """Replace a share of the examples by presses outside the working area, if the film is simulated there.
+        """Replace a share of the examples by examples of presses outside the working area.
 
         Args:
             inner_examples: Result of `inner`.
-            outside: The film outside the working area; None if it is not simulated.
+            outside: Presses outside the working area; None if they are not simulated. The examples are then returned
+                unchanged.
 
         Returns:
-            Charges, pC, and residuals, same shape, in random order.
+            Charges, pC, and residuals, in random order, with the shape of `inner_examples`.
         """
         if outside is None:
             return inner_examples
@@ -136,13 +145,15 @@ class MisfitExamples:
 
     @property
     def _has_positive_charges(self) -> bool:
-        """Whether all charges are positive, so that their features are logarithms."""
+        """Whether all charges are positive. In this case, the input features are logarithms."""
         return self.features.charge_features.mean is None  # only features of charges of both signs have a mean
 
     @property
     def _options(self) -> ExampleOptions:
-        """Options of the examples. For charges of both signs, the charges are clipped to the limits of the input
-        features."""
+        """Options for drawing examples.
+
+        Charges of both signs are clipped to the limits of the input features.
+        """
         starts = MANY_SEARCH_STARTS if self._has_many_electrodes else SEARCH_STARTS
         if self._has_positive_charges:
             return ExampleOptions(starts=starts)
@@ -150,14 +161,17 @@ class MisfitExamples:
         return ExampleOptions(starts=starts, limits=(charge_features.low_pC, charge_features.high_pC))
 
     def _noise(self) -> Noise:
-        """Return the noise of good presses. For charges of both signs, return the noise of each channel."""
+        """Return the noise of presses without faults.
+
+        If the charges have both signs, the noise of each channel is returned separately.
+        """
         noise = misfit_noise(self.config.noise_model)
         if self._has_positive_charges:
             return noise
         return ChannelNoise.alike(noise, self.features.charge_features.n_electrode)
 
     def _saved_or_drawn(self, name: str, draw: Callable[..., Array]) -> Array:
-        """Return the examples that the run has saved under a name. If there are none, draw the examples and save them.
+        """Return the examples that the run has saved under a name. If there are no such examples, draw and save them.
 
         Args:
             name: Name of the examples in the run.
@@ -170,15 +184,15 @@ class MisfitExamples:
 
 
 def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfig) -> TrainingStage:
-    """Return the training of the misfit perceptron.
+    """Define the training of the misfit perceptron.
 
-    The perceptron learns the residuals, whose lengths are compressed. Examples with misfits far above `FOCUS_MISFIT`
-    count less than others.
+    The targets of the perceptron are the residuals with compressed lengths. Examples with misfits far above
+    `FOCUS_MISFIT` have smaller weights than other examples.
 
     Args:
-        network: The network, whose misfit perceptron is trained.
-        examples: Charges, pC, and residuals (Q - Q(c)) / sigma at the nearest contact c, shape (2, n, n_electrode).
-            The last examples are used for validation.
+        network: Network whose misfit perceptron is trained.
+        examples: Charges Q, pC, and their residuals (Q - Q(c)) / sigma, shape (2, n, n_electrode), where c is the
+            nearest contact and sigma the standard deviation of the noise. The last examples are used for validation.
         config: Number of steps and batch size.
     """
     charges, residuals = examples
@@ -186,19 +200,19 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     targets = compress_length(torch.tensor(residuals)).float()
     n_validation = max(1, round(VALIDATION_FRACTION * config.hold_out * len(inputs)))
     n_train = len(inputs) - n_validation
-    focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_UNIT))  # the compressed length of a residual of `FOCUS_MISFIT`
+    focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_UNIT))  # compressed length of a residual of length `FOCUS_MISFIT`
 
     def distance(rows: Tensor | slice) -> Tensor:
-        """Return the weighted mean squared distance between outputs and targets, for some rows of the examples."""
+        """Return the weighted mean of the squared distances between outputs and targets, for some of the examples."""
         return focused_squared_distance(network.misfit_vector(inputs[rows]), targets[rows], focus)
 
     def loss(_: int, random: torch.Generator) -> Tensor:
-        """Return the weighted mean squared distance for a random batch."""
+        """Return the weighted mean of the squared distances for a random batch of the training examples."""
         batch_rows = torch.randint(n_train, (config.batch,), generator=random)
         return distance(batch_rows)
 
     def score() -> tuple[float, str]:
-        """Return the weighted mean squared distance for the validation examples, and a text with it."""
+        """Return the weighted mean of the squared distances for the validation examples, and a text that reports it."""
         validation_loss = distance(slice(n_train, None)).item()
         return validation_loss, f"{validation_loss:.4f} on watched charges"
 

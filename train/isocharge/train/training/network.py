@@ -1,12 +1,15 @@
-"""The network during training, in PyTorch: from charges to contact, standard deviations and misfit.
+"""Network for training in PyTorch, which estimates contacts, standard deviations and misfits from charges.
 
 The inputs are whitened logarithms of the charges (`isocharge.train.training.features`). The force scales all charges by
-nearly the same factor. The common factor therefore depends mostly on the force, and the ratios depend mostly on the
-position. One perceptron gives the mean and the logarithm of the standard deviation of (x, y, ln F). A second perceptron
-gives the vector (Q - Q(c)) / sigma at the contact c of the domain where this vector is shortest. The length of the
-vector is the misfit. If a contact explains the charges exactly, the vector is zero. The vector is a smooth function of
-the charges there, but its length is not. The length of the vector ranges from a tenth to thousands, and is compressed
-by asinh.
+nearly the same factor. The common factor of the charges therefore depends mostly on the force, and their ratios depend
+mostly on the position. A first perceptron estimates the means of x, y and ln F and the logarithms of their standard
+deviations.
+
+A second perceptron estimates the misfit vector (Q - Q(c)) / sigma. Here, Q are the measured charges, sigma are the
+standard deviations of their noise, and Q(c) are the charges of the contact c for which the vector is shortest. The
+length of the misfit vector is the misfit. If the measured charges are exactly those of a contact, the vector is zero.
+Near such charges, the vector is a smooth function of the charges, but its length is not. The length of the vector
+ranges from a tenth to thousands, so it is compressed by the function asinh.
 """
 
 from collections.abc import Sequence
@@ -24,34 +27,40 @@ from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.folded_network import LOG_STD, MEAN, MISFIT_UNIT, N_CONTACT_ANSWERS, FoldedNetwork
-from isocharge.train.training.folding import answer_units, fold
+from isocharge.train.training.folding import fold, linear_answer_map
 from isocharge.train.training.torch_evaluation import evaluate, evaluate_features
 
 LARGEST_INT8 = 127
-"""Largest absolute value of a weight that is rounded to 8 bits, in units of the scale of its output."""
+"""Largest absolute value of the integers by which weights are represented in 8 bits."""
 
 FIRST_LAYER_SLOPES = (0.5, 3.5)
-"""Smallest and largest norm of the initial weights of a unit of a sharpened first layer. The inputs have unit
-variance."""
+"""Smallest and largest norm of the initial weights of a unit in a sharpened first layer.
+
+The inputs of the layer have unit variance.
+"""
 
 N_TRAINING_ANGLES = 3
-"""Number of outputs of the contact perceptron for the angles of the correlations, which are not released."""
+"""Number of outputs of the contact perceptron for angles of correlations, which a released model does not contain."""
 
 TRAINING_ANGLES = slice(N_CONTACT_ANSWERS, N_CONTACT_ANSWERS + N_TRAINING_ANGLES)
-"""Outputs of the contact perceptron with these angles, relative to a right angle."""
+"""Columns of the outputs of the contact perceptron that contain the angles of the correlations minus a right angle."""
 
 INITIAL_NONLINEAR_SIZE = 0.2
-"""Factor on the initial weights of outputs whose linear part was fitted."""
+"""Factor by which the initial weights of an output are multiplied after its linear part was fitted."""
 
 MIN_LENGTH = 1e-9
-"""Length below which a misfit vector counts as having this length, so that no division by zero occurs."""
+"""Smallest length of a residual by which the compression divides, so that no division by zero occurs."""
+
+MIN_SCALE = 1e-30
+"""Smallest scale by which the rounding divides, so that no division by zero occurs."""
 
 
 class TrainablePerceptron(nn.Module):
     """A perceptron with a skip layer (`isocharge.common.perceptron`).
 
-    The logarithm of the force is nearly a linear function of the logarithms of the charges. It is needed with an error
-    of about a thousandth of its range. With the skip layer, the hidden layers only need to learn the nonlinear part.
+    The logarithm of the force is nearly a linear function of the logarithms of the charges. The network must estimate
+    the logarithm of the force with an error of about a thousandth of its range. With the skip layer, the hidden layers
+    only need to learn the nonlinear part of this function.
 
     Args:
         n_input: Number of inputs.
@@ -77,11 +86,12 @@ class TrainablePerceptron(nn.Module):
         nn.init.zeros_(self.skip.weight)
 
     def sharpen_first_layer(self) -> None:
-        """Draw the first layer again with larger weights, so that the units bend at random places among the inputs.
+        """Draw the first layer again with larger weights, so that its units are nonlinear at random places.
 
-        The posterior mean of contacts at the rim of the working area bends within a small distance. Units that are
-        nearly linear over all inputs learn this slowly. Each unit gets a random direction in the space of the inputs
-        and a random slope along this direction. The output of the unit is zero at a random centre.
+        Near the rim of the working area, the posterior mean of the contact is a strongly nonlinear function of the
+        charges. Units that are nearly linear for all inputs learn such a function slowly. Each unit therefore gets a
+        random direction in the space of the inputs and a random slope along this direction. The argument of its
+        activation is zero at a random centre.
         """
         first, *_ = self.linear_layers()
         n_unit = first.out_features
@@ -94,9 +104,10 @@ class TrainablePerceptron(nn.Module):
             first.bias.copy_(-(first.weight * centre).sum(dim=1))  # weight @ centre + bias = 0
 
     def fit_linear_part(self, inputs: Tensor, targets: Tensor) -> None:
-        """Set the skip layer to the linear least-squares fit of the first outputs.
+        """Fit the first outputs to targets by linear least squares, and store the coefficients in the skip layer.
 
-        The hidden layers then start with a small contribution to these outputs, and learn what is not linear.
+        At the beginning of the training, the hidden layers then contribute little to these outputs. During the
+        training, they learn the nonlinear part of the outputs.
 
         Args:
             inputs: Inputs, shape (n, n_input).
@@ -114,11 +125,18 @@ class TrainablePerceptron(nn.Module):
             last.bias[:n_target] = offset[0]
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Compute the outputs, shape (n, n_output), of inputs of shape (n, n_input)."""
+        """Compute the outputs of the perceptron.
+
+        Args:
+            inputs: Inputs, shape (n, n_input).
+
+        Returns:
+            Outputs, shape (n, n_output).
+        """
         return evaluate(self.definition(), inputs)
 
     def definition(self) -> Perceptron[Tensor]:
-        """Return the perceptron with the tensors that are trained."""
+        """Return the definition of the perceptron, which contains the trained tensors themselves instead of copies."""
         *hidden, last = (Layer(layer.weight.T, layer.bias) for layer in self.linear_layers())
         return Perceptron(tuple(hidden), last, self.skip.weight.T, self.activation)
 
@@ -131,25 +149,29 @@ class TrainablePerceptron(nn.Module):
         return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def hidden_matrices(self) -> list[Tensor]:
-        """Return the weights between hidden layers, shape (n_output, n_input) each."""
+        """Return the weight matrices between hidden layers, each of shape (n_output, n_input)."""
         _, *between, _ = self.linear_layers()
         return [layer.weight for layer in between]
 
     def round_hidden_matrices(self) -> None:
-        """Round the weights between hidden layers to 8 bits, one scale for each output, and stop their training.
+        """Round the weights between hidden layers to 8 bits, and exclude these weights from further training.
 
-        A rounded weight is an integer from -127 to 127 times the scale of its output.
+        Each rounded weight is the product of an integer from -127 to 127 and a scale. All weights of an output have the
+        same scale.
         """
         for matrix in self.hidden_matrices():
-            weights = matrix.detach()  # shares its memory with the matrix
-            scale = weights.abs().amax(dim=1, keepdim=True) / LARGEST_INT8
-            integers = torch.round(weights / scale.clamp(min=1e-30))  # the limit avoids a division by zero
+            weights = matrix.detach()  # shares its memory with the matrix, which is therefore changed below
+            scale = weights.abs().amax(dim=1, keepdim=True) / LARGEST_INT8  # shape (n_output, 1)
+            integers = torch.round(weights / scale.clamp(min=MIN_SCALE))
             weights.copy_(integers * scale)
             matrix.requires_grad_(False)
 
 
 class InverseNetwork(nn.Module):
-    """The whole network.
+    """The whole network, which consists of the contact perceptron and the misfit perceptron.
+
+    The contact perceptron estimates unit coordinates. Unit coordinates are x, y and ln F, scaled such that each of them
+    ranges from -1 to 1 in the domain.
 
     Args:
         domain: Contacts for which the network is trained.
@@ -160,11 +182,12 @@ class InverseNetwork(nn.Module):
     def __init__(self, domain: Domain, features: WhitenedFeatures, config: NetworkConfig) -> None:
         """Create the perceptrons with random weights.
 
-        The scales of the contacts and the whitening of the features are buffers, which are not trained.
+        The centre and the scale of the contacts and the whitening of the features are stored as buffers, because they
+        are not trained.
 
         Args:
-            domain: Contacts that the network estimates.
-            features: Features of the charges.
+            domain: Contacts for which the network is trained.
+            features: Whitened input features.
             config: Widths and activation of the hidden layers.
         """
         super().__init__()
@@ -189,35 +212,42 @@ class InverseNetwork(nn.Module):
         return self.features.charge_features.n_electrode
 
     def inputs(self, charge: Tensor) -> Tensor:
-        """Compute the inputs of both perceptrons from charges of shape (n, n_electrode), pC.
-
-        Finite charges give finite inputs.
-        """
-        return (evaluate_features(self.features.charge_features, charge) - self.features_mean) @ self.whitening
-
-    def posterior(self, charge: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute mean and log standard deviation of the unit coordinates.
+        """Compute the inputs of both perceptrons, which are whitened features. Finite charges give finite inputs.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
-            Mean and logarithm of the standard deviation, shape (n, 3) each.
+            Inputs, shape (n, n_electrode).
+        """
+        features = evaluate_features(self.features.charge_features, charge)
+        return (features - self.features_mean) @ self.whitening
+
+    def posterior(self, charge: Tensor) -> tuple[Tensor, Tensor]:
+        """Estimate the means of the unit coordinates and the logarithms of their standard deviations.
+
+        Args:
+            charge: Charges, shape (n, n_electrode), pC.
+
+        Returns:
+            Means and logarithms of the standard deviations, each of shape (n, 3).
         """
         mean, log_std, _ = self.posterior_with_angles(charge)
         return mean, log_std
 
     def posterior_with_angles(self, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute the posterior with the angles of its correlations (`isocharge.train.training.correlation`).
+        """Estimate the unit coordinates, their standard deviations and the angles of their correlations.
 
-        The angles are trained together with the network, so that the hidden layers contain the information about the
-        correlations. The angles of a released model are fitted to the hidden layers after the training.
+        The module `isocharge.train.training.correlation` explains the angles. The angles are trained together with the
+        network, so that the hidden layers contain information about the correlations. A released model has other
+        angles, which are fitted to the hidden layers after the training.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
 
         Returns:
-            Mean and logarithm of the standard deviation of the unit coordinates, and the angles, shape (n, 3) each.
+            Means of the unit coordinates, logarithms of their standard deviations, and angles minus a right angle, each
+            of shape (n, 3).
         """
         outputs = self.contact(self.inputs(charge))
         return outputs[:, MEAN], outputs[:, LOG_STD], outputs[:, TRAINING_ANGLES]
@@ -232,12 +262,12 @@ class InverseNetwork(nn.Module):
             Contacts (x, y, F), shape (n, 3), mm and N. Standard deviations of the contacts, shape (n, 3). Misfits,
             shape (n, 1).
         """
-        # (x, y, ln F) and the standard deviations of these values
+        # Convert the unit coordinates to (x, y, ln F).
         unit_mean, unit_log_std = self.posterior(charge)
         log_contact = unit_mean * self.scale + self.centre
         log_contact_std = torch.exp(unit_log_std) * self.scale
 
-        # The standard deviation of ln F is that of F relative to F.
+        # Convert (x, y, ln F) to (x, y, F). The standard deviation of F is the standard deviation of ln F times F.
         force = torch.exp(log_contact[:, 2:])  # shape (n, 1)
         contact = torch.cat([log_contact[:, :2], force], dim=1)
         contact_std = torch.cat([log_contact_std[:, :2], log_contact_std[:, 2:] * force], dim=1)
@@ -248,10 +278,15 @@ class InverseNetwork(nn.Module):
 
 
 def compress_length(residual: Tensor) -> Tensor:
-    """Return the targets of the misfit perceptron: residuals with the length asinh(length / MISFIT_UNIT).
+    """Compress the lengths of residuals. The compressed residuals are the targets of the misfit perceptron.
+
+    The length of a residual becomes asinh(length / MISFIT_UNIT).
 
     Args:
-        residual: (Q - Q(c)) / sigma at the nearest contact c, shape (..., n_electrode).
+        residual: Residuals (Q - Q(c)) / sigma at the nearest contact c, shape (..., n_electrode).
+
+    Returns:
+        Vectors with the directions of the residuals and the compressed lengths, shape (..., n_electrode).
     """
     length: Tensor = torch.linalg.vector_norm(residual, dim=-1, keepdim=True)
     return residual * (torch.asinh(length / MISFIT_UNIT) / length.clamp(min=MIN_LENGTH))
@@ -270,11 +305,12 @@ def perceptron_to_numpy(perceptron: Perceptron[Tensor]) -> Perceptron[Array]:
 
 
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
-    """Fold both perceptrons of a trained network into one."""
+    """Fold both perceptrons of a trained network into one perceptron."""
     charge_features = network.features.charge_features
-    units = answer_units(network.domain, np.eye(3), np.zeros(3), charge_features.n_electrode)
+    # The contact perceptron estimates the unit coordinates directly, so they are neither rotated nor shifted.
+    answer_map = linear_answer_map(network.domain, np.eye(3), np.zeros(3), charge_features.n_electrode)
     perceptrons = [_contact_to_numpy(network), network.misfit_vector.to_numpy()]
-    return _fold(network, perceptrons, units)
+    return _fold(network, perceptrons, answer_map)
 
 
 def fold_contact_mean(network: InverseNetwork) -> FoldedNetwork:
@@ -284,21 +320,21 @@ def fold_contact_mean(network: InverseNetwork) -> FoldedNetwork:
     """
     weights_of_means = np.diag(network.domain.scale)
     weights_of_log_stds = np.zeros((3, 3))
-    units = Layer(np.vstack([weights_of_means, weights_of_log_stds]), network.domain.centre)
-    return _fold(network, [_contact_to_numpy(network)], units)
+    answer_map = Layer(np.vstack([weights_of_means, weights_of_log_stds]), network.domain.centre)
+    return _fold(network, [_contact_to_numpy(network)], answer_map)
 
 
-def _fold(network: InverseNetwork, perceptrons: Sequence[Perceptron[Array]], units: Layer[Array]) -> FoldedNetwork:
-    """Fold perceptrons of a network into one.
+def _fold(network: InverseNetwork, perceptrons: Sequence[Perceptron[Array]], answer_map: Layer[Array]) -> FoldedNetwork:
+    """Fold perceptrons of a network into one perceptron.
 
     Args:
-        network: The network, whose features and whitening are used.
-        perceptrons: Perceptrons that run side by side.
-        units: Linear layer from the outputs of all perceptrons to the answers.
+        network: Network whose features and whitening are used.
+        perceptrons: Perceptrons of the network with the same inputs.
+        answer_map: Linear map from the outputs of all perceptrons, one after the other, to the answers.
     """
     mean = _to_numpy(network.features_mean)
     matrix = _to_numpy(network.whitening)
-    return FoldedNetwork(network.features.charge_features, fold(perceptrons, mean, matrix, units))
+    return FoldedNetwork(network.features.charge_features, fold(perceptrons, mean, matrix, answer_map))
 
 
 def _contact_to_numpy(network: InverseNetwork) -> Perceptron[Array]:
@@ -310,4 +346,5 @@ def _contact_to_numpy(network: InverseNetwork) -> Perceptron[Array]:
 
 
 def _to_numpy(tensor: Tensor) -> Array:
+    """Return a copy of a tensor as a NumPy array in double precision."""
     return np.asarray(tensor.detach().double().numpy())

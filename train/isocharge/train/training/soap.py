@@ -1,9 +1,9 @@
-"""SOAP: Adam in the eigenbasis of the second moments of the gradient.
+"""The optimiser SOAP, which applies Adam in the eigenbasis of the second moments of the gradient.
 
-A weight matrix W has a gradient G. The optimiser averages G G^T and G^T G over the steps. The entries of the gradient
-are nearly uncorrelated along the eigenvectors of these averages. Adam scales each entry separately, so in this basis it
-comes close to a second-order method (Vyas et al., 2024, arXiv 2409.11321, algorithm 3). The eigenvectors change slowly
-and are updated every few steps by one orthogonal iteration.
+For the gradient G of each weight matrix, the optimiser averages the matrices G G^T and G^T G over the steps. In the
+basis of the eigenvectors of these averages, the entries of the gradient are nearly uncorrelated. Adam scales each entry
+separately. In this basis, Adam therefore comes close to a second-order method (Vyas et al., 2024, arXiv 2409.11321,
+algorithm 3). The eigenvectors change slowly, and are updated every few steps by one orthogonal iteration.
 """
 
 import copy
@@ -17,19 +17,20 @@ BASIS_PERIOD = 10
 """Number of steps between two updates of the eigenvectors."""
 
 EPSILON = 1e-10
-"""Smallest root mean square of an entry of the gradient by which a step is divided."""
+"""Number that is added to each root mean square of the gradient, so that no division by zero occurs."""
 
 
 class Soap:
     """The optimiser SOAP. Parameters with one dimension, such as biases, are trained by Adam.
 
-    The class has the methods of PyTorch's optimisers that a training needs. The class is not derived from
-    `torch.optim.Optimizer`, because the first object of that class imports PyTorch's compiler, which takes 2 s.
+    The class has only those methods of PyTorch's optimisers that a training needs. The class is not derived from
+    `torch.optim.Optimizer`, because the creation of the first object of that class imports PyTorch's compiler, which
+    takes long.
 
     Args:
-        params: Parameters, or groups of parameters as of all optimisers of PyTorch. A parameter with more than two
-            dimensions is an array of matrices.
-        lr: Learning rate: the change of each entry in one step, approximately.
+        params: Parameters, or groups of parameters in the form that all optimisers of PyTorch accept. A parameter with
+            more than two dimensions is an array of matrices.
+        lr: Learning rate, which is approximately the change of each entry in one step.
         betas: Decay rates of the moving averages of the gradient and of its second moments.
 
     Attributes:
@@ -42,9 +43,9 @@ class Soap:
         lr: float = 1e-3,
         betas: tuple[float, float] = (0.95, 0.95),
     ) -> None:
-        """Prepare the optimiser. See the class for the arguments.
+        """Prepare the optimiser. The class describes the arguments.
 
-        Parameters that are given without a group form one group with the default settings.
+        Parameters that are given without a group form one group with the settings `lr` and `betas`.
         """
         defaults: dict[str, Any] = {"lr": lr, "betas": betas}
         self.param_groups: list[dict[str, Any]] = []
@@ -81,37 +82,37 @@ class Soap:
 def _update(
     parameter: Tensor, gradient: Tensor, state: dict[str, Any], rate: float, betas: tuple[float, float]
 ) -> None:
-    """Change one parameter and its state by a step of SOAP (Vyas et al., 2024, algorithm 3).
+    """Change one parameter and its state by one step of SOAP (Vyas et al., 2024, algorithm 3).
 
     The averaged gradient is rotated into the eigenbasis. The entries of the rotated gradient are divided by their root
     mean squares, as in Adam. The result is rotated back and gives the direction of the step.
 
     Args:
-        parameter: The parameter.
-        gradient: Its gradient, of the same shape.
-        state: Moving averages and eigenvectors of the parameter; empty before its first step.
+        parameter: Parameter to change.
+        gradient: Gradient of the parameter, of the same shape.
+        state: Moving averages and eigenvectors of the parameter; empty before the first step.
         rate: Learning rate.
-        betas: Decay rates of the moving averages.
+        betas: Decay rates of the moving averages of the gradient and of its second moments.
     """
     if not state:
         state.update(_initial_state(gradient))
     state["step"] += 1
     mean_decay, square_decay = betas
 
-    # Matrices have an eigenbasis, which follows the moving averages of G G' and G' G of the gradient G.
-    if gradient.ndim > 1:
+    # Update the moving averages of G G^T and G^T G, where G is the gradient, and the eigenbases of these averages.
+    if gradient.ndim > 1:  # vectors have no eigenbases
         state["row_moment"].lerp_(gradient @ gradient.mT, 1.0 - square_decay)
         state["column_moment"].lerp_(gradient.mT @ gradient, 1.0 - square_decay)
         if state["step"] % BASIS_PERIOD == 1:  # at the first step, and then once in a period
             _update_basis(state)
 
-    # Moving averages of the gradient, and of its squared entries in the eigenbasis
+    # Update the moving averages of the gradient, and of its squared entries in the eigenbasis.
     mean = state["mean"].lerp_(gradient, 1.0 - mean_decay)
     rotated_gradient = _rotate(gradient, state)
     mean_square = state["square"].mul_(square_decay)
     mean_square.addcmul_(rotated_gradient, rotated_gradient, value=1.0 - square_decay)
 
-    # The averages begin at zero, so they are divided by the total weight of the gradients so far.
+    # The moving averages begin at zero. They are therefore divided by the total weight of all gradients so far.
     mean_weight = 1.0 - mean_decay ** state["step"]
     square_weight = 1.0 - square_decay ** state["step"]
     root_mean_square = (mean_square / square_weight).sqrt_().add_(EPSILON)
@@ -120,11 +121,11 @@ def _update(
 
 
 def _initial_state(gradient: Tensor) -> dict[str, Any]:
-    """Return the state of a parameter before its first step: averages of zero, and identity matrices as eigenbases.
+    """Return the state of a parameter before its first step, with averages of zero and identity matrices as eigenbases.
 
     Args:
-        gradient: Gradient of the parameter: matrices of shape (..., n_row, n_column), or a vector, which has no
-            eigenbases.
+        gradient: Gradient of the parameter, which is an array of matrices, shape (..., n_row, n_column), or a vector. A
+            vector has no eigenbases.
     """
     state: dict[str, Any] = {
         "step": 0,
@@ -141,14 +142,14 @@ def _initial_state(gradient: Tensor) -> dict[str, Any]:
 
 
 def _update_basis(state: dict[str, Any]) -> None:
-    """Bring both bases nearer to the eigenvectors of the second moments by one orthogonal iteration."""
+    """Update both eigenbases by one orthogonal iteration, which brings them nearer to the eigenvectors."""
     for name in ("row", "column"):
         basis = state[f"{name}_basis"]
         state[f"{name}_basis"] = torch.linalg.qr(state[f"{name}_moment"] @ basis).Q
 
 
 def _rotate(matrix: Tensor, state: dict[str, Any]) -> Tensor:
-    """Return a matrix in the eigenbasis. Vectors are not rotated."""
+    """Transform a matrix to the eigenbasis. A vector is returned unchanged."""
     if matrix.ndim < 2:
         return matrix
     rotated: Tensor = state["row_basis"].mT @ matrix @ state["column_basis"]
@@ -156,7 +157,7 @@ def _rotate(matrix: Tensor, state: dict[str, Any]) -> Tensor:
 
 
 def _rotate_back(matrix: Tensor, state: dict[str, Any]) -> Tensor:
-    """Return a matrix that is given in the eigenbasis. Vectors are not rotated."""
+    """Transform a matrix from the eigenbasis back to the original basis. A vector is returned unchanged."""
     if matrix.ndim < 2:
         return matrix
     rotated: Tensor = state["row_basis"] @ matrix @ state["column_basis"].mT

@@ -1,4 +1,4 @@
-"""Training data: simulated or measured presses, or the answers of another model."""
+"""Training data of a network, which are simulated or measured presses or the answers of another model."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,14 +18,15 @@ from isocharge.train.training.network import as_tensor
 class Teacher:
     """A model whose answers a smaller network learns (knowledge distillation, Hinton et al., 2015).
 
-    The contact of a press is one sample of the posterior of its noisy charges. A good model gives this posterior
-    without the scatter of single samples, so a small network learns faster from its answers than from the contacts.
+    The true contact of a press is only one sample from the posterior distribution of the contact, given its noisy
+    charges. A good model estimates this distribution without the scatter of single samples. A small network therefore
+    learns faster from the answers of such a model than from the true contacts.
 
     Attributes:
         label: Name and version of the model.
         sha256: Checksum of the model file.
-        answer: Function of charges, shape (n, n_electrode), pC. It returns contacts, shape (n, 3), mm and N, and the
-            standard deviations of the contacts, shape (n, 3).
+        answer: Function that estimates contacts from charges, shape (n, n_electrode), pC. It returns the contacts,
+            shape (n, 3), mm and N, and their standard deviations, shape (n, 3).
     """
 
     label: str
@@ -33,14 +34,14 @@ class Teacher:
     answer: Callable[[Array], tuple[Array, Array]]
 
     def posterior(self, charge: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
-        """Compute the teacher's posterior in unit coordinates.
+        """Estimate the means of the unit coordinates and the logarithms of their standard deviations with the model.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
-            domain: Centre and scale of the unit coordinates.
+            domain: Domain that defines the centre and the scale of the unit coordinates.
 
         Returns:
-            Mean and logarithm of the standard deviation, shape (n, 3) each.
+            Means and logarithms of the standard deviations, each of shape (n, 3).
         """
         contact, std = self.answer(charge.double().numpy())
         log_force_std = std[:, 2] / contact[:, 2]  # the standard deviation of ln F
@@ -50,18 +51,19 @@ class Teacher:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingData:
-    """Presses on which one network is trained, and presses for measuring its errors.
+    """Presses for the training of one network, and presses for measuring its errors.
 
     Attributes:
-        sensor: The pressed sensor.
+        sensor: Sensor to which the presses belong.
         probes: Notations of the probes.
-        domain: Contacts for which a network is requested. The network gets a smaller domain if the map folds.
+        domain: Contacts for which a network is requested. The network gets a smaller domain if the map from contacts to
+            charges folds.
         presses: Presses for training. Noise is added to the charges during the training. For measured presses, this is
             a regularisation.
         sha256: Checksum of the presses.
         test: Measured presses for measuring errors; None to hold out a part of `presses`.
-        teacher: Model whose answers are learned; None to learn the contacts of the presses.
-        provenance: Additional information for the release.
+        teacher: Model whose answers the network learns; None if it learns the contacts of the presses.
+        provenance: Additional information about the origin of the model, for the release.
     """
 
     sensor: Sensor
@@ -75,7 +77,7 @@ class TrainingData:
 
     @classmethod
     def of(cls, dataset: Dataset) -> "TrainingData":
-        """Return the training data of a dataset, simulated or measured.
+        """Convert a simulated or measured dataset to training data.
 
         Raises:
             DatasetError: If the dataset cannot train a network, for example because of a copied channel.

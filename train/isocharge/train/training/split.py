@@ -1,4 +1,4 @@
-"""Presses of a training in three parts: for training, for validation and for the test."""
+"""Split of presses into three parts, which are used for training, for validation and for the test."""
 
 from dataclasses import dataclass, replace
 
@@ -17,23 +17,27 @@ VALIDATION_FRACTION = 0.5
 """Number of validation positions relative to the number of test positions, dimensionless."""
 
 SIGNED_FEATURE_SCALE = 0.1
-"""Charge above which features of charges of both signs are logarithmic, relative to the charge above which the noise is
-proportional to the charge. On a taut uniaxial film the position error is 1.05 of the Bayes limit with 0.1, and 1.08
-with 1."""
+"""Charge above which features of charges of both signs are logarithmic, dimensionless.
+
+It is relative to the charge above which the noise is proportional to the charge. On a taut uniaxial film, the value 0.1
+gave smaller position errors than the value 1.
+"""
 
 
 @dataclass(frozen=True)
 class Split:
-    """The presses of a training, split by position, in the domain where the map can be inverted.
+    """Presses that are split by position. In their domain, the map from contacts to charges can be inverted.
 
     Attributes:
         domain: Contacts for which the network is trained.
         train: Presses for training.
         validation: Presses for early stopping.
         test: Presses for measuring errors.
-        field: Map from contacts to charges, fitted to the presses of the domain, or to all presses if that fits better.
+        field: Map from contacts to charges. It is fitted to the presses of the domain, or to all presses if this fit is
+            more accurate.
         cautions: Sentences about folds of the map and about contacts with the same charges.
-        folded_charges: Charges of all presses, including the region where the map folds; None if it does not fold.
+        folded_charges: Approximation of the charges by a series, which includes the region where the map folds; None if
+            the map does not fold or if the charges have both signs.
     """
 
     domain: Domain
@@ -46,49 +50,53 @@ class Split:
 
     @classmethod
     def of(cls, data: TrainingData, training: TrainingConfig) -> "Split":
-        """Split presses into presses for training, for validation and for the test, and fit a charge field to them.
+        """Split presses into three parts for training, for validation and for the test, and fit a charge field.
 
-        A first charge field is fitted to all presses. This field gives the largest disk in which the map certainly does
-        not fold. Only presses within this disk are used.
+        The charge field is a map from contacts to charges. A first charge field is fitted to all presses. This first
+        field determines the largest disk in which the map certainly does not fold. Only the presses within this disk
+        are used.
 
         Args:
             data: Presses of the sensor.
             training: Fractions of the presses, noise and seed.
         """
         presses = data.presses
-        names = data.sensor.electrode_names
+        electrode_names = data.sensor.electrode_names
         field_train, field_validation = split_by_position(presses, training.hold_out, training.seed)
-        whole_field = ChargeField.fit(data.domain, names, field_train, field_validation)
+        whole_field = ChargeField.fit(data.domain, electrode_names, field_train, field_validation)
         domain, cautions = invertible_domain(whole_field, presses, misfit_noise(training.noise_model))
-        is_folded = domain != data.domain
-        inside = presses.within(domain.radius) if is_folded else presses
+        is_folded = domain != data.domain  # the domain is only reduced if the map folds
+        used_presses = presses.within(domain.radius) if is_folded else presses
 
-        train, validation, test = _split_presses(inside, training)
+        train, validation, test = _split_presses(used_presses, training)
 
-        # If the map folds, the first field was also fitted to presses beyond the fold. If the presses are measured, it
-        # was also fitted to test presses. In both cases, a second field is fitted to the training presses. For a map
-        # that folds, the more accurate field is used.
+        # If the map folds, the first field was also fitted to presses beyond the fold. If the presses are measured, the
+        # first field was also fitted to test presses. In both cases, a second field is fitted to the training presses.
+        # For a map that folds, the more accurate field is used.
         field: ChargeMap = whole_field
         if is_folded or presses.measured:
-            field = ChargeField.fit(domain, names, train, validation)
+            field = ChargeField.fit(domain, electrode_names, train, validation)
             if is_folded and whole_field.error < field.error:
                 field = within(whole_field, domain.radius)
         folded_charges = whole_field.of_positive if is_folded else None
         return cls(domain, train, validation, test, field, cautions, folded_charges)
 
     def features(self, noise: NoiseModel) -> WhitenedFeatures:
-        """Fit the input features: logarithms if all charges are positive, otherwise inverse hyperbolic sines.
+        """Fit the input features to the training presses.
+
+        The features are logarithms if all charges are positive, and inverse hyperbolic sines otherwise.
 
         Args:
-            noise: Noise of the charges, which gives the scale on which the inverse hyperbolic sines bend.
+            noise: Noise of the charges, which determines the scale on which the inverse hyperbolic sines are nonlinear.
         """
         charge = self.train.charge
         has_both_signs = self.train.signed or self.validation.signed or self.test.signed
         if not has_both_signs:
             return WhitenedFeatures.fit_logarithms(charge)
         channel_noise = ChannelNoise.alike(noise, charge.shape[1])
-        larger_noise = replace(channel_noise, white=SIGNED_FEATURE_SCALE * channel_noise.white)
-        return WhitenedFeatures.fit_signed(charge, larger_noise.transition_charge(charge))
+        # The typical charges are the charges above which smaller noise would be proportional to the charge.
+        smaller_noise = replace(channel_noise, white=SIGNED_FEATURE_SCALE * channel_noise.white)
+        return WhitenedFeatures.fit_signed(charge, smaller_noise.transition_charge(charge))
 
 
 def _split_presses(
@@ -96,11 +104,14 @@ def _split_presses(
 ) -> tuple[LabelledPresses, LabelledPresses, LabelledPresses]:
     """Split presses by position into presses for training, for validation and for the test.
 
-    The test presses of measured presses are always the same ones. Simulated presses are split at random.
+    If the presses are measured, the same presses are always used for the test. Simulated presses are split at random.
 
     Args:
-        presses: The presses.
-        training: Fraction of the presses for the test, and the seed.
+        presses: Presses to split.
+        training: Fraction of the positions for the test, and the seed.
+
+    Returns:
+        Presses for training, for validation and for the test.
     """
     if presses.measured:
         is_test = held_out(presses.contact)
@@ -109,6 +120,6 @@ def _split_presses(
     else:
         remaining, test = split_by_position(presses, training.hold_out, training.seed)
     validation_share = VALIDATION_FRACTION * training.hold_out
-    # Another seed makes this choice independent of that of the test.
+    # With another seed, the choice of the validation presses is independent of the choice of the test presses.
     train, validation = split_by_position(remaining, validation_share, training.seed + 1)
     return train, validation, test

@@ -1,4 +1,4 @@
-"""Evaluation of a network's definition with PyTorch, for training."""
+"""Evaluation of input features and perceptrons with PyTorch, which is used for training."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ def evaluate_features(features: ChargeFeatures, charge: Tensor) -> Tensor:
     """Compute the input features of charges. Finite charges give finite features.
 
     Args:
-        features: Limits, typical charges and means of the features.
+        features: Definition of the features: limits, typical charges and means.
         charge: Charges, shape (..., n_electrode), pC.
 
     Returns:
@@ -23,7 +23,7 @@ def evaluate_features(features: ChargeFeatures, charge: Tensor) -> Tensor:
     """
 
     def as_charge_type(values: Array) -> Tensor:
-        """Convert an array into a tensor with the number type of the charges."""
+        """Convert an array to a tensor with the data type of the charges."""
         return torch.as_tensor(values, dtype=charge.dtype)
 
     clipped = charge.clamp(as_charge_type(features.low_pC), as_charge_type(features.high_pC))
@@ -34,20 +34,20 @@ def evaluate_features(features: ChargeFeatures, charge: Tensor) -> Tensor:
 
 
 def evaluate_hidden_layers(layers: Sequence[Layer[Tensor]], activation: Activation, inputs: Tensor) -> Tensor:
-    """Apply hidden layers to inputs.
+    """Apply hidden layers to inputs, one after the other.
 
     Args:
-        layers: Weights and biases of the layers.
-        activation: Activation after each layer.
+        layers: Weights and biases of the hidden layers.
+        activation: Activation that is applied after each layer.
         inputs: Inputs, shape (n, n_input) or (n_batch, n, n_input).
 
     Returns:
         Outputs of the last layer, shape (n, width) or (n_batch, n, width).
     """
-    function = getattr(torch.nn.functional, activation.torch_name)
+    activation_function = getattr(torch.nn.functional, activation.torch_name)
     outputs = inputs
     for layer in layers:
-        outputs = function(_evaluate_layer(layer, outputs))
+        outputs = activation_function(_evaluate_layer(layer, outputs))
     return outputs
 
 
@@ -55,9 +55,9 @@ def evaluate(perceptron: Perceptron[Tensor], inputs: Tensor) -> Tensor:
     """Evaluate a perceptron.
 
     Args:
-        perceptron: A perceptron, or n_batch perceptrons with weights of shape (n_batch, n_input, n_output) and biases
+        perceptron: One perceptron, or n_batch perceptrons with weights of shape (n_batch, n_input, n_output) and biases
             of shape (n_batch, 1, n_output).
-        inputs: Inputs, shape (n, n_input), or (n_batch, n, n_input).
+        inputs: Inputs, shape (n, n_input) or (n_batch, n, n_input).
 
     Returns:
         Outputs, shape (n, n_output) or (n_batch, n, n_output).
@@ -67,7 +67,7 @@ def evaluate(perceptron: Perceptron[Tensor], inputs: Tensor) -> Tensor:
 
 
 def _evaluate_layer(layer: Layer[Tensor], inputs: Tensor) -> Tensor:
-    """Compute inputs @ weight + bias in one operation."""
+    """Compute inputs @ weight + bias in one operation, for one layer or a batch of layers."""
     if inputs.ndim == 2:
         return torch.addmm(layer.bias, inputs, layer.weight)
     return torch.baddbmm(layer.bias, inputs, layer.weight)

@@ -1,4 +1,4 @@
-"""The Open Inference Protocol over gRPC: `inference.GRPCInferenceService` on the same models as HTTP.
+"""gRPC server of the Open Inference Protocol, which uses the same models as the HTTP server.
 
 May import: network.protocol, network.
 """

@@ -1,7 +1,8 @@
-"""Messages of `inference.GRPCInferenceService`, and functions that convert them to requests and answers.
+"""Messages of the gRPC service `inference.GRPCInferenceService`, and functions that convert these messages.
 
-The message classes are built from the compiled `inference.proto` in a separate descriptor pool. A program may therefore
-also use another implementation of the protocol, although its messages have the same names.
+The classes of the messages are created from the compiled file `inference.proto` in a separate descriptor pool. A
+program can therefore use another implementation of the protocol at the same time, although the messages of both
+implementations have the same names.
 """
 
 from importlib.resources import files
@@ -22,11 +23,11 @@ from isocharge.serve.network.protocol.inference import (
 )
 
 SERVICE = "inference.GRPCInferenceService"
-"""Full name of the service."""
+"""Full name of the gRPC service."""
 
 
 def _service_descriptor() -> Any:
-    """Return the descriptor of the service from the compiled protocol file."""
+    """Read the compiled protocol file, and return the descriptor of the service."""
     compiled = files("isocharge.serve.network.grpc").joinpath("inference.binpb").read_bytes()
     pool = DescriptorPool()
     descriptor_set = FileDescriptorSet.FromString(compiled)
@@ -39,27 +40,27 @@ METHODS: dict[str, tuple[type[Any], type[Any]]] = {
     method.name: (GetMessageClass(method.input_type), GetMessageClass(method.output_type))
     for method in _service_descriptor().methods
 }
-"""Classes of the request and of the response of each method, by its name."""
+"""Class of the request and class of the response, by the name of the method."""
 
 CONTENT_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
-"""Field of a tensor's contents that holds the numbers, by number type."""
+"""Field of the contents of a tensor that contains the numbers, by the type of the numbers."""
 
 
 def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> InferRequest:
-    """Parse a ModelInferRequest, and return the charges and the requested outputs.
+    """Read a ModelInferRequest, and return the charges and the requested outputs.
 
-    The message is converted to the JSON object of the HTTP protocol, and then parsed as such. If the charges of the
-    request are raw contents, the outputs of the response are raw contents, too.
+    The message is first converted to the JSON object that an HTTP request would contain. This object is then parsed. If
+    the charges are sent as raw contents, the outputs of the response are also sent as raw contents.
 
     Args:
-        message: The message of gRPC.
-        loaded: The model.
+        message: The ModelInferRequest.
+        loaded: Version of the model for which the request is meant.
         max_presses: Largest number of presses in one request.
 
     Raises:
         RequestError: If the message is not a request for this model.
         ChargeError: If a charge is not finite.
-        TooLarge: If there are more presses than `max_presses`.
+        TooLarge: If the request contains more than `max_presses` presses.
     """
     raw_contents = message.raw_input_contents
     if len(raw_contents) > 1:
@@ -75,12 +76,13 @@ def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> Infer
 
 
 def _input_object(tensor: Any, raw_charges: bytes | None) -> dict[str, Any]:
-    """Return an input tensor as the JSON object of the HTTP protocol.
+    """Convert an input tensor to the JSON object that an HTTP request would contain.
 
     Args:
-        tensor: Message with the name, the number type and the shape of the tensor, and possibly its numbers.
-        raw_charges: Raw content of the request, which follows the JSON text in the HTTP protocol; None if the request
-            has none.
+        tensor: Message that contains the name, the number type and the shape of the tensor. It may also contain the
+            numbers.
+        raw_charges: Raw content of the request with the charges, or None if the request has no raw content. In an HTTP
+            request, these bytes would follow the JSON text.
     """
     parameters: dict[str, Any] = _unsupported_parameters(tensor)
     json_object = {
@@ -91,23 +93,27 @@ def _input_object(tensor: Any, raw_charges: bytes | None) -> dict[str, Any]:
     }
     if raw_charges is not None:
         parameters["binary_data_size"] = len(raw_charges)
-    # A tensor with both numbers and raw content gets both keys, and is refused when the object is parsed.
+    # If the request contains both numbers and raw content, the object contains both. The function `parse_request` then
+    # refuses the object. It also refuses an unknown number type.
     if tensor.HasField("contents") or raw_charges is None:
-        field = CONTENT_FIELDS.get(tensor.datatype, "fp32_contents")  # an unknown number type is refused then, too
+        field = CONTENT_FIELDS.get(tensor.datatype, "fp32_contents")
         json_object["data"] = list(getattr(tensor.contents, field))
     return json_object
 
 
 def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
-    """Return the parameters of a tensor that this server must refuse, because they change the meaning of a request."""
+    """Return the parameters of a tensor that this server does not support.
+
+    The server must refuse these parameters, because they change the meaning of a request.
+    """
     return {name: True for name in ("shared_memory_region", "classification") if name in tensor.parameters}
 
 
 def write_response(answer: InferAnswer) -> Any:
-    """Return the outputs of a model as a ModelInferResponse.
+    """Convert the outputs of a model to a ModelInferResponse.
 
-    The values of an output are raw contents if the request asks for a binary tensor, and otherwise a list of texts or
-    numbers.
+    If an output was requested as a binary tensor, its values are sent as raw contents. Otherwise they are sent as a
+    list of texts or numbers.
     """
     _, response_type = METHODS["ModelInfer"]
     message = response_type()
@@ -121,7 +127,7 @@ def write_response(answer: InferAnswer) -> Any:
         if name in answer.binary:
             message.raw_output_contents.append(binary_tensor(rows))
         elif is_text:
-            texts = rows[:, 0].tolist()  # this output has one column
+            texts = rows[:, 0].tolist()  # the output `flags` has a single column
             tensor.contents.bytes_contents.extend(text.encode() for text in texts)
         else:
             tensor.contents.fp32_contents.extend(rows.ravel().tolist())

@@ -1,6 +1,6 @@
-"""gRPC server, which makes a `Service` available on a port and has its own event loop.
+"""gRPC server that makes a `Service` available on a port. The server runs in its own event loop.
 
-An open call needs no thread. Idle calls therefore do not delay other clients.
+No thread waits for the messages of an open call. Calls without messages therefore do not delay other clients.
 """
 
 import asyncio
@@ -21,28 +21,28 @@ from isocharge.serve.network.protocol import Handler
 T = TypeVar("T")
 
 GRACE_SECONDS = 10
-"""Time that requests which have begun have to finish when the server stops, s."""
+"""Longest time to wait, when the server stops, until the calls that have already begun are finished, s."""
 
 MAX_CALLS_PER_CONNECTION = 100
-"""Largest number of open calls of one connection, which is the smallest number that HTTP/2 recommends.
+"""Largest number of open calls on one connection. HTTP/2 recommends at least this number.
 
-Further calls of the connection wait on the side of the client.
+If a client begins further calls on the connection, they wait in the client.
 """
 
 
 @contextmanager
 def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> Iterator[str]:
-    """Run a gRPC server while the block runs.
+    """Return a context manager that runs a gRPC server while its block runs.
 
     Args:
-        handler: Handler of the HTTP server, whose models, limits and token are used. Clients send the token as metadata
-            `authorization`.
-        host: Name or address on which to listen.
-        port: TCP port; 0 selects a free port.
-        tls: Certificate and key; None for no TLS.
+        handler: Handler of the HTTP server. The gRPC server uses its models, limits and token. Clients send the token
+            in the metadata field `authorization`.
+        host: Host name or IP address on which to listen.
+        port: TCP port. The port 0 selects a free port.
+        tls: Certificate and private key for TLS, or None for a server without TLS.
 
     Yields:
-        The address, `grpc://host:port` or `grpcs://host:port`.
+        The URL of the server, `grpc://host:port` or, with TLS, `grpcs://host:port`.
 
     Raises:
         ListenError: If the address is in use or cannot be used.
@@ -61,36 +61,40 @@ def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) 
 
 @contextmanager
 def _event_loop() -> Iterator[asyncio.AbstractEventLoop]:
-    """Run an event loop in its own thread while the block runs, and yield the event loop."""
+    """Return a context manager that runs an event loop in its own thread while its block runs.
+
+    Yields:
+        The event loop.
+    """
     loop = uvloop.new_event_loop()
     thread = Thread(target=loop.run_forever, name="grpc")
     thread.start()
     try:
         yield loop
     finally:
-        # Wait for the calls that run in other threads, stop the loop, and wait for the thread of the loop.
-        _run_in(loop, loop.shutdown_default_executor())
+        _run_in(loop, loop.shutdown_default_executor())  # waits for the calls that are answered in other threads
         loop.call_soon_threadsafe(loop.stop)
-        thread.join()
+        thread.join()  # the loop must not be closed before it has stopped
         loop.close()
 
 
 def _run_in(loop: asyncio.AbstractEventLoop, coroutine: Coroutine[Any, Any, T]) -> T:
-    """Run a coroutine in an event loop of another thread, wait for its end, and return its result."""
-    return asyncio.run_coroutine_threadsafe(coroutine, loop).result()
+    """Run a coroutine in the event loop of another thread, wait until it has ended, and return its result."""
+    future = asyncio.run_coroutine_threadsafe(coroutine, loop)
+    return future.result()
 
 
 async def _start(handler: Handler, address: str, tls: Tls | None) -> tuple[grpc.aio.Server, int]:
-    """Start a gRPC server, and return it with the port on which it listens.
+    """Start a gRPC server, and return the server and the port on which it listens.
 
     Args:
-        handler: Handler of the HTTP server, whose models, limits and token are used.
-        address: `host:port`; the port 0 selects a free port.
-        tls: Certificate and key; None for no TLS.
+        handler: Handler of the HTTP server. The gRPC server uses its models, limits and token.
+        address: Address `host:port` on which to listen. The port 0 selects a free port.
+        tls: Certificate and private key for TLS, or None for a server without TLS.
     """
     limits = handler.limits
-    # The service itself limits the calls to `connections`, and ends a waiting call when a new call exceeds this limit.
-    # The limit of grpcio must be higher, because grpcio refuses calls above it before they reach the service.
+    # The service limits the number of open calls to `connections`. If a new call exceeds this limit, the service ends a
+    # waiting call instead of refusing the new call. grpcio would refuse the new call, so its own limit must be higher.
     max_calls = 2 * limits.connections
     server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=max_calls)
     server.add_generic_rpc_handlers((Service(handler).handlers(),))
@@ -100,7 +104,7 @@ async def _start(handler: Handler, address: str, tls: Tls | None) -> tuple[grpc.
 
 
 def _options(limits: ServerLimits) -> list[tuple[str, int]]:
-    """Return the options of grpcio that apply the limits of a server."""
+    """Return the options with which grpcio applies the limits of a server."""
     return [
         ("grpc.max_receive_message_length", limits.body_bytes),
         ("grpc.max_metadata_size", limits.header_bytes),
@@ -114,12 +118,12 @@ def _options(limits: ServerLimits) -> list[tuple[str, int]]:
 
 
 def _listen(server: grpc.aio.Server, address: str, tls: Tls | None) -> int:
-    """Let a server listen on `host:port`, and return the port on which it listens.
+    """Let a server listen on an address, and return the port on which it listens.
 
     Args:
-        server: The server, which has not been started.
-        address: `host:port`; the port 0 selects a free port.
-        tls: Certificate and key; None for no TLS.
+        server: The server, which has not been started yet.
+        address: Address `host:port` on which to listen. The port 0 selects a free port.
+        tls: Certificate and private key for TLS, or None for a server without TLS.
 
     Raises:
         ListenError: If the address is in use or cannot be used.

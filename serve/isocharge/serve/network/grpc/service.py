@@ -1,10 +1,10 @@
-"""Answers to the calls of `inference.GRPCInferenceService`.
+"""Service that answers the calls of `inference.GRPCInferenceService`.
 
-The service has the same models, limits and token as the HTTP server.
+The service uses the same models, limits and token as the HTTP server.
 
-All methods are declared as streams of messages from the client. The token and the limits can therefore be checked
-before the first message arrives. If the largest number of calls is open, the call that has waited longest for a message
-from its client is ended when a new call begins.
+Every method is declared as a method that receives a stream of messages. The token and the limits can therefore be
+checked before the first message of a call arrives. If a new call exceeds the largest number of open calls, the service
+ends another call, namely the call that has waited longest for a message from its client.
 """
 
 import asyncio
@@ -28,10 +28,10 @@ from isocharge.serve.network.protocol.response import client_message, statuses
 from isocharge.serve.network.traffic import Exchange
 
 METHODS_WITHOUT_TOKEN = ("ServerLive", "ServerReady")
-"""Names of the methods that need no token."""
+"""Names of the methods that clients may call without a token."""
 
 SLOW_METHODS = ("RepositoryModelLoad", "RepositoryModelUnload")
-"""Names of the methods that may take long and are therefore answered in other threads."""
+"""Names of the methods that may take a long time. They are therefore answered in other threads."""
 
 STREAM = "ModelStreamInfer"
 """Name of the method that receives and sends several messages in one call."""
@@ -42,7 +42,7 @@ class _Call:
     """Properties of a call that the counters and the log need.
 
     Attributes:
-        model: Label `name/version` of the requested model; None if the call names no model.
+        model: Label `name/version` of the requested model, or None if no loaded model was requested.
         bytes_in: Total size of the received messages, bytes.
         bytes_out: Total size of the sent messages, bytes.
     """
@@ -53,28 +53,30 @@ class _Call:
 
 
 class Service:
-    """Answers calls with the models, the token and the limits of a handler."""
+    """Service that answers calls with the models, the token and the limits of a handler."""
 
     def __init__(self, handler: Handler) -> None:
-        """Store the models, limits, token and counters, and register the function that answers each method.
+        """Store the models, the limits, the token and the counters, and the functions that answer the methods.
 
         Args:
-            handler: Handler of the HTTP server, whose models, limits, token and counters are used.
+            handler: Handler of the HTTP server. The service uses its models, limits, token and counters.
         """
         self._store = handler.store
         self._limits = handler.limits
         self._traffic = handler.traffic
         self._token = handler.token
         self._open_count = 0
-        self._waiting: dict[asyncio.Timeout, None] = {}  # an ordered set of the calls that wait for a message
+        # Timeouts of the calls that wait for a message, in the order in which they began to wait. A dictionary without
+        # values is used as an ordered set.
+        self._waiting: dict[asyncio.Timeout, None] = {}
         self._traffic.open["grpc"] = lambda: self._open_count
         self._functions = self._functions_of_methods()
 
     def _functions_of_methods(self) -> dict[str, Callable[[Any], Any]]:
-        """Return the function that answers each method, by the name of the method.
+        """Return the functions that answer the methods, by the name of the method.
 
-        Each function takes the message of the request. It returns the message of the response, its content as a JSON
-        object, or None for an empty response.
+        The argument of a function is the message of the request. A function returns either the message of the response,
+        or the content of this message as a JSON object, or None if the response is empty.
         """
         store = self._store
         return {
@@ -95,25 +97,26 @@ class Service:
         }
 
     def handlers(self) -> grpc.GenericRpcHandler:
-        """Return the handlers of all methods for grpcio."""
+        """Return the handlers of all methods in the form that grpcio requires."""
         methods = {name: grpc.stream_unary_rpc_method_handler(partial(self._handle, name)) for name in METHODS}
         methods[STREAM] = grpc.stream_stream_rpc_method_handler(partial(self._handle, STREAM))
         return grpc.method_handlers_generic_handler(SERVICE, methods)
 
     async def _handle(self, name: str, _: object, context: grpc.aio.ServicerContext) -> Any:
-        """Answer a call. Count it with its status, and write it to the log, if there is one.
+        """Answer a call, count the call with its status, and write a line about the call to the log if there is a log.
 
         Args:
             name: Name of the method.
+            _: Iterator over the messages. It is not used, because the messages are read from the context.
             context: Context of the call, from which messages are read.
 
         Returns:
-            The response; None for the method `STREAM`, whose responses have been sent. If an error occurs, the call is
-            ended with the status and the message of the error.
+            The serialized response, or None if the method is `STREAM`, because its responses were already sent. If an
+            error has occurred, the call is ended with the status and the message of the error, and nothing is returned.
         """
         call = _Call()
         start_ns = time.perf_counter_ns()
-        status = "CANCELLED"  # stays if the client disconnects, because grpcio then cancels this coroutine
+        status = "CANCELLED"  # if the client disconnects, grpcio cancels this coroutine, and the status is not changed
         error_type = None
         try:
             response = await self._answer_call(name, context, call)
@@ -123,7 +126,7 @@ class Service:
             status, message = _status_and_message(error)
             error_type = type(error).__name__
         finally:
-            self._traffic.note(
+            self._traffic.count_and_log(
                 Exchange(
                     transport="grpc",
                     route=name,
@@ -133,22 +136,22 @@ class Service:
                     ns=time.perf_counter_ns() - start_ns,
                     bytes_in=call.bytes_in,
                     bytes_out=call.bytes_out,
-                    client=context.peer() if self._traffic.log else None,
+                    client=context.peer() if self._traffic.log else None,  # only the log needs the client
                 )
             )
-        # This line is reached only after an error, whose status and message end the call.
+        # This line is reached only after an error. The call is ended with the status and the message of the error.
         return await context.abort(grpc.StatusCode[status], message)
 
     async def _answer_call(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes | None:
-        """Check the number of calls and the token, and answer the messages of a call.
+        """Check the number of open calls and the token, and answer the messages of a call.
 
         Args:
             name: Name of the method.
             context: Context of the call.
-            call: Properties of the call for counters and log.
+            call: Properties of the call for the counters and the log, which are updated.
 
         Returns:
-            The response; None for the method `STREAM`, whose responses have been sent.
+            The serialized response, or None if the method is `STREAM`, because its responses were already sent.
         """
         with self._count_open_call():
             if self._token is not None and name not in METHODS_WITHOUT_TOKEN:
@@ -159,15 +162,15 @@ class Service:
             return await self._answer_message(name, context, call)
 
     async def _answer_message(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes:
-        """Wait for the only message of a call, and return the serialized response to it.
+        """Wait for the only message of a call, and return the serialized response.
 
         Args:
             name: Name of the method.
             context: Context of the call, from which the message is read.
-            call: Properties of the call for counters and log.
+            call: Properties of the call for the counters and the log, which are updated.
 
         Raises:
-            RequestError: If the call ends without a message, or the message is not valid.
+            RequestError: If the call ends without a message, or if the message is not valid.
             TimeoutError: If the message does not arrive in time.
         """
         data = await self._next_message(context, self._limits.header_seconds)
@@ -180,15 +183,15 @@ class Service:
     async def _answer_stream(self, context: grpc.aio.ServicerContext, call: _Call) -> None:
         """Send a response to each message of a stream until the client ends the stream.
 
-        The first message must arrive within `header_seconds`, and each later message within `idle_seconds`. The client
-        must read each response within `body_seconds`.
+        The first message must arrive within `header_seconds`, and each later message within `idle_seconds` after a
+        response. The client must read each response within `body_seconds`.
 
         Args:
             context: Context of the call, from which messages are read and to which responses are written.
-            call: Properties of the call for counters and log.
+            call: Properties of the call for the counters and the log, which are updated.
 
         Raises:
-            TimeoutError: If the client sends no message, or does not read a response, in time.
+            TimeoutError: If the client does not send a message or does not read a response in time.
         """
         data = await self._next_message(context, self._limits.header_seconds)
         while data is not grpc.aio.EOF:
@@ -197,12 +200,12 @@ class Service:
             data = await self._next_message(context, self._limits.idle_seconds)
 
     def _respond(self, name: str, data: bytes, call: _Call) -> bytes:
-        """Return the serialized response to a serialized message.
+        """Answer one message, and return the serialized response.
 
         Args:
             name: Name of the method.
-            data: The serialized request.
-            call: Properties of the call, to which the model and the sizes of request and response are added.
+            data: The serialized message of the request.
+            call: Properties of the call. The model and the sizes of the request and of the response are added to them.
         """
         request_type, response_type = METHODS[name]
         call.bytes_in += len(data)
@@ -211,12 +214,13 @@ class Service:
         except DecodeError as error:
             expected = request_type.DESCRIPTOR.name
             raise RequestError(f"expected a {expected}, got {len(data)} bytes of another kind") from error
-        # The messages of the protocol have different names for the fields with the model and its version.
+        # The fields with the model and its version are called `model_name` and `model_version` in some messages of the
+        # protocol, and `name` and `version` in the other messages.
         model_name = getattr(request, "model_name", "") or getattr(request, "name", "")
         model_version = getattr(request, "model_version", "") or getattr(request, "version", "")
         call.model = self._store.label(model_name, model_version)
 
-        # A function returns the response as a message, as a JSON object, or, if the response is empty, as None.
+        # The response is a message, a JSON object with the content of the message, or None if the message is empty.
         response = self._functions[name](request)
         if not isinstance(response, Message):
             response = ParseDict(response or {}, response_type())
@@ -225,7 +229,7 @@ class Service:
         return response_data
 
     def _load(self, request: Any) -> None:
-        """Read the files of a model again.
+        """Read the files of the requested model again.
 
         Raises:
             RequestError: If the request has parameters.
@@ -235,7 +239,7 @@ class Service:
         self._store.load(request.model_name)
 
     def _infer(self, request: Any) -> Any:
-        """Return the ModelInferResponse to a ModelInferRequest."""
+        """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
         loaded = self._store.get(request.model_name, request.model_version)
         read = partial(read_request, request, loaded, self._limits.batch)
         return answer_inference(loaded, read, write_response)
@@ -243,7 +247,7 @@ class Service:
     def _infer_in_stream(self, request: Any) -> Any:
         """Return the response to one request of a stream.
 
-        If an error occurs, its message is returned as a response, so that the stream continues.
+        If an error occurs, the response contains the message of the error. The stream can therefore continue.
         """
         _, response_type = METHODS[STREAM]
         status = "OK"
@@ -252,20 +256,20 @@ class Service:
         except Exception as error:  # every error is sent to the client
             _, status = statuses(error)
             response = response_type(error_message=client_message(error))
-        self._traffic.count("grpc", f"{STREAM} message", status)  # the stream itself is counted as one call
+        self._traffic.count("grpc", f"{STREAM} message", status)  # `_handle` counts the whole stream as one call
         return response
 
     @contextmanager
     def _count_open_call(self) -> Iterator[None]:
-        """Count a call as open while the block runs.
+        """Return a context manager that counts a call as open while its block runs.
 
-        If there are too many open calls, the server ends the call that has waited longest for a message.
+        If there are already too many open calls, the service ends the call that has waited longest for a message.
 
         Raises:
-            TooMany: If there are too many calls, and no call waits for a message.
+            TooMany: If there are too many open calls, and none of them waits for a message.
         """
         if self._open_count >= self._limits.connections:
-            # The ended call still counts as open until its task has reacted, so the count may exceed the limit briefly.
+            # The call that is ended counts as open until its coroutine ends. The count may briefly exceed the limit.
             self._end_waiting_call()
         self._open_count += 1
         try:
@@ -281,29 +285,29 @@ class Service:
         """
         if not self._waiting:
             raise TooMany(f"all {self._limits.connections} calls are taken; try again later")
-        # The timeouts of the waiting calls are stored in the order in which the calls began to wait.
-        oldest_timeout = next(iter(self._waiting))
+        oldest_timeout = next(iter(self._waiting))  # the first element has waited longest
         del self._waiting[oldest_timeout]
-        # With its deadline set to the present time, the timeout expires at once and ends the waiting call.
+        # If the deadline of the timeout is the present time, the timeout expires at once. The waiting call then ends.
         oldest_timeout.reschedule(asyncio.get_running_loop().time())
 
     async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
         """Wait for the next message of a call.
 
-        While a call waits for a message, the call may be ended because of a new call.
+        While this call waits for a message, the service may end it because of a new call.
 
         Args:
             context: Context of the call.
             timeout_s: Longest time to wait, s.
 
         Returns:
-            The message; grpc.aio.EOF at the end of the call.
+            The serialized message, or `grpc.aio.EOF` if the client has ended the call.
 
         Raises:
-            TimeoutError: If the message does not arrive in time, or this call is ended because of a new call.
+            TimeoutError: If the message does not arrive in time, or if the service ends this call because of a new
+                call.
         """
         async with asyncio.timeout(timeout_s) as timeout:
-            self._waiting[timeout] = None  # a new call may let this timeout expire early
+            self._waiting[timeout] = None  # `_end_waiting_call` may let this timeout expire early
             try:
                 return await context.read()
             finally:
@@ -311,7 +315,7 @@ class Service:
 
 
 def _status_and_message(error: Exception) -> tuple[str, str]:
-    """Return the name of the gRPC status with which an error ends a call, and the message to the client."""
+    """Return the gRPC status and the message with which a call is ended after an error."""
     if isinstance(error, TimeoutError):
         return "DEADLINE_EXCEEDED", "the call waited too long for its client, or others needed its place"
     _, grpc_status = statuses(error)
@@ -319,6 +323,9 @@ def _status_and_message(error: Exception) -> tuple[str, str]:
 
 
 def _authorization(context: grpc.aio.ServicerContext) -> bytes:
-    """Return the value of the metadata field `authorization`, which is empty if the client did not send the field."""
+    """Return the value of the metadata field `authorization`.
+
+    The value is empty if the client has not sent the field.
+    """
     value = dict(context.invocation_metadata() or ()).get("authorization", "")
     return value.encode() if isinstance(value, str) else bytes(value)

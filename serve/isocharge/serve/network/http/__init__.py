@@ -1,4 +1,4 @@
-"""HTTP server of the Open Inference Protocol, which limits the size and the duration of requests."""
+"""HTTP server of the Open Inference Protocol. The server limits the size and the duration of requests."""
 
 from isocharge.common.extras import require
 

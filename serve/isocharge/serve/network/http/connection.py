@@ -1,14 +1,14 @@
-"""HTTP/1.1 on one connection. The size and the duration of requests are limited.
+"""HTTP/1.1 on one connection, with limits on the size and the duration of requests.
 
-A complete request is answered at once in the event loop, because most answers take microseconds. A request that may
-take longer is answered in another thread. Later requests of the same connection wait until its answer is sent.
+Most requests are answered at once in the event loop, because most answers take only microseconds. If an answer may take
+longer, it is computed in another thread. Later requests of the same connection then wait until this answer is sent.
 
-A timer for each request would cost as much time as parsing the request. Each connection therefore only stores a
-deadline. The client must take its next step before this deadline. The server regularly compares all deadlines with the
-clock (`close_overdue`).
+Each connection stores a deadline, by which the client must send further data or read the response. The server regularly
+calls `close_overdue`, which compares all deadlines with the present time. There is no timer for each request, because a
+timer would take as much time as parsing a request.
 
 A client may send thousands of requests at once, and all connections share one thread. Long data are therefore parsed in
-slices. After `TURN_SECONDS`, the event loop continues with the other connections.
+slices. After `TURN_SECONDS`, the event loop serves the other connections before it parses further slices.
 """
 
 import asyncio
@@ -27,20 +27,23 @@ from isocharge.serve.network.protocol.response import error_response, refusal
 from isocharge.serve.network.traffic import Client
 
 MAX_UNSENT_BYTES = 1 << 22
-"""Largest total size of the responses that a client has not read, bytes, beyond which the connection is closed."""
+"""Largest total size of the responses that a client has not read yet, bytes.
+
+If more bytes wait to be read, the connection is closed.
+"""
 
 SLICE_BYTES = 4096
-"""Number of bytes that are parsed at a time. Nearly every request is shorter."""
+"""Number of bytes that are parsed at a time. Nearly all requests are shorter than this."""
 
 TURN_SECONDS = 250e-6
-"""Time after which a connection with more data to parse yields to other connections, s."""
+"""Time after which a connection stops parsing so that other connections are served, s."""
 
 LINGER_SECONDS = 2.0
-"""Time for which the connection of a refused client stays open, s, so that the client can read the reason."""
+"""Time for which a connection stays open after a refusal, s. In this time, the client can read the reason."""
 
 
 class Phase(Enum):
-    """Part of a request that a connection is waiting for. The values are used in error messages."""
+    """Part of a request for which a connection is waiting. The values are used in error messages."""
 
     IDLE = "a request"
     HEADERS = "the end of the headers"
@@ -51,17 +54,17 @@ class Connection(asyncio.Protocol):
     """One connection of the server.
 
     Attributes:
-        deadline: Time at which the connection is ended if the client has not taken its next step, s, on the clock of
-            the event loop.
+        deadline: Time by which the client must send further data or read the response, s, on the clock of the event
+            loop. After this time, the connection is ended.
         has_completed_request: Whether the client has sent at least one complete request.
     """
 
     def __init__(self, handler: Handler, connections: "set[Connection]", loop: asyncio.AbstractEventLoop) -> None:
-        """Begin a connection without data.
+        """Create the state of a connection on which no data have arrived yet.
 
         Args:
-            handler: Answers the requests.
-            connections: Open connections of the server.
+            handler: Handler that answers the requests.
+            connections: Set of the open connections of the server, to which this connection adds itself.
             loop: Event loop of the server.
         """
         self.deadline = math.inf
@@ -73,7 +76,7 @@ class Connection(asyncio.Protocol):
         self._transport: asyncio.Transport
         self._client: Client = None
 
-        # The request that is being parsed.
+        # The request that is being parsed
         self._phase = Phase.IDLE
         self._timed_phase = Phase.IDLE  # the phase for which the deadline was set
         self._parser = self._new_parser()
@@ -82,30 +85,34 @@ class Connection(asyncio.Protocol):
         self._body = bytearray()
         self._expects_continue = False
 
-        # The data that are being parsed. A piece is the part of the data that is passed to the parser at a time.
-        self._piece_bytes = 0  # size of the present piece
+        # The data that are being parsed. A piece is the part of the data that is passed to the parser in one call.
+        self._piece_bytes = 0  # size of the piece that is being parsed
         self._unchecked_bytes = 0  # bytes since the request began, or since the latest part of its body
         self._piece_begins_with_request = True  # false after the first request of the piece has begun
         self._piece_was_answered = False  # whether a request of the present piece was answered
-        self._unparsed = bytearray()  # received data that wait to be parsed
+        self._unparsed = bytearray()  # received data that have not been parsed yet
         self._next_turn: asyncio.Handle | None = None  # scheduled call of `_parse_stored_data`
 
-        # The latest complete request. If it came in one piece, its text and size are stored to recognise a repetition.
+        # Head of the latest complete request. If the request arrived alone and in one piece, the bytes of its head and
+        # its total size are stored, too. A request with the same head is then recognised without parsing it.
         self._head: Head | None = None
         self._remembered_head = b""
         self._remembered_bytes = 0
 
-        # The answer that is computed in another thread, and the complete requests that wait for it, with their bodies.
+        # The task that computes an answer in another thread, and the heads and bodies of the requests that wait for it
         self._answering: asyncio.Task[None] | None = None
         self._waiting: deque[tuple[Head, bytes]] = deque()
 
-        self._is_stopping = False  # whether the server stops
-        self._is_refused = False  # whether a refusal was sent, after which no request is read
-        self._is_half_closed = False  # whether the client sends no more data, but still receives responses
-        self._is_blocked = False  # whether sending waits, because the client does not read its responses
+        self._is_stopping = False  # whether the server is being stopped
+        self._is_refused = False  # whether a request was refused; no further requests are read then
+        self._is_half_closed = False  # whether the client sends no more data but still reads responses
+        self._is_blocked = False  # whether nothing is parsed, because the client does not read its responses
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Accept the connection. If there are too many, end an unused connection, or refuse this one."""
+        """Begin the connection.
+
+        If there are too many connections, end another connection that is unused, or refuse this connection.
+        """
         self._transport = transport
         peer = transport.get_extra_info("peername")
         self._client = None  # a Unix socket has no address of the client
@@ -119,12 +126,12 @@ class Connection(asyncio.Protocol):
             self._refuse(refusal(503, f"all {self._limits.connections} connections are taken; try again later"))
 
     def _end_oldest_unused(self) -> bool:
-        """End the oldest other connection on which no complete request has arrived.
+        """End the oldest of the other connections on which no complete request has arrived.
 
-        The oldest connection is the one whose deadline for the request comes first.
+        The oldest connection is the connection with the earliest deadline.
 
         Returns:
-            Whether there was such a connection.
+            Whether a connection was ended.
         """
         unused = [other for other in self._connections if other is not self and not other.has_completed_request]
         if not unused:
@@ -135,46 +142,47 @@ class Connection(asyncio.Protocol):
         return True
 
     def connection_lost(self, _error: Exception | None) -> None:
-        """Discard the data of a connection that has ended."""
+        """Discard the received data, because the connection has ended."""
         self._connections.discard(self)
         self._unparsed.clear()
         self._waiting.clear()
 
     def data_received(self, data: bytes) -> None:
-        """Parse short data at once, and long data in slices, between which other connections are served.
+        """Process data that the client has sent.
 
-        While an answer is computed, or the client does not read its responses, data are only stored. If a request has
-        the same head (request line and headers) as the latest request, the head is not parsed again.
+        Short data are parsed at once. Long data are parsed in slices, and other connections are served between the
+        slices. While an answer is being computed, or while the client does not read its responses, data are only
+        stored. If a request has the same head as the previous request, the head is not parsed again.
         """
         if self._is_refused or self._transport.is_closing():
             return
 
-        # Store long data, and data that must wait for earlier data or an answer. Parse them in slices.
+        # Store data that are long, or that must wait for earlier data or for an answer. They are parsed in slices.
         must_wait = self._unparsed or self._answering or self._is_blocked
         if must_wait or len(data) > SLICE_BYTES:
             self._unparsed += data
-            if self._next_turn is None:  # otherwise the event loop will parse the stored data
+            if self._next_turn is None:  # otherwise the event loop will call `_parse_stored_data`
                 self._parse_stored_data()
             return
 
-        # Answer a request that has the same head and the same size as the latest request, without the parser.
+        # If a request has the same head and the same size as the previous request, answer it without the parser.
         repeats_head = len(data) == self._remembered_bytes and data.startswith(self._remembered_head)
         if repeats_head and self._head is not None:
             body = data[len(self._remembered_head) :]
             self._answer(self._head, body)
             return
 
-        # Parse any other short data. If they are one complete request, remember its head.
+        # Parse all other short data. If the data are exactly one complete request, store its head.
         begins_request = self._phase is Phase.IDLE
         self._parse(data)
         if begins_request and self._piece_was_answered:
             self._remember(data)
 
     def eof_received(self) -> bool:
-        """Handle the end of the stream that the client sends.
+        """Handle the end of the data that the client sends.
 
         Returns:
-            Whether the connection stays open for further responses.
+            Whether the connection stays open, because responses must still be sent.
         """
         self._is_half_closed = bool(self._unparsed or self._answering)
         return self._is_half_closed and self._transport.can_write_eof()
@@ -182,33 +190,37 @@ class Connection(asyncio.Protocol):
     def pause_writing(self) -> None:
         """Stop reading requests, because the client does not read its responses.
 
-        The connection is closed if the client does not continue within `body_seconds`.
+        The connection is closed unless the client reads its responses within `body_seconds`.
         """
         self._set_deadline(self._limits.body_seconds)
         self._is_blocked = True
         self._transport.pause_reading()
 
     def resume_writing(self) -> None:
-        """Continue, because the client has read its responses."""
+        """Continue to read and parse requests, because the client has read its responses."""
         self._is_blocked = False
         self._set_deadline(self._limits.idle_seconds)
         if self._next_turn is None:
             self._parse_stored_data()
 
     def shutdown(self) -> None:
-        """Close the connection, because the server stops.
+        """Close the connection, because the server is being stopped.
 
-        If a request is incomplete, or its answer is being computed, the connection is closed after the response.
+        If a request is incomplete, or if its answer is being computed, the connection is closed after the response was
+        sent.
         """
         self._is_stopping = True  # the next response closes the connection
         has_open_request = self._phase is not Phase.IDLE or self._answering is not None
-        if self._is_refused:  # the connection only lingers until the client has read the refusal
+        if self._is_refused:  # the connection is only open so that the client can read the refusal
             self._transport.abort()
         elif not has_open_request:
             self._transport.close()
 
     def end_overdue(self) -> None:
-        """End the connection because its deadline has passed. If a request has begun, the reason is sent."""
+        """End the connection, because its deadline has passed.
+
+        If a request has begun, the reason is sent to the client.
+        """
         if self._phase is Phase.IDLE or self._is_refused:
             self._transport.abort()
         else:
@@ -221,11 +233,13 @@ class Connection(asyncio.Protocol):
     def _parse_stored_data(self) -> None:
         """Parse slices of the stored data for at most `TURN_SECONDS`.
 
-        If data remain, the event loop calls this method again after it has served the other connections.
+        If some data are not parsed in this time, the event loop calls this method again after it has served other
+        connections.
         """
         self._next_turn = None
         turn_end = time.perf_counter() + TURN_SECONDS
-        # Parsing a slice may begin an answer in another thread, fill the send buffer, or refuse a request.
+        # The conditions are checked before each slice. While a slice is parsed, an answer in another thread may begin,
+        # the buffer of unread responses may become full, or a request may be refused.
         while self._unparsed and not (self._answering or self._is_blocked or self._is_refused):
             if self._transport.is_closing():
                 return
@@ -238,36 +252,36 @@ class Connection(asyncio.Protocol):
         self._resume_reading()
 
     def _resume_reading(self) -> None:
-        """Let the transport read more data if all data are parsed. Otherwise let it pause reading.
+        """Resume reading data if all stored data are parsed, and otherwise pause reading.
 
-        If all requests are answered and the client sends no more data, close the connection.
+        If all requests are answered and the client sends no more data, the connection is closed.
         """
         if self._transport.is_closing():
             return
         if self._unparsed:
             self._transport.pause_reading()
-        elif not self._is_blocked:  # the method `resume_writing` continues a blocked connection
+        elif not self._is_blocked:  # a blocked connection is continued by the method `resume_writing`
             self._transport.resume_reading()
             if self._is_half_closed and not self._answering:
                 self._transport.close()
 
     def _new_parser(self) -> httptools.HttpRequestParser:
-        """Return a parser of requests that calls the methods `on_...` of this connection."""
+        """Return a new parser of requests, which calls the methods of this connection whose names begin with `on_`."""
         parser = httptools.HttpRequestParser(self)
-        # Data after the last request are ignored instead of being an error.
+        # Data after the last request of a connection are ignored. They would otherwise cause an error.
         parser.set_dangerous_leniencies(lenient_data_after_close=True)
         return parser
 
     def _parse(self, data: bytes) -> None:
-        """Parse a piece of data. If a request is incomplete afterwards, check its size.
+        """Parse a piece of data, and check the size of a request that is still incomplete afterwards.
 
-        The parser calls the methods `on_...`, which answer each complete request.
+        The parser calls the methods whose names begin with `on_`. They answer each complete request.
         """
         self._piece_bytes = len(data)
         self._unchecked_bytes += self._piece_bytes
         self._piece_begins_with_request = self._phase is Phase.IDLE
         self._piece_was_answered = False
-        self._remembered_bytes = 0
+        self._remembered_bytes = 0  # the remembered head is discarded, because the piece may contain another request
         try:
             self._parser.feed_data(data)
         except httptools.HttpParserUpgrade as upgrade:
@@ -279,9 +293,10 @@ class Connection(asyncio.Protocol):
             self._check_incomplete_request()
 
     def _check_incomplete_request(self) -> None:
-        """Check the size of an incomplete request without its body, and set the deadline of a new phase.
+        """Check the size of an incomplete request, and set a deadline if a new phase has begun.
 
-        This size includes the headers, and the trailers and chunk extensions of a body that is sent in chunks.
+        The content of the body is not counted, because it has its own limit. The size of the headers is counted. If the
+        body is sent in chunks, the sizes of its trailers and chunk extensions are also counted.
         """
         if self._unchecked_bytes > self._limits.header_bytes:
             self._refuse_headers()
@@ -293,14 +308,18 @@ class Connection(asyncio.Protocol):
                 self._set_deadline(self._limits.body_seconds)
 
     def _parse_without_upgrade(self, data_after_headers: bytes) -> None:
-        """Parse a request again without its `Upgrade` header, which HTTP allows a server to ignore.
+        """Parse a request again without its header `Upgrade`.
 
-        A new parser is needed, because the old parser treats everything after the headers as another protocol.
+        HTTP allows a server to ignore this header. A new parser is needed, because the present parser assumes that
+        another protocol follows after the headers.
+
+        Args:
+            data_after_headers: Rest of the piece, which has not been parsed.
         """
         method = self._parser.get_method()
         if method == b"CONNECT":  # the parser treats this method like an upgrade
             self._refuse(refusal(400, "CONNECT: this server opens no tunnels"))
-        if self._is_refused:  # here, or before because of its headers
+        if self._is_refused:  # refused by the statement above, or before because of too long headers
             return
         self._parser = self._new_parser()
         self._phase = Phase.IDLE
@@ -309,10 +328,10 @@ class Connection(asyncio.Protocol):
         self._parse(b"\r\n".join([request_line, *header_lines, b"", data_after_headers]))
 
     def on_message_begin(self) -> None:
-        """Begin a request. The parser has not read its request line yet.
+        """Begin a new request, whose request line the parser has not read yet.
 
-        The parser does not report where in the present piece of data the request begins. The bytes of the piece are
-        therefore only counted for the first request in the piece.
+        The parser does not report at which position in the present piece of data the request begins. The bytes of the
+        piece are therefore counted only for the first request in the piece.
         """
         self._phase = Phase.HEADERS
         self._unchecked_bytes = self._piece_bytes if self._piece_begins_with_request else 0
@@ -323,11 +342,14 @@ class Connection(asyncio.Protocol):
         self._body = bytearray()
 
     def on_url(self, url: bytes) -> None:
-        """Append a part of the target in the request line."""
+        """Append a part of the target, which is the URL in the request line."""
         self._url += url
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Append a header, whose name may contain capitals. Headers after the body (trailers) are ignored."""
+        """Store a header, with its name in lower case.
+
+        Headers after the body, which are called trailers, are ignored.
+        """
         if self._phase is Phase.BODY:
             return
         lower_name = name.lower()
@@ -336,9 +358,9 @@ class Connection(asyncio.Protocol):
         self._headers.append((lower_name, value))
 
     def on_headers_complete(self) -> None:
-        """Check the size of the complete headers, and send `100 Continue` if the client waits for it."""
-        # If the request began in the middle of a piece, up to SLICE_BYTES of its headers have not been counted. The
-        # exact size is computed only if the headers may be too long.
+        """Check the size of the complete headers, and send `100 Continue` if the client waits for this response."""
+        # If the request began in the middle of a piece, up to SLICE_BYTES bytes of its headers have not been counted.
+        # The exact size is only computed if the headers may be too long.
         max_possible_bytes = self._unchecked_bytes + SLICE_BYTES
         may_be_too_long = max_possible_bytes > self._limits.header_bytes
         self._phase = Phase.BODY
@@ -347,12 +369,12 @@ class Connection(asyncio.Protocol):
             self._refuse_headers()
             return
 
-        is_parsed_again = self._parser.should_upgrade()  # then this method is called a second time
+        is_parsed_again = self._parser.should_upgrade()  # if true, this method will be called again for this request
         if self._expects_continue and not self._is_refused and not is_parsed_again:
             self._transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 
     def on_body(self, body: bytes) -> None:
-        """Append a part of the body, and refuse the request if its body is too large."""
+        """Store a part of the body, and refuse the request if its body is too large."""
         if self._is_refused:
             return
         self._unchecked_bytes = 0  # the body has its own limit, which is checked here
@@ -363,9 +385,10 @@ class Connection(asyncio.Protocol):
             self._refuse(error_response(error))
 
     def on_message_complete(self) -> None:
-        """Answer the complete request, unless it was refused. If an answer is being computed, the request waits for it.
+        """Answer the complete request, unless it was refused.
 
-        A request for a protocol upgrade is not answered here, because it is parsed again without the upgrade.
+        If an answer is being computed in another thread, the request must wait for this answer. A request with a
+        protocol upgrade is not answered here, because it is parsed again without its header `Upgrade`.
         """
         if self._is_refused or self._transport.is_closing() or self._parser.should_upgrade():
             return
@@ -376,7 +399,7 @@ class Connection(asyncio.Protocol):
         head = Head(method, request_path(self._url), self._headers, is_last)
         self._head = head
         body = bytes(self._body)
-        if self._answering:  # responses must have the order of the requests
+        if self._answering:  # the responses must be sent in the order of the requests
             self._waiting.append((head, body))
         elif self._handler.may_block(head.path):
             self._answer_in_thread(head, body)
@@ -385,23 +408,23 @@ class Connection(asyncio.Protocol):
             self._answer(head, body)
 
     def _answer(self, head: Head, body: bytes) -> None:
-        """Answer a request, and send the response."""
+        """Answer a request at once, and send the response."""
         response = self._handler.answer(head.method, head.path, head.headers, body, self._client)
         self._write(response, head)
 
     def _answer_in_thread(self, head: Head, body: bytes) -> None:
         """Begin to answer a request in another thread.
 
-        The connection has no deadline until the response is sent.
+        Until the response is sent, the connection has no deadline.
         """
         self._answering = self._loop.create_task(self._answer_in_order(head, body))
         self._timed_phase = Phase.IDLE
         self.deadline = math.inf
 
     async def _answer_in_order(self, head: Head, body: bytes) -> None:
-        """Answer a request in another thread, and afterwards the requests that have arrived in the meantime.
+        """Answer a request in another thread, and then the requests that have arrived in the meantime.
 
-        If one of the later requests also needs another thread, the remaining requests wait for its answer.
+        If a later request also needs another thread, the requests after it wait for its answer.
 
         Args:
             head: Request line and headers of the request.
@@ -421,10 +444,13 @@ class Connection(asyncio.Protocol):
         self._parse_stored_data()
 
     def _remember(self, data: bytes) -> None:
-        """Store the head of a request, so that a request with the same head need not be parsed.
+        """Store the head of the latest request, so that a request with the same head does not have to be parsed.
 
         Clients send the same head again and again. If the bytes of the head and the size of the body are equal, the
-        parser would give the same result again. A head is only stored if its request arrived alone and in one piece.
+        result of the parser would also be equal. The head is only stored if the request arrived alone and in one piece.
+
+        Args:
+            data: The data that contain the request.
         """
         head, blank_line, body = data.partition(b"\r\n\r\n")
         if body == self._body and self._phase is Phase.IDLE:
@@ -432,11 +458,11 @@ class Connection(asyncio.Protocol):
             self._remembered_bytes = len(data)
 
     def _write(self, response: Response, head: Head) -> None:
-        """Send a response in one piece, and set the deadline of the next request.
+        """Send a response, and set the deadline by which the next request must begin.
 
         Args:
             response: The response.
-            head: Head of the request, which states whether the connection is closed after the response.
+            head: Head of the request. Its attribute `is_last` states whether the client wants to close the connection.
         """
         if self._is_refused or self._transport.is_closing():
             return
@@ -451,12 +477,18 @@ class Connection(asyncio.Protocol):
         self._set_deadline(self._limits.idle_seconds)
 
     def _set_deadline(self, seconds: float) -> None:
-        """Set the deadline, unless the client does not read its responses or an answer is being computed."""
+        """Set the deadline to a time from now.
+
+        The deadline is not changed while the client does not read its responses, or while an answer is being computed.
+
+        Args:
+            seconds: Time from now to the deadline, s.
+        """
         if not (self._is_blocked or self._answering):
             self.deadline = self._loop.time() + seconds
 
     def _header_bytes(self) -> int:
-        """Return the size of the target and the headers, bytes."""
+        """Return the total size of the target and the headers, bytes."""
         separator_bytes = len(b": \r\n")
         return len(self._url) + sum(len(name) + len(value) + separator_bytes for name, value in self._headers)
 
@@ -466,7 +498,7 @@ class Connection(asyncio.Protocol):
         self._refuse(refusal(431, f"the request line and headers are longer than {limit} bytes"))
 
     def _refuse(self, response: Response) -> None:
-        """Send a refusal, and read no more requests. The handler is not called.
+        """Refuse the present request with a response that states the reason, and read no more requests.
 
         The connection is closed when the client closes it, or after `LINGER_SECONDS`.
         """
@@ -474,9 +506,9 @@ class Connection(asyncio.Protocol):
             return
         self._is_refused = True
         self._unparsed.clear()
-        self._handler.refused(response, self._client)
+        self._handler.count_refusal(response, self._client)
         self._transport.write(response_bytes(response, is_last=True))
-        if self._transport.can_write_eof():  # TLS cannot end only the data of the server
+        if self._transport.can_write_eof():  # false with TLS, in which both directions can only be closed together
             self._transport.write_eof()
             self._set_deadline(LINGER_SECONDS)
         else:
@@ -484,7 +516,12 @@ class Connection(asyncio.Protocol):
 
 
 def close_overdue(connections: Iterable[Connection], now: float) -> None:
-    """End every connection whose deadline is before `now`, s, on the clock of the event loop."""
+    """End all connections whose deadline has passed.
+
+    Args:
+        connections: Connections of the server.
+        now: Present time on the clock of the event loop, s.
+    """
     for connection in list(connections):
         if connection.deadline < now:
             connection.end_overdue()

@@ -1,4 +1,4 @@
-"""The parsed head of an HTTP/1.1 request, and the conversion of a response to the bytes that are sent."""
+"""Head of an HTTP/1.1 request, and conversion of a response to the bytes that are sent."""
 
 import urllib.parse
 from functools import lru_cache
@@ -10,20 +10,20 @@ import httptools
 from isocharge.serve.network.protocol import Response
 
 STATUS_LINES = {status.value: b"HTTP/1.1 %d %s\r\n" % (status, status.phrase.encode()) for status in HTTPStatus}
-"""Status line for each status code."""
+"""Status line of a response, by status code."""
 
 CLOSING_HEADER = b"connection: close\r\n\r\n"
-"""End of the headers of the last response of a connection."""
+"""End of the headers of the last response on a connection, which tells the client that the connection is closed."""
 
 
 class Head(NamedTuple):
-    """Request line and headers of a complete request.
+    """Head of a complete request, which consists of the request line and the headers.
 
     Attributes:
         method: Method in capitals.
-        path: Path without query, with percent signs decoded.
-        headers: Names in lower case, and values.
-        is_last: Whether the client asks to close the connection after the response.
+        path: Path without the query. Its percent-encoding is decoded.
+        headers: Pairs of the name of a header in lower case and its value.
+        is_last: Whether the client has asked to close the connection after the response.
     """
 
     method: str
@@ -33,12 +33,14 @@ class Head(NamedTuple):
 
 
 def response_bytes(response: Response, *, is_last: bool, with_body: bool = True) -> bytes:
-    """Return a response as the bytes that are sent: status line, headers, a blank line, and the body.
+    """Convert a response to the bytes that are sent.
+
+    The bytes are the status line, the headers, a blank line and the body.
 
     Args:
         response: The response.
-        is_last: Whether the connection is closed after the response, which the headers then state.
-        with_body: Whether the body is sent. The response to a HEAD request has none.
+        is_last: Whether the connection is closed after the response. If it is, a header tells this to the client.
+        with_body: Whether the body is sent. The body of a response to a HEAD request is not sent.
     """
     parts = [STATUS_LINES[response.status]]
     for name, value in response.headers:
@@ -51,6 +53,10 @@ def response_bytes(response: Response, *, is_last: bool, with_body: bool = True)
 
 @lru_cache(64)
 def request_path(url: bytes) -> str:
-    """Return the path in the target of a request line, after its percent-encoding is decoded."""
+    """Return the path in the target of a request line, and decode its percent-encoding.
+
+    Args:
+        url: Target of the request line, which may also contain a query.
+    """
     path = httptools.parse_url(url).path or b"/"
     return urllib.parse.unquote_to_bytes(path).decode("utf-8", "replace")

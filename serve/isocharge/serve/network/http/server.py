@@ -1,4 +1,4 @@
-"""The HTTP server: listening, accepting connections, TLS handshakes, and stopping."""
+"""HTTP server, which listens, accepts connections, makes TLS handshakes, and stops when it receives a signal."""
 
 import asyncio
 import signal
@@ -13,10 +13,10 @@ from isocharge.serve.network.http.connection import Connection, close_overdue
 from isocharge.serve.network.protocol import Handler
 
 GRACE_SECONDS = 10.0
-"""Longest time to finish the requests that have begun when the server stops, s."""
+"""Longest time to wait, when the server stops, until the requests that have already begun are finished, s."""
 
 TICK_SECONDS = 0.1
-"""Time between two checks of all deadlines, and pause after a failure to accept a connection, s."""
+"""Time between two checks of all deadlines, s. It is also the pause after an error in accepting a connection."""
 
 BACKLOG = 2048
 """Largest number of connections that wait to be accepted."""
@@ -26,19 +26,22 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class HttpServer:
-    """A server that listens from its construction until `close`. Requests are answered while `run` is executed.
+    """HTTP server of models.
+
+    The server listens from the moment when it is created until `close` is called. It answers requests while `run` is
+    executed.
 
     Attributes:
-        url: URL for clients.
+        url: URL that clients use.
     """
 
     def __init__(self, handler: Handler, address: Address, *, tls: Tls | None = None) -> None:
-        """Open the listening socket.
+        """Open the socket on which the server listens.
 
         Args:
-            handler: Answers the requests. Its limits also apply to the connections.
+            handler: Handler that answers the requests. Its limits also apply to the connections.
             address: Address on which to listen.
-            tls: Certificate and key; None for no TLS.
+            tls: Certificate and private key for TLS, or None for a server without TLS.
 
         Raises:
             InputError: If a TLS file cannot be used.
@@ -49,29 +52,34 @@ class HttpServer:
         self._limits = handler.limits
         self._tls = tls.context() if tls else None
         self._connections: set[Connection] = set()
-        self._handshakes: dict[asyncio.Task[None], None] = {}  # tasks of TLS handshakes: a set in order of their start
+        # Tasks that create connections and make TLS handshakes, in the order in which they began. A dictionary without
+        # values is used as an ordered set.
+        self._handshakes: dict[asyncio.Task[None], None] = {}
         self._is_stopped = False
         handler.traffic.open["http"] = lambda: len(self._connections)  # for the metric of open connections
         self._socket = address.listen(BACKLOG)
         self.url = address.url(self._socket, secure=tls is not None)
 
     def run(self) -> None:
-        """Answer requests until SIGTERM, SIGINT or `stop`, and then finish the requests that have begun."""
+        """Answer requests until the server is stopped, and then finish the requests that have already begun.
+
+        The server is stopped by the signals SIGTERM and SIGINT, and by the method `stop`.
+        """
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
             runner.run(self._serve())
 
     def stop(self) -> None:
-        """Stop `run`. This method may be called from any thread."""
+        """End the method `run` soon. Any thread may call this method."""
         self._is_stopped = True
 
     def close(self) -> None:
-        """Close the listening socket."""
+        """Close the socket on which the server listens."""
         self._socket.close()
         self._address.release()
 
     async def _serve(self) -> None:
-        """Accept connections and answer requests until the server is stopped, and then finish the open requests."""
-        # Accept connections in another task. This task checks the deadlines.
+        """Accept connections and answer requests until the server is stopped, and then finish open requests."""
+        # Another task accepts connections. The present task checks the deadlines of all connections.
         loop = asyncio.get_running_loop()
         is_main_thread = threading.current_thread() is threading.main_thread()
         signals = SIGNALS if is_main_thread else ()  # other threads cannot handle signals
@@ -82,7 +90,7 @@ class HttpServer:
             await asyncio.sleep(TICK_SECONDS)
             close_overdue(self._connections, loop.time())
 
-        # Stop accepting, and finish the open requests.
+        # The server was stopped. No more connections are accepted, and open requests are finished.
         for signal_number in signals:
             loop.remove_signal_handler(signal_number)  # so that a second Ctrl-C ends the program at once
         for task in (accepting, *self._handshakes):
@@ -92,12 +100,12 @@ class HttpServer:
         await self._finish(loop)
 
     async def _finish(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Finish the requests that have begun, for at most `GRACE_SECONDS`, and then end all remaining connections."""
+        """Wait at most `GRACE_SECONDS` until all open requests are finished, and then end the remaining connections."""
         for connection in list(self._connections):
             connection.shutdown()
         grace_end = loop.time() + GRACE_SECONDS
         while self._connections and loop.time() < grace_end:
-            await asyncio.sleep(0.5 * TICK_SECONDS)  # shorter than usual, so that the server ends soon
+            await asyncio.sleep(0.5 * TICK_SECONDS)  # shorter than usual, so that the server ends quickly
             close_overdue(self._connections, loop.time())
         for connection in list(self._connections):
             connection.abort()
@@ -105,8 +113,9 @@ class HttpServer:
     async def _accept(self, loop: asyncio.AbstractEventLoop) -> None:
         """Accept connections until the task is cancelled.
 
-        Unfinished TLS handshakes count as connections. If there are too many connections, the oldest handshake is
-        cancelled. Without TLS, and if there is no handshake, the new connection itself checks the limit.
+        Unfinished TLS handshakes are counted as connections. If there are too many connections, the oldest unfinished
+        handshake is cancelled. If there is no unfinished handshake, or if the server does not use TLS, the class
+        `Connection` applies the limit instead.
         """
         self._socket.setblocking(False)
         while True:
@@ -116,7 +125,7 @@ class HttpServer:
                 await asyncio.sleep(TICK_SECONDS)
                 continue
             is_full = len(self._connections) + len(self._handshakes) >= self._limits.connections
-            # A client that has not finished its handshake gives way to the new client.
+            # The connection of a client that has not finished its handshake is ended in favour of the new client.
             if is_full and self._tls is not None and self._handshakes:
                 oldest_handshake = next(iter(self._handshakes))
                 oldest_handshake.cancel()
@@ -125,7 +134,7 @@ class HttpServer:
             handshake.add_done_callback(self._handshakes.pop)  # removes the task when it ends
 
     async def _connect(self, accepted: socket.socket, loop: asyncio.AbstractEventLoop) -> None:
-        """Create the connection of an accepted socket, after the TLS handshake if the server uses TLS.
+        """Create the connection of an accepted socket. If the server uses TLS, make the TLS handshake first.
 
         Args:
             accepted: The accepted socket, which is closed if the handshake fails.
@@ -136,4 +145,4 @@ class HttpServer:
         try:
             await loop.connect_accepted_socket(new_connection, accepted, ssl=self._tls, ssl_handshake_timeout=timeout_s)
         except (OSError, asyncio.CancelledError):  # OSError includes ssl.SSLError and TimeoutError
-            accepted.close()  # nothing is raised, because the failure of one client must not affect the server
+            accepted.close()  # no error is raised, because an error of one client must not affect the server

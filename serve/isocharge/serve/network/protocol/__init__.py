@@ -1,11 +1,11 @@
-"""The Open Inference Protocol, version 2.
+"""Open Inference Protocol, version 2, independent of the transport.
 
-The package converts requests to answers and statuses, and does not depend on the transport.
+This package computes the answers and statuses of requests.
 
 May import: network, prediction, model.
 
-The transports `isocharge.serve.network.http` and `isocharge.serve.network.grpc` import this package. The package
-imports neither of them.
+The two transports, `isocharge.serve.network.http` and `isocharge.serve.network.grpc`, import this package. This package
+does not import the transports.
 """
 
 from isocharge.serve.network.protocol.handler import Handler

@@ -1,4 +1,7 @@
-"""Descriptions of the server and its models as JSON objects. The gRPC service has messages with the same fields."""
+"""Descriptions of the server and its models as JSON objects.
+
+The messages of the gRPC service have the same fields as these objects.
+"""
 
 from typing import Any
 
@@ -23,12 +26,15 @@ NO_LOAD_PARAMETERS = "load: parameters are not supported; put the files into the
 
 
 def server_metadata() -> dict[str, Any]:
-    """Return the name, the version and the extensions of the server."""
+    """Return the name and the version of the server, and the extensions of the protocol that it supports."""
     return {"name": "isocharge", "version": package_version(), "extensions": list(EXTENSIONS)}
 
 
 def model_metadata(loaded: LoadedVersion, store: ModelStore) -> dict[str, Any]:
-    """Return the tensors of a model. The key `properties` contains the metadata of its file as JSON texts."""
+    """Return the names, number types and shapes of the tensors of a model, and its metadata.
+
+    The metadata are under the key `properties`. Each value is a JSON text, as in the file of the model.
+    """
     metadata = loaded.metadata
     return {
         "name": metadata.name,
@@ -41,12 +47,12 @@ def model_metadata(loaded: LoadedVersion, store: ModelStore) -> dict[str, Any]:
 
 
 def _tensor(name: str, width: int) -> dict[str, Any]:
-    """Return the description of a tensor with any number of rows and `width` columns."""
+    """Return the description of a tensor that has any number of rows and `width` columns."""
     return {"name": name, "datatype": "FP32", "shape": [-1, width]}
 
 
 def model_config(loaded: LoadedVersion, limits: ServerLimits) -> dict[str, Any]:
-    """Return the configuration of a model in the form of Triton. All versions of the model are available."""
+    """Return the configuration of a model in the form that Triton uses."""
     return {
         "name": loaded.metadata.name,
         "platform": PLATFORM,
@@ -59,30 +65,33 @@ def model_config(loaded: LoadedVersion, limits: ServerLimits) -> dict[str, Any]:
 
 
 def statistics_of(store: ModelStore, name: str = "", version: str = "") -> dict[str, Any]:
-    """Return the counters of one version of a model, of all versions of a model, or of all models.
+    """Return the counters of one version of a model, of all its versions, or of all versions of all models.
 
     Args:
-        store: The models.
-        name: Name of the model; empty for all models.
-        version: Version of the model; empty for all versions.
+        store: Store of the models that the server uses.
+        name: Name of the model. An empty text selects all models.
+        version: Number of the version as a text. An empty text selects all versions.
 
     Raises:
-        ModelNotFound: If the model or the version is not loaded.
+        ModelNotFound: If the selected model or version is not loaded.
     """
     if version:
-        models = [store.get(name, version)]
+        selected = [store.get(name, version)]
     elif name:
-        models = store.versions_of(name)
+        selected = store.versions_of(name)
     else:
-        models = store.loaded_versions()
+        selected = store.loaded_versions()
     return {
         "model_stats": [
             {"name": loaded.metadata.name, "version": loaded.version, **loaded.statistics.to_json()}
-            for loaded in models
+            for loaded in selected
         ]
     }
 
 
 def repository_index(store: ModelStore, *, ready: bool) -> list[dict[str, str]]:
-    """Return one row for each version in the repository, or only for each loaded version if `ready` is true."""
+    """Return one row for each version in the repository.
+
+    If `ready` is true, the result contains only the rows of loaded versions.
+    """
     return [row for row in store.index() if row["state"] == "READY" or not ready]

@@ -1,8 +1,9 @@
-"""Responses to requests of the Open Inference Protocol, independent of the transport.
+"""Computation of the responses to HTTP requests of the Open Inference Protocol.
 
-A request consists of method, path, headers and body. A response consists of status, headers and body. Requests may be
-answered in any thread. Most responses take microseconds, and the largest batch takes milliseconds. The method
-`may_block` returns whether a server should use another thread for a path.
+The class `Handler` does not depend on the server that receives the requests. A request consists of method, path,
+headers and body. A response consists of status, headers and body. Any thread may answer requests. Most responses take
+microseconds to compute, and a response to the largest batch takes milliseconds. Some responses take longer, for example
+because a model is loaded. The method `may_block` returns whether the response for a path may take a long time.
 """
 
 import re
@@ -23,20 +24,20 @@ from isocharge.serve.network.protocol.routes import ROUTES, Request, Route, Serv
 from isocharge.serve.network.traffic import Client, Exchange, Traffic
 
 Headers = Iterable[tuple[bytes, bytes]]
-"""Headers of a request: names in lower case, values as they were sent."""
+"""Headers of a request. The names are in lower case, and the values are unchanged."""
 
 MAX_REMEMBERED_PATHS = 64
-"""Number of recent paths whose route is cached."""
+"""Number of recently requested paths whose routes are cached."""
 
 
 class Match(NamedTuple):
     """The route of a path.
 
     Attributes:
-        route: The route; None if there is none.
-        label: Template of the path for the log and the counters.
-        model: Name of the model in the path; empty if the path names none.
-        version: Version in the path; empty if the path names none.
+        route: The route, or None if the server has no route for the path.
+        label: First template of the route, under which requests are counted and logged.
+        model: Name of the model in the path. It is empty if the path contains no name.
+        version: Version of the model in the path. It is empty if the path contains no version.
     """
 
     route: Route | None
@@ -48,11 +49,11 @@ class Match(NamedTuple):
 NO_ROUTE = Match(None, "unknown")
 
 _PARAMETERS = {"{model}": "(?P<model>[^/]*)", "{version}": "(?P<version>[^/]+)"}
-"""Regular expressions of the parameters in a template."""
+"""Regular expression for each parameter that a template of a path may contain."""
 
 
 def _pattern(template: str) -> re.Pattern[str]:
-    """Return the regular expression of the paths that fit a template."""
+    """Return a regular expression that matches the paths of a template."""
     expression = re.escape(template)
     for name, parameter in _PARAMETERS.items():
         expression = expression.replace(re.escape(name), parameter)
@@ -64,21 +65,22 @@ _PATTERNS = [(_pattern(template), route) for route in ROUTES for template in rou
 
 @lru_cache(MAX_REMEMBERED_PATHS)
 def match_path(path: str) -> Match:
-    """Return the route of a path, with the name and the version of the model that the path contains.
+    """Return the route of a path, and the name and the version of the model in the path.
 
-    The name and the version are empty if the path contains none. The result is `NO_ROUTE` if no route has this path.
+    If the path contains no name or no version, this part of the result is empty. If the server has no route for the
+    path, the result is `NO_ROUTE`.
     """
     for pattern, route in _PATTERNS:
         path_match = pattern.fullmatch(path)
         if path_match is not None:
             parameters = path_match.groupdict()
-            label = route.paths[0]  # all paths of a route are counted together
+            label = route.paths[0]  # requests for the other paths of the route are counted under the first path
             return Match(route, label, parameters.get("model", ""), parameters.get("version", ""))
     return NO_ROUTE
 
 
 class Handler:
-    """Answers requests from the models of a store, counts them, and writes them into the log."""
+    """Answers HTTP requests with the models of a store, counts the requests, and writes them to the log."""
 
     def __init__(
         self,
@@ -88,15 +90,17 @@ class Handler:
         token: Token | None = None,
         browser_check: BrowserCheck | None = None,
     ) -> None:
-        """Set up the handler.
+        """Create a handler for the models of a store.
 
         Args:
-            store: The models.
-            limits: Limits of the body and of the batch. The transport observes the limits of the connections.
-            traffic: Counters and log of the requests.
-            token: Token that requests must carry; None if no token is needed.
-            browser_check: Check that refuses requests from web pages of other sites. By default, requests for the host
-                names of this machine are accepted, or requests for any host name if there is a token.
+            store: Store of the models that the server uses.
+            limits: Limits of the server. The handler applies the limits of the body and of the batch. The server itself
+                applies the limits of the connections.
+            traffic: Counters and log of the requests. By default, the requests are counted, but not logged.
+            token: Token that requests must contain, or None if requests need no token.
+            browser_check: Check that refuses requests from web pages of other sites. By default, the check only accepts
+                requests for IP addresses and for `localhost`. If there is a token, it accepts requests for any host
+                name.
         """
         self.store = store
         self.token = token
@@ -108,28 +112,31 @@ class Handler:
         self._service = Service(store, self.limits, metrics, partial(openapi_document, ROUTES, store))
 
     def may_block(self, path: str) -> bool:
-        """Return whether the response for this path may take long, so that it must not delay other requests."""
+        """Return whether a response to a request for this path may take a long time.
+
+        The server should then compute the response in another thread, so that other requests are not delayed.
+        """
         route = match_path(path).route
         return route is not None and route.may_block
 
     def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
-        """Answer one request, count it, and write it to the log, if there is one.
+        """Answer one request, count the request, and write a line about it to the log if there is a log.
 
         Args:
             method: Method in capitals.
-            path: Path without the query, percent-decoded.
+            path: Path without the query. Its percent-encoding is already decoded.
             headers: Headers of the request.
             body: Body of the request, which may be compressed.
-            client: Address of the client, for the log.
+            client: Address and port of the client, for the log.
 
         Returns:
-            The response. No error is raised: an error becomes a response with the body {"error": "..."}.
+            The response. If an error occurs, it is not raised, but the response contains its status and its message.
         """
         start_ns = time.perf_counter_ns()
         match = match_path(path)
         try:
             response = self._check_and_answer(method, path, match, dict(headers), body)
-        except Exception as error:  # every error becomes a response here
+        except Exception as error:  # every error is sent to the client
             response = error_response(error)
         self.traffic.count("http", match.label, response.status)
         log = self.traffic.log
@@ -145,24 +152,39 @@ class Handler:
                 bytes_out=len(response.body),
                 client=client,
             )
-            log.exchange(exchange)
+            log.write_exchange(exchange)
         return response
 
-    def refused(self, response: Response, client: Client = None) -> None:
-        """Count and log the refusal of a request that the transport could not read to its end."""
-        size = len(response.body)
-        self.traffic.note(Exchange("http", "none", response.status, None, response.error, 0, 0, size, client))
+    def count_refusal(self, response: Response, client: Client = None) -> None:
+        """Count and log the refusal of a request that the server did not read completely.
+
+        Args:
+            response: The refusal, which the server sends to the client.
+            client: Address and port of the client, for the log.
+        """
+        exchange = Exchange(
+            transport="http",
+            route="none",
+            status=response.status,
+            model=None,
+            error=response.error,
+            ns=0,
+            bytes_in=0,
+            bytes_out=len(response.body),
+            client=client,
+        )
+        self.traffic.count_and_log(exchange)
 
     def _check_and_answer(
         self, method: str, path: str, match: Match, fields: dict[bytes, bytes], body: bytes
     ) -> Response:
-        """Check a request, answer it, and return the response.
+        """Check whether a request is allowed, answer the request, and return the response.
 
         Args:
             method: Method in capitals.
             path: Path without the query, for error messages.
             match: Route of the path.
-            fields: Values of the headers by their names in lower case.
+            fields: Value of each header by the name of the header in lower case.
             body: Body of the request, which may be compressed.
 
         Raises:
@@ -170,13 +192,14 @@ class Handler:
         """
         self._browser_check.check(method, fields)
         route = match.route
-        # The token is checked before unknown paths are refused, so that a client without a token does not learn which
-        # paths exist.
+        # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
+        # which paths exist.
         if self.token is not None and (route is None or route.needs_token):
             self.token.check(fields.get(b"authorization", b""))
         if route is None:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
-        is_head_of_get = method == "HEAD" and route.method == "GET"  # the transport then omits the body
+        # A HEAD request is answered like a GET request. The server then sends the response without its body.
+        is_head_of_get = method == "HEAD" and route.method == "GET"
         if method != route.method and not is_head_of_get:
             raise WrongMethod(f"{path}: expected the method {route.method}, got {method[:20]}", route.method)
         self.limits.check_body(len(body))

@@ -1,4 +1,4 @@
-"""The JSON body of a request for an inference, from which the schema in the OpenAPI document is derived, too."""
+"""JSON body of a request for an inference. The schema in the OpenAPI document is also derived from these types."""
 
 from typing import Annotated, Any, Literal
 
@@ -8,7 +8,7 @@ Unsupported = Annotated[None, Meta(description="nothing, as this server does not
 
 
 class Parameters(Struct, frozen=True):
-    """Parameters of a request, an input or an output. Unknown parameters are ignored, as Triton does."""
+    """Parameters of a request, of an input or of an output. Unknown parameters are ignored, as in Triton."""
 
     binary_data: bool | None = None
     binary_data_output: bool = False
@@ -18,7 +18,7 @@ class Parameters(Struct, frozen=True):
 
 
 class InputTensor(Struct, frozen=True):
-    """Input tensor with the charges, pC. The numbers are checked later, when the shape is known to be valid."""
+    """Input tensor with the charges, pC. The numbers are checked after the shape was checked."""
 
     name: Literal["charge_pC"]
     datatype: Literal["FP32", "FP64"]
@@ -28,7 +28,7 @@ class InputTensor(Struct, frozen=True):
 
 
 class OutputTensor(Struct, frozen=True):
-    """Requested output."""
+    """Output that the client requests."""
 
     name: Literal["contact", "contact_std", "contact_correlation", "misfit", "flags"]
     parameters: Parameters = Parameters()

@@ -1,9 +1,9 @@
-"""One inference of the Open Inference Protocol.
+"""Inference of the Open Inference Protocol.
 
-The steps of an inference read the request, run the model and write the response.
-
-A body is JSON, which may be followed by binary tensors. If there are binary tensors, a header contains the length of
-the JSON. The gRPC service converts its messages to the same JSON objects and also uses `parse_request`.
+An inference has three steps: the server reads the request, runs the model, and writes the response. The body of a
+request or of a response is a JSON text, which may be followed by binary tensors. If binary tensors follow, a header
+contains the length of the JSON text. The gRPC service converts its messages to the same JSON objects, and also calls
+`parse_request`.
 """
 
 import struct
@@ -32,25 +32,28 @@ from isocharge.serve.network.protocol.infer_body import InferBody, InputTensor, 
 from isocharge.serve.prediction.contact import Contacts
 
 DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype("<f8")}
-"""Number types of charges. The protocol prescribes little-endian numbers."""
+"""NumPy type of the charges by the name of the number type. The protocol prescribes little-endian numbers."""
 
 FLAGS = "flags"
-"""Name of the output with the flags of each press, separated by commas. It is computed only on request."""
+"""Name of the output that contains the flags of each press, separated by commas.
+
+This output is only computed if the client requests it.
+"""
 
 MAX_LENGTH_DIGITS = 12
-"""Largest number of digits of the length of a JSON text in a header. No body is so long."""
+"""Largest number of digits in a header that states the length of a JSON text. Every accepted body is much shorter."""
 
 Rows = np.ndarray[Any, Any]
-"""Values of an output, shape (n, width): numbers, or texts for the output `flags`."""
+"""Values of an output, shape (n, width). They are texts for the output `flags`, and numbers for all other outputs."""
 
 
 class InferRequest(NamedTuple):
-    """Charges for a model, and the outputs that the client requests.
+    """Request for an inference, which contains charges and the names of the requested outputs.
 
     Attributes:
-        id: Identifier that is repeated in the response; empty if the request has none.
+        id: Identifier that is repeated in the response. It is empty if the request has no identifier.
         charge_pC: Charges, shape (n, electrodes), pC.
-        outputs: Names of the requested outputs, in the order of the response.
+        outputs: Names of the requested outputs, in the order in which the response contains them.
         binary: Names of the outputs that are sent as binary tensors.
     """
 
@@ -61,13 +64,13 @@ class InferRequest(NamedTuple):
 
 
 class InferAnswer(NamedTuple):
-    """Outputs of a model for one request.
+    """Answer to a request for an inference, which contains the outputs of the model.
 
     Attributes:
         name: Name of the model.
         version: Version of the model.
-        id: Identifier from the request.
-        outputs: Outputs by name, each of shape (n, width).
+        id: Identifier of the request. It is empty if the request has no identifier.
+        outputs: Values of each output by its name, each of shape (n, width).
         binary: Names of the outputs that are sent as binary tensors.
     """
 
@@ -79,7 +82,7 @@ class InferAnswer(NamedTuple):
 
 
 def read_object(text: bytes) -> dict[str, Any]:
-    """Parse a JSON object. An empty text is parsed as an empty object.
+    """Parse the text of a JSON object. The result for an empty text is an empty object.
 
     Raises:
         RequestError: If the text is not a JSON object.
@@ -94,22 +97,24 @@ def read_object(text: bytes) -> dict[str, Any]:
 
 
 def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, max_presses: int) -> InferRequest:
-    """Read a request from the body of an HTTP request.
+    """Read a request for an inference from the body of an HTTP request.
 
     Args:
-        body: The body, not compressed.
-        header_length: Value of the header Inference-Header-Content-Length; None if the request has no binary tensor.
-        loaded: The model.
+        body: The body, after it was decompressed.
+        header_length: Value of the header Inference-Header-Content-Length, which is the length of the JSON text, bytes.
+            None if the request has no such header, because no binary tensor follows.
+        loaded: Version of the model that is requested.
         max_presses: Largest number of presses in one request.
 
     Raises:
         RequestError: If the body is not a request for this model.
         ChargeError: If a charge is not finite.
-        TooLarge: If there are more presses than `max_presses`.
+        TooLarge: If the request contains more than `max_presses` presses.
     """
     if header_length is None:
         return parse_request(read_object(body), b"", loaded, max_presses)
-    # The digits are tested first, because int() accepts signs, blanks and underscores, and is slow for a long text.
+    # The characters are checked before the conversion, because int() also accepts signs, blanks and underscores, and is
+    # slow for long texts.
     is_short_number = header_length.isdigit() and len(header_length) <= MAX_LENGTH_DIGITS
     json_length = int(header_length) if is_short_number else None
     if json_length is None or json_length > len(body):
@@ -118,27 +123,29 @@ def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, 
             f"got {header_length.decode('latin-1')!r:.50}"
         )
     content = read_object(body[:json_length])
-    binary_tensors = memoryview(body)[json_length:]  # a view, because the bytes need not be copied
+    binary_tensors = memoryview(body)[json_length:]  # a view, so that the bytes are not copied
     return parse_request(content, binary_tensors, loaded, max_presses)
 
 
 def parse_request(
     content: dict[str, Any], binary: bytes | memoryview, loaded: LoadedVersion, max_presses: int
 ) -> InferRequest:
-    """Parse a request from a JSON object.
+    """Convert the JSON object of a request for an inference to an `InferRequest`.
 
     Args:
-        content: The object.
-        binary: Bytes that follow the JSON. They are the charges if the input has the parameter `binary_data_size`.
-        loaded: The model. If the request names no outputs, all outputs of the model are computed.
+        content: The JSON object.
+        binary: Bytes that follow the JSON text. If the input has the parameter `binary_data_size`, these bytes are the
+            charges.
+        loaded: Version of the model that is requested. If the request contains no names of outputs, all outputs of the
+            model are computed.
         max_presses: Largest number of presses in one request.
 
     Raises:
-        RequestError: If the object is not a request for this model.
+        RequestError: If the JSON object is not a request for this model.
         ChargeError: If a charge is not finite.
-        TooLarge: If there are more presses than `max_presses`.
+        TooLarge: If the request contains more than `max_presses` presses.
     """
-    body = convert(content, InferBody, where="", error=RequestError)  # the error message needs no file name
+    body = convert(content, InferBody, where="", error=RequestError)  # `where` is empty, because there is no file
     default_is_binary = body.parameters.binary_data_output
     if body.outputs:
         names, binary_names = _requested_outputs(body.outputs, loaded, default_is_binary=default_is_binary)
@@ -155,17 +162,18 @@ def _requested_outputs(
     """Return the names of the requested outputs, and the names of the outputs that are sent as binary tensors.
 
     Args:
-        outputs: Outputs that the request names.
-        loaded: The model.
-        default_is_binary: Whether an output is sent as a binary tensor if the request does not state it.
+        outputs: Outputs that the request contains.
+        loaded: Version of the model that is requested.
+        default_is_binary: Whether an output is sent as a binary tensor if the request makes no statement about this
+            output.
 
     Raises:
-        RequestError: If an output is named twice, or the model does not have it.
+        RequestError: If the request contains an output twice, or an output that the model does not have.
     """
     names = tuple(output.name for output in outputs)
     if len(set(names)) < len(names):
         raise RequestError("outputs: expected each name once")
-    # The names have been checked when the request was parsed, and only this output is missing in some models.
+    # Unknown names were refused when the request was parsed. All known outputs except this one exist in every model.
     if CORRELATION in names and CORRELATION not in loaded.outputs:
         raise RequestError(
             f"outputs: expected one of {', '.join(loaded.outputs)}, got {CORRELATION!r}, which "
@@ -185,19 +193,19 @@ def _read_charges(
 ) -> Singles:
     """Return the charges of an input tensor, shape (n, electrodes), pC.
 
-    The charges are either values in the JSON text, or bytes that follow this text. The shape is checked before any
-    memory of that size is used.
+    The charges are either numbers in the JSON text, or bytes that follow the JSON text. The shape is checked before an
+    array of this shape is created.
 
     Args:
-        tensor: The input tensor.
-        binary: Bytes that follow the JSON text; empty if there are none.
-        electrodes: Electrodes of the model.
+        tensor: Input tensor of the request.
+        binary: Bytes that follow the JSON text. It is empty if no bytes follow.
+        electrodes: Names of the electrodes of the model, in the order of the charges.
         max_presses: Largest number of presses in one request.
 
     Raises:
         RequestError: If the shape or the data are not valid.
         ChargeError: If a charge is not finite.
-        TooLarge: If there are more presses than `max_presses`.
+        TooLarge: If the request contains more than `max_presses` presses.
     """
     shape = tensor.shape
     _check_shape(shape, electrodes, max_presses)
@@ -216,22 +224,22 @@ def _read_charges(
             f"input and Inference-Header-Content-Length, got binary_data_size {stated_size!r:.50} and {len(binary)} "
             "bytes"
         )
-    # The copy is aligned. The bytes after a JSON text may begin at any address.
+    # The numbers are copied so that they are aligned in memory. The bytes after a JSON text may begin at any address.
     charges = np.frombuffer(binary, dtype).reshape(shape).copy()
     return as_float32(charges, electrodes)
 
 
 def _check_shape(shape: list[int], electrodes: tuple[str, ...], max_presses: int) -> None:
-    """Check the shape of the input tensor that a request states.
+    """Check the shape that a request states for its input tensor.
 
     Args:
-        shape: The shape, which should be the number of presses and the number of electrodes.
-        electrodes: Electrodes of the model.
+        shape: The shape. It must consist of the number of presses and the number of electrodes.
+        electrodes: Names of the electrodes of the model, in the order of the charges.
         max_presses: Largest number of presses in one request.
 
     Raises:
-        RequestError: If there is no press, or the number of columns is not the number of electrodes.
-        TooLarge: If there are more presses than `max_presses`.
+        RequestError: If the number of presses is not positive, or if the number of electrodes is wrong.
+        TooLarge: If the request contains more than `max_presses` presses.
     """
     if len(shape) != 2 or shape[0] < 1 or shape[1] != len(electrodes):
         raise RequestError(
@@ -244,49 +252,53 @@ def _check_shape(shape: list[int], electrodes: tuple[str, ...], max_presses: int
 
 
 def _from_values(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
-    """Return the charges from a flat list of numbers, or from a list of rows.
+    """Convert a flat list of numbers, or a list of rows, to charges.
 
     Args:
-        values: Content of the key `data` of the request. Nothing has been checked yet.
-        shape: Number of presses and number of electrodes.
+        values: Value of the key `data` of the request, which may have any type.
+        shape: Number of presses, and number of electrodes.
         electrodes: Names of the electrodes, for error messages.
 
     Returns:
         Charges, shape (n, electrodes), pC.
 
     Raises:
-        RequestError: If the values are not numbers, or do not have this shape.
+        RequestError: If the values are not numbers, or if their number or arrangement does not agree with the shape.
         ChargeError: If a charge is not finite.
     """
     press_count, electrode_count = shape
     is_flat_list = type(values) is list and len(values) == press_count * electrode_count
-    # For a few numbers, struct is several times faster than creating and testing arrays. However, struct converts True
-    # to 1.0. A list that contains True or False, or the equal numbers 1 and 0, is therefore converted by `_from_array`.
+    # If there are few numbers, struct is several times faster than creating and checking arrays. However, struct would
+    # accept True and False. Lists that contain them are therefore converted by `_from_array`. The numbers 1 and 0 are
+    # equal to True and False, so that lists with these numbers are also converted by `_from_array`.
     if is_flat_list and not (True in values or False in values):
         charges = np.empty(shape, np.float32)
-        write_into_charges = partial(_packer(len(values)), charges.data, 0)  # writes at the offset 0
+        write_into_charges = partial(_packer(len(values)), charges.data, 0)  # writes to the array, from its beginning
         if write_finite(write_into_charges, values):
             return charges
-    # The other function is slower, but accepts rows, and raises the errors.
+    # `_from_array` is slower, but also accepts rows, and raises an error if the values are not valid.
     return _from_array(values, shape, electrodes)
 
 
 @lru_cache(64)
 def _packer(count: int) -> Callable[..., None]:
-    """Return a function that packs `count` float32 numbers into a buffer."""
+    """Return a function that writes `count` numbers as float32 to a buffer."""
     return struct.Struct(f"={count}f").pack_into
 
 
 def _from_array(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
-    """Return the charges from values of any kind, shape (n, electrodes), pC.
+    """Convert values of any type to charges, or raise an error.
 
     Args:
-        values: Content of the key `data` of the request.
-        shape: Number of presses and number of electrodes.
+        values: Value of the key `data` of the request, which may have any type.
+        shape: Number of presses, and number of electrodes.
         electrodes: Names of the electrodes, for error messages.
 
+    Returns:
+        Charges, shape (n, electrodes), pC.
+
     Raises:
-        RequestError: If the values are not numbers, or have neither this shape nor the shape of a flat list.
+        RequestError: If the values are not numbers, or if they are neither rows of this shape nor a flat list.
         ChargeError: If a charge is not finite.
     """
     numbers = _as_array(values)
@@ -305,10 +317,11 @@ def _from_array(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> S
 def _as_array(values: Any) -> np.ndarray[Any, Any]:
     """Convert a list, or a list of lists, to an array.
 
-    If the values contain true or false, the array has the type object, because NumPy would convert these values to 1
-    and 0. If the values do not form an array, the result is an array of None. The caller refuses both types.
+    NumPy would convert true and false to 1 and 0. If the values contain true or false, the array therefore has the type
+    object. If the values cannot be converted to an array, the result is an array that contains None, which also has the
+    type object. The caller refuses arrays of this type.
     """
-    dtype = object if _contains_booleans(values) else None  # None: NumPy chooses the type
+    dtype = object if _contains_booleans(values) else None  # with None, NumPy chooses the type
     try:
         return np.asarray(values, dtype)
     except (ValueError, OverflowError):  # rows of different lengths, or an integer that is too large
@@ -316,21 +329,21 @@ def _as_array(values: Any) -> np.ndarray[Any, Any]:
 
 
 def _contains_booleans(values: Any) -> bool:
-    """Return whether true or false is an element of a list, or of a list in a list of lists."""
+    """Return whether a list, or a list of lists, contains true or false."""
     is_nested = isinstance(values, list) and bool(values) and isinstance(values[0], list)
     rows = values if is_nested else [values]
     return any(type(row) is list and any(type(value) is bool for value in row) for row in rows)
 
 
 def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
-    """Return the body of the response to an inference.
+    """Return the body of the HTTP response to an inference.
 
     Args:
-        answer: Outputs of the model, and the names of those that are sent as binary tensors.
+        answer: Outputs of the model, and the names of the outputs that are sent as binary tensors.
 
     Returns:
-        The body: JSON, which may be followed by binary tensors; and the length of the JSON in bytes if binary tensors
-        follow, otherwise None.
+        The body, which is a JSON text that may be followed by binary tensors. The length of the JSON text, bytes, or
+        None if no binary tensors follow.
     """
     content: dict[str, Any] = {"model_name": answer.name, "model_version": answer.version}
     if answer.id:  # empty if the request has no identifier
@@ -344,24 +357,24 @@ def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
 
 
 def binary_tensor(rows: Rows) -> bytes:
-    """Return an output as little-endian bytes.
+    """Convert the values of an output to a binary tensor, which is little-endian.
 
-    Numbers are float32. Each text is preceded by its length in bytes (u32).
+    Numbers are written as float32. Before each text, its length in bytes is written as a 32-bit unsigned integer.
     """
-    if not rows.dtype.hasobject:
+    if not rows.dtype.hasobject:  # the values are numbers
         return rows.astype("<f4", copy=False).tobytes()
     return b"".join(struct.pack("<I", len(text)) + text.encode() for text in rows.ravel().tolist())
 
 
 def _json_tensor(name: str, rows: Rows, binary: bytes | None) -> dict[str, Any]:
-    """Return an output as a JSON object.
+    """Return the JSON object that describes an output.
 
-    The object contains the values, or the size of the binary tensor with the values.
+    The object contains either the values, or the size of the binary tensor that contains the values.
 
     Args:
         name: Name of the output.
         rows: Values of the output, shape (n, width). They are written row by row.
-        binary: The binary tensor; None if the values are written as JSON.
+        binary: Binary tensor with the values, or None if the values are written as JSON.
     """
     is_text = name == FLAGS
     datatype = "BYTES" if is_text else "FP32"
@@ -369,28 +382,30 @@ def _json_tensor(name: str, rows: Rows, binary: bytes | None) -> dict[str, Any]:
     if binary is not None:
         return tensor | {"parameters": {"binary_data_size": len(binary)}}
     values = rows.ravel()
-    return tensor | {"data": values.tolist() if is_text else values}  # orjson writes arrays of numbers, not of texts
+    # orjson can write arrays of numbers, but not arrays of texts.
+    return tensor | {"data": values.tolist() if is_text else values}
 
 
 ResponseType = TypeVar("ResponseType")
 
 
 def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> tuple[dict[str, Rows], int, int]:
-    """Run the model on the charges of presses. This function may be called from any thread.
+    """Run a model on the charges of presses. Any thread may call this function.
 
     Args:
-        loaded: The model.
+        loaded: Version of the model that is run.
         charge_pC: Charges, shape (n, electrodes), pC.
         names: Names of the requested outputs.
 
     Returns:
-        Outputs by name, each of shape (n, width). Number of presses whose misfit was not computed, because it was not
-        requested. Number of presses whose misfit is NaN or above the limit of the model.
+        A tuple of three values. The first value contains the outputs by name, each of shape (n, width). The second
+        value is the number of presses whose misfit was not computed, because it was not requested. The third value is
+        the number of presses whose misfit is NaN or exceeds the limit of the model.
 
     Raises:
         ModelError: If onnxruntime fails to run the graph.
     """
-    if FLAGS in names:  # the flags are computed from all outputs of the graph, which do not include the flags
+    if FLAGS in names:  # the flags are not an output of the graph, but are computed from all outputs of the graph
         outputs, unchecked, alarms = infer(loaded, charge_pC, loaded.outputs)
         outputs[FLAGS] = _flags(loaded, outputs)
         return {name: outputs[name] for name in names}, unchecked, alarms
@@ -402,49 +417,54 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
     check_output_shapes(outputs, count, loaded.metadata.label)
     if "misfit" not in outputs:
         return outputs, count, 0
-    is_good = outputs["misfit"] <= loaded.validity.misfit_limit  # false for NaN
-    return outputs, 0, count - int(np.count_nonzero(is_good))
+    is_good = outputs["misfit"] <= loaded.validity.misfit_limit  # false if the misfit is NaN
+    alarms = count - int(np.count_nonzero(is_good))
+    return outputs, 0, alarms
 
 
 def _infer_single_press(
     loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]
 ) -> tuple[dict[str, Rows], int, int]:
-    """Run the model for one press in memory that is bound to its session, which is faster than `session.run`.
+    """Run a model on the charges of one press.
+
+    The session of the model uses memory that is allocated once and reused. This is faster than a call of `session.run`.
 
     Args:
-        loaded: The model.
+        loaded: Version of the model that is run.
         charge_pC: Charges of the press, shape (electrodes,), pC.
         names: Names of the requested outputs.
 
     Returns:
-        The outputs by name; 0, because the misfit is always computed; and 1 if the misfit is above the limit, else 0.
+        The three values that `infer` returns. The first value contains the outputs by name, each of shape (1, width).
+        The second value is 0, because the misfit is always computed. The third value is 1 if the misfit is NaN or
+        exceeds the limit of the model, and otherwise 0.
     """
-    press = loaded.press()
+    press = loaded.press_of_thread()
     row = np.empty((1, press.size), np.float32)  # all outputs of the press, one after the other
     try:
         press.run_into(charge_pC, row[0])
-    except Exception as error:  # onnxruntime's exceptions have no common base class of their own
+    except Exception as error:  # the exceptions of onnxruntime have no common base class other than Exception
         raise run_error(error) from error
     columns = press.columns
     outputs = {name: row[:, columns[name]] for name in names}
     misfit = row[:, columns["misfit"]].item()
-    is_alarm = not misfit <= loaded.validity.misfit_limit  # also true for NaN
+    is_alarm = not misfit <= loaded.validity.misfit_limit  # also true if the misfit is NaN
     return outputs, 0, int(is_alarm)
 
 
 def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
-    """Return the flags of presses, separated by commas, shape (n, 1).
+    """Return the flags of each press as one text, in which commas separate the flags, shape (n, 1).
 
     Args:
-        loaded: The model.
-        outputs: Outputs of the model for these presses, each of shape (n, width).
+        loaded: Version of the model that was run.
+        outputs: Outputs of the model for the presses by name, each of shape (n, width).
     """
     correlations = np.zeros_like(outputs["contact"])  # the flags do not depend on the correlations
-    # These are the attributes of Contacts in their order: three for the contact, three standard deviations, the misfit
-    # and three correlations.
-    parts = [outputs["contact"], outputs["contact_std"], outputs["misfit"], correlations]
-    attributes = np.concatenate(parts, axis=1).T  # shape (10, n)
-    contacts = Contacts(*attributes)
+    # `Contacts` has ten attributes, which are arrays of the shape (n,): three values of the contact, three standard
+    # deviations, the misfit and three correlations. The columns of the four outputs have the same order.
+    outputs_in_order = [outputs["contact"], outputs["contact_std"], outputs["misfit"], correlations]
+    columns = np.concatenate(outputs_in_order, axis=1).T  # shape (10, n)
+    contacts = Contacts(*columns)
     texts = [",".join(flags) for flags in loaded.validity.batch_flags(contacts)]
     return np.array(texts, dtype=object)[:, np.newaxis]
 
@@ -452,15 +472,15 @@ def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
 def answer_inference(
     loaded: LoadedVersion, read: Callable[[], InferRequest], write: Callable[[InferAnswer], ResponseType]
 ) -> ResponseType:
-    """Read a request, run the model, write the response, and count the request.
+    """Read a request, run the model, and return the response. The request is counted with the duration of each step.
 
     Args:
-        loaded: The model.
+        loaded: Version of the model that is run.
         read: Function that returns the request, or raises an error if the request is not valid.
-        write: Function that converts the outputs to the response of the transport.
+        write: Function that converts the outputs to the response.
 
     Raises:
-        IsochargeError: The errors of `read`, and ModelError if the model fails.
+        IsochargeError: If `read` raises this error, or if the model fails.
     """
     clock_ns = time.perf_counter_ns
     start_ns = clock_ns()
@@ -471,8 +491,8 @@ def answer_inference(
         run_end_ns = clock_ns()
         response = write(InferAnswer(loaded.metadata.name, loaded.version, request.id, outputs, request.binary))
     except Exception:
-        loaded.statistics.failed(clock_ns() - start_ns)
+        loaded.statistics.count_refused(clock_ns() - start_ns)
         raise
     stages_ns = (read_end_ns - start_ns, run_end_ns - read_end_ns, clock_ns() - run_end_ns)
-    loaded.statistics.succeeded(len(request.charge_pC), stages_ns, unchecked, alarms)
+    loaded.statistics.count_answered(len(request.charge_pC), stages_ns, unchecked, alarms)
     return response

@@ -1,4 +1,4 @@
-"""The OpenAPI document of the HTTP server, derived from its routes."""
+"""OpenAPI document of the HTTP server, which is derived from the routes of the server."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -10,7 +10,7 @@ from isocharge.serve.network.protocol.describe import server_metadata
 from isocharge.serve.network.protocol.routes import Json, Route, Schema, object_schema
 
 ERROR = Schema("error", object_schema({"error": {"type": "string"}}))
-"""The answer of every route if a request is refused."""
+"""Schema of the answer to a request that is refused."""
 
 DESCRIPTION = (
     "Computes contacts on a piezoelectric tactile film from the charges of its electrodes, with the Open Inference "
@@ -23,7 +23,11 @@ REFERENCE = "#/components/schemas/{name}"
 
 
 def openapi_document(routes: Iterable[Route], store: ModelStore) -> Json:
-    """Return the document, OpenAPI 3.1, for the routes that have a summary and the models that are loaded."""
+    """Return the OpenAPI document, version 3.1, as a JSON object.
+
+    The document describes the routes that have a summary. The document also lists the names and versions of the loaded
+    models.
+    """
     listed = [route for route in routes if route.summary]
     models = {loaded.metadata.name for loaded in store.loaded_versions()}
     versions = {loaded.version for loaded in store.loaded_versions()}
@@ -44,7 +48,9 @@ def openapi_document(routes: Iterable[Route], store: ModelStore) -> Json:
 
 
 def _path_item(path: str, route: Route) -> Json:
-    """Return the OpenAPI description of a path: its parameters, its method, the request body and the responses.
+    """Return the OpenAPI description of a path.
+
+    The description contains the parameters in the path, the method, the body of the request, and the responses.
 
     Args:
         path: Template of the path.
@@ -70,32 +76,33 @@ def _path_item(path: str, route: Route) -> Json:
 
 
 def _content(schema: Schema, media_type: str) -> Json:
-    """Return the description of a body of this media type. The description refers to the schema of the body."""
+    """Return the description of a body, which contains its media type and a reference to its schema."""
     return {media_type: {"schema": {"$ref": REFERENCE.format(name=schema.name)}}}
 
 
 def _path_parameter(name: str, values: set[str]) -> Json:
-    """Return the description of a parameter in a path, with its possible values."""
+    """Return the description of a parameter of a path, including its possible values."""
     schema = {"type": "string", "enum": sorted(values) or ["none"]}
     return {"name": name, "in": "path", "required": True, "schema": schema}
 
 
 def _schemas(routes: Iterable[Route]) -> dict[str, Any]:
-    """Return the schemas of all bodies and answers by name.
+    """Return the schemas of all bodies and answers of the given routes, by name.
 
-    The content of a schema is given directly, or derived from a type. A derived schema may refer to further schemas,
-    which the result also contains.
+    The content of a schema is either given as a JSON object, or derived from a type. A derived schema may refer to
+    further schemas. The result also contains these further schemas.
     """
-    used = [ERROR]
+    used_schemas = [ERROR]
     for route in routes:
-        used.append(route.answer)
+        used_schemas.append(route.answer)
         if route.body is not None:
-            used.append(route.body.schema)
-    schemas: dict[str, Any] = {}
-    for schema in used:
+            used_schemas.append(route.body.schema)
+
+    content_by_name: dict[str, Any] = {}
+    for schema in used_schemas:
         if isinstance(schema.content, type):
-            _, derived_schemas = msgspec.json.schema_components([schema.content], ref_template=REFERENCE)
-            schemas |= derived_schemas
+            _, derived_content_by_name = msgspec.json.schema_components([schema.content], ref_template=REFERENCE)
+            content_by_name |= derived_content_by_name
         else:
-            schemas[schema.name] = schema.content
-    return schemas
+            content_by_name[schema.name] = schema.content
+    return content_by_name

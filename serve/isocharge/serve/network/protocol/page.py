@@ -1,7 +1,8 @@
-"""The start page of the HTTP server, which shows the models and an example of a request.
+"""Start page of the HTTP server, which shows the models and an example of a request.
 
-Names of models, model cards and reasons for refusals come from files and are therefore escaped. In addition, the
-headers of the page forbid browsers to run scripts and to load other files.
+The names of models, the model cards and the reasons for refusals come from files. Special characters of HTML in these
+texts are therefore escaped. In addition, the headers of the page do not allow browsers to run scripts or to load other
+files.
 """
 
 import base64
@@ -44,16 +45,16 @@ PAGE_HEADERS = (
     (b"referrer-policy", b"no-referrer"),
     (b"cross-origin-resource-policy", b"same-origin"),
 )
-"""Headers of every page. They allow only one style sheet, which is identified by its hash."""
+"""Headers of every page. They allow only the style sheet in the page itself, which is identified by its hash."""
 
 MAX_CARD_BYTES = 1 << 18
-"""Largest size of a card that the page shows, bytes."""
+"""Largest size of a model card that the page shows, bytes."""
 
 
 def page(store: ModelStore) -> str:
     """Return the start page as HTML. The page loads no other files.
 
-    The page begins with an example of a request, because most visitors look for it.
+    The page begins with an example of a request, because most visitors look for such an example.
     """
     refused = "".join(f'<p class="refused">Refused: {escape(reason)}</p>' for reason in store.refusals())
     served = store.loaded_versions()
@@ -71,10 +72,14 @@ def page(store: ModelStore) -> str:
 
 
 def _first_request(served: list[LoadedVersion]) -> str:
-    """Return the section of the page that shows how to send a press, as HTML; empty if no model is loaded."""
+    """Return the HTML of the section that shows how to send a press, or an empty text if no model is loaded.
+
+    Args:
+        served: All loaded versions of models. The first one is used for the example.
+    """
     if not served:
         return ""
-    loaded = served[0]  # the example uses any model
+    loaded = served[0]
     path = f"v2/models/{quote(loaded.metadata.name, safe='')}"
     meanings = "".join(
         f"<dt><code>{name}</code></dt><dd>{escape(OUTPUT_MEANINGS[name])}</dd>" for name in loaded.outputs
@@ -90,7 +95,7 @@ without load.</p>
 
 
 def _article(loaded: LoadedVersion) -> str:
-    """Return the section of the page about one version of a model, as HTML."""
+    """Return the HTML of the section about one version of a model."""
     metadata = loaded.metadata
     min_force_N, max_force_N = metadata.force_range_N
     facts = {
@@ -109,11 +114,11 @@ def _article(loaded: LoadedVersion) -> str:
 
 
 def _example(loaded: LoadedVersion, path: str) -> str:
-    """Return shell commands that send the first golden press of a model with curl.
+    """Return shell commands that send the first golden press of a model to the server with curl.
 
     Args:
-        loaded: The model.
-        path: Path of the model on the server, without the first slash.
+        loaded: Version of the model whose press is sent.
+        path: Path of the model on the server, without the slash at its beginning.
     """
     charges = ", ".join(f"{charge:.1f}" for charge in loaded.model.golden.charge_pC[0].tolist())
     tensor = f'"name": "charge_pC", "datatype": "FP32", "shape": [1, {len(loaded.metadata.electrodes)}]'
@@ -122,7 +127,7 @@ def _example(loaded: LoadedVersion, path: str) -> str:
 
 
 def _card(model: Model) -> str:
-    """Return the card in the folder of a model as preformatted HTML."""
+    """Read the card in the folder of a model, and return it as preformatted HTML."""
     try:
         text = read_whole(model.folder / "card.md", MAX_CARD_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError):

@@ -1,4 +1,4 @@
-"""HTTP responses, the statuses of errors for HTTP and gRPC, and the compression of bodies."""
+"""HTTP responses, compression of their bodies, and statuses of errors for HTTP and gRPC."""
 
 import gzip
 import logging
@@ -23,19 +23,23 @@ _STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (errors.InputError, 400, "INVALID_ARGUMENT"),
     (Exception, 500, "INTERNAL"),
 )
-"""Class of an error, its HTTP status and its gRPC status. The first matching class of the list is used."""
+"""Class of an error, its HTTP status and its gRPC status. The first row whose class matches an error is used."""
 
 INTERNAL_MESSAGE = "internal error; the server's log says more"
 """Message to the client for an error that is not an IsochargeError."""
 
 
 def statuses(error: Exception) -> tuple[int, str]:
-    """Return the HTTP status of an error and the name of its gRPC status."""
+    """Return the HTTP status and the name of the gRPC status with which an error is reported."""
     return next((code, name) for kind, code, name in _STATUSES if isinstance(error, kind))
 
 
 def client_message(error: Exception) -> str:
-    """Return the message to the client. An error that is not an IsochargeError is written to the log instead."""
+    """Return the message about an error that is sent to the client.
+
+    If the error is not an IsochargeError, it is unexpected, and its message may contain secrets. The error is then
+    written to the log, and the client receives a general message.
+    """
     if isinstance(error, errors.IsochargeError):
         return str(error)
     log.exception("a request failed", exc_info=error)
@@ -47,9 +51,9 @@ class Response(NamedTuple):
 
     Attributes:
         status: Status code.
-        headers: Names in lower case, and values.
+        headers: Pairs of the name of a header in lower case and its value.
         body: The body.
-        error: Type of the error; None if there was no error.
+        error: Name of the type of the error, for the log. None if no error occurred.
     """
 
     status: int
@@ -59,28 +63,36 @@ class Response(NamedTuple):
 
 
 def response_of(status: int, content_type: bytes, body: bytes, error: str | None = None) -> Response:
-    """Return a response with the headers `content-type` and `content-length`."""
+    """Return a response that has the headers `content-type` and `content-length`.
+
+    Args:
+        status: Status code.
+        content_type: Value of the header `content-type`.
+        body: Body of the response.
+        error: Name of the type of the error, for the log. None if no error occurred.
+    """
     headers = [(b"content-type", content_type), (b"content-length", b"%d" % len(body))]
     return Response(status, headers, body, error)
 
 
 def json_response(content: Any) -> Response:
-    """Return a response whose body is a value in JSON."""
+    """Return a response with the status 200 whose body is a value in JSON."""
     return response_of(200, b"application/json", orjson.dumps(content))
 
 
 def refusal(status: int, message: str, error: str | None = None) -> Response:
-    """Return the response to a request that is refused: {"error": message}."""
+    """Return the response to a request that is refused. Its body is the JSON object {"error": message}."""
     return response_of(status, b"application/json", orjson.dumps({"error": message}), error)
 
 
 def error_response(error: Exception) -> Response:
-    """Return the response to a request that raised an error.
+    """Return the response to a request that has raised an error.
 
-    The body contains the message. If the HTTP method is wrong, the header `Allow` names the allowed method. If the
-    token is missing or wrong, the header `WWW-Authenticate` names the required authentication.
+    The body of the response contains the message of the error. If the HTTP method is wrong, the header `Allow` contains
+    the allowed method. If the token is missing or wrong, the header `WWW-Authenticate` contains the required kind of
+    authentication.
     """
-    http_status, _ = statuses(error)  # the second status is that of gRPC
+    http_status, _ = statuses(error)  # the status of gRPC is not needed
     error_type = type(error).__name__  # for the log
     response = refusal(http_status, client_message(error), error_type)
     if isinstance(error, errors.WrongMethod):
@@ -91,7 +103,7 @@ def error_response(error: Exception) -> Response:
 
 
 MIN_COMPRESSED_BYTES = 1024
-"""Smallest size of a body that is compressed, bytes. A shorter body is sent faster without compression."""
+"""Smallest size of a body that is compressed, bytes. Shorter bodies are sent faster without compression."""
 
 _WINDOW_BITS = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
 """Argument `wbits` of zlib for each encoding. The encoding `deflate` of HTTP is the zlib format."""
@@ -101,14 +113,14 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
     """Decompress the body of a request.
 
     Args:
-        body: The compressed body.
-        encoding: Value of the header Content-Encoding in lower case; empty if the request has none.
-        limit: Largest size of the result, bytes. Decompression stops at this size.
+        body: The body, which may be compressed.
+        encoding: Value of the header Content-Encoding in lower case. It is empty if the request has no such header.
+        limit: Largest size of the decompressed body, bytes. The decompression stops when this size is exceeded.
 
     Raises:
         UnknownEncoding: If the encoding is not gzip, deflate or identity.
-        TooLarge: If the result is larger than the limit.
-        RequestError: If the data are damaged or incomplete, or other data follow them.
+        TooLarge: If the decompressed body is larger than the limit.
+        RequestError: If the compressed data are damaged or incomplete, or if other data follow them.
     """
     if encoding in (b"", b"identity"):
         return body
@@ -116,7 +128,7 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
         raise errors.UnknownEncoding(f"Content-Encoding {_quoted(encoding)}: expected gzip, deflate or identity")
     decompressor = zlib.decompressobj(_WINDOW_BITS[encoding])
     try:
-        plain = decompressor.decompress(body, limit + 1)  # one byte more shows that the limit is exceeded
+        plain = decompressor.decompress(body, limit + 1)  # the additional byte shows that the limit is exceeded
     except zlib.error as error:
         raise errors.RequestError(
             f"the body is not {_quoted(encoding)}, as its Content-Encoding states: {error}"
@@ -129,19 +141,19 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
 
 
 def compress(body: bytes, accepted: bytes) -> tuple[bytes, bytes]:
-    """Compress the body of a response if the client accepts an encoding and the body is long enough.
+    """Compress the body of a response if the client accepts a supported encoding and the body is long enough.
 
     Args:
-        body: The body.
-        accepted: Value of the header Accept-Encoding of the request.
+        body: Body of the response.
+        accepted: Value of the header Accept-Encoding of the request. It is empty if the request has no such header.
 
     Returns:
-        The body and its Content-Encoding, which is empty if the body was not compressed.
+        The body, and the value of its header Content-Encoding. This value is empty if the body was not compressed.
     """
     if len(body) < MIN_COMPRESSED_BYTES:
         return body, b""
     encodings = _accepted_encodings(accepted)
-    # The lowest level is used, because it is the fastest. Without a time stamp, equal bodies give equal bytes.
+    # The lowest level of compression is the fastest. With the time stamp 0, equal bodies are compressed to equal bytes.
     if b"gzip" in encodings:
         return gzip.compress(body, compresslevel=1, mtime=0), b"gzip"
     if b"deflate" in encodings:
@@ -150,9 +162,10 @@ def compress(body: bytes, accepted: bytes) -> tuple[bytes, bytes]:
 
 
 def _accepted_encodings(header: bytes) -> set[bytes]:
-    """Return the names of the encodings in an Accept-Encoding header, except names with the weight 0.
+    """Return the names of the encodings that an Accept-Encoding header accepts.
 
-    For example, the names in `gzip, deflate;q=0.5, br;q=0` are `gzip` and `deflate`.
+    An encoding with the weight 0 is not accepted. For example, `gzip, deflate;q=0.5, br;q=0` accepts `gzip` and
+    `deflate`.
     """
     names = set()
     for part in header.split(b","):
@@ -165,5 +178,5 @@ def _accepted_encodings(header: bytes) -> set[bytes]:
 
 
 def _quoted(encoding: bytes) -> str:
-    """Return the name of an encoding for an error message."""
+    """Return the name of an encoding as a quoted text for an error message. Long names are shortened."""
     return repr(encoding.decode("latin-1"))[:50]

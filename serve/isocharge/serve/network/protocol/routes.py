@@ -1,7 +1,8 @@
-"""The routes of the HTTP server. Each route is one entry of `ROUTES`.
+"""Routes of the HTTP server. Each route is an element of `ROUTES`.
 
-An entry has the method, the paths, the summary, the schemas of the request and of the answer, and the function that
-answers requests. The dispatch of requests and the OpenAPI document are derived from the entries.
+A route contains a method, its paths, a summary, the schemas of the request and of the answer, and the function that
+answers requests. The server uses `ROUTES` to find the function for a request. The OpenAPI document is also derived from
+`ROUTES`.
 """
 
 from collections.abc import Callable, Mapping
@@ -30,12 +31,12 @@ Json = dict[str, Any]
 
 
 class Service(NamedTuple):
-    """Objects of the server that the functions of the routes use.
+    """Objects of the server that are used by the functions that answer requests.
 
     Attributes:
-        store: The models.
-        limits: Limits of the body and of the batch.
-        metrics: Counters in the format of Prometheus.
+        store: Store of the models that the server uses.
+        limits: Limits of the size of a body and of a batch.
+        metrics: Counters of the server in the format of Prometheus.
         openapi: Function that returns the OpenAPI document.
     """
 
@@ -46,14 +47,14 @@ class Service(NamedTuple):
 
 
 class Request(NamedTuple):
-    """A request with its body decompressed.
+    """Request that is passed to the function of its route. Its body is already decompressed.
 
     Attributes:
-        service: The server.
-        headers: Headers of the request, names in lower case.
+        service: Objects of the server.
+        headers: Value of each header by the name of the header in lower case.
         body: Body of the request.
-        model: Name of the model in the path; empty if the path names none.
-        version: Version in the path; empty if the path names none.
+        model: Name of the model in the path. It is empty if the path contains no name.
+        version: Version of the model in the path. It is empty if the path contains no version.
     """
 
     service: Service
@@ -64,14 +65,14 @@ class Request(NamedTuple):
 
     @property
     def loaded(self) -> LoadedVersion:
-        """The model that the path names. If the model is not loaded, ModelNotFound is raised."""
+        """Loaded version of the model in the path. ModelNotFound is raised if the version is not loaded."""
         return self.service.store.get(self.model, self.version)
 
 
 class Schema(NamedTuple):
-    """A schema of the OpenAPI document with its name.
+    """Named schema of the OpenAPI document.
 
-    The content of the schema is given directly, or as a type from which the content is derived.
+    The content of the schema is either given as a JSON object, or as a type from which this object is derived.
     """
 
     name: str
@@ -79,7 +80,7 @@ class Schema(NamedTuple):
 
 
 class Body(NamedTuple):
-    """The body of a request: its schema, whether it is required, and an example."""
+    """Description of the body of a request, which consists of its schema, whether it is required, and an example."""
 
     schema: Schema
     is_required: bool = False
@@ -88,19 +89,19 @@ class Body(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Route:
-    """A route of the server.
+    """Route of the HTTP server, which answers the requests with one method and certain paths.
 
     Attributes:
-        method: Method of the request. A route with the method GET also answers HEAD, without a body.
-        paths: Templates of the paths. The log and the counters use the first template.
+        method: HTTP method. A route with the method GET also answers HEAD requests, without a body.
+        paths: Templates of the paths. Requests are logged and counted under the first template.
         respond: Function that answers a request.
-        summary: Purpose of the route; empty if the OpenAPI document does not list the route.
+        summary: Purpose of the route. It is empty if the OpenAPI document does not contain the route.
         answer: Schema of the answer.
         answer_type: Media type of the answer.
-        body: Body of the request; None if the route has no body.
-        needs_token: Whether a request needs the token of the server. Health checks need none, because the programs that
-            start and monitor servers have no token.
-        may_block: Whether an answer may take a long time, so that the server should use another thread.
+        body: Description of the body of a request, or None if requests have no body.
+        needs_token: Whether requests must contain the token of the server. Health checks need no token, because the
+            programs that start and monitor servers do not have it.
+        may_block: Whether an answer may take a long time. The server then computes the answer in another thread.
     """
 
     method: str
@@ -115,17 +116,17 @@ class Route:
 
 
 def object_schema(properties: Json, required: list[str] | None = None) -> Json:
-    """Return the schema of an object.
+    """Return the schema of a JSON object.
 
     Args:
-        properties: Schema of each property by its name.
-        required: Names of the required properties; by default all.
+        properties: Schema of each property by the name of the property.
+        required: Names of the required properties. By default, all properties are required.
     """
     return {"type": "object", "properties": properties, "required": required or list(properties)}
 
 
 def list_schema(items: Json) -> Json:
-    """Return the schema of a list."""
+    """Return the schema of a list whose elements have a given schema."""
     return {"type": "array", "items": items}
 
 
@@ -185,7 +186,7 @@ UNLOAD_BODY = Schema("unload", {"type": "object"})
 INFER_BODY = Schema("InferBody", InferBody)
 
 EXAMPLE = {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [942.9, 910.4, 690.8]}]}
-"""Example of the body of an inference."""
+"""Example of the body of a request for an inference."""
 
 
 def _show_page(request: Request) -> Response:
@@ -221,7 +222,10 @@ def _show_statistics(request: Request) -> Response:
 
 
 def _show_index(request: Request) -> Response:
-    """Return all versions in the repository. If the body has `ready: true`, return only the loaded versions."""
+    """Return the index of the repository, which contains all versions of all models.
+
+    If the body contains `ready: true`, the index contains only the loaded versions.
+    """
     ready = read_object(request.body).get("ready", False)
     if not isinstance(ready, bool):
         raise RequestError(f"ready: expected true or false, got {ready!r:.100}")
@@ -229,7 +233,7 @@ def _show_index(request: Request) -> Response:
 
 
 def _load(request: Request) -> Response:
-    """Read the files of a model again."""
+    """Read the files of a model again, and return an empty object."""
     if read_object(request.body).get("parameters", {}) != {}:
         raise RequestError(describe.NO_LOAD_PARAMETERS)
     request.service.store.load(request.model)
@@ -255,20 +259,21 @@ def _show_config(request: Request) -> Response:
 
 
 def _infer(request: Request) -> Response:
-    """Compute the contacts of the presses in a request, and return them as JSON, which binary tensors may follow.
+    """Compute the contacts of the presses in a request.
 
-    Only this response is compressed, because the asyncio client of Triton does not decompress other responses.
+    The body of the response is a JSON text, which may be followed by binary tensors. Responses to other requests are
+    not compressed, because the asyncio client of Triton decompresses only the responses to inferences.
     """
     loaded = request.loaded
     header_length = request.headers.get(b"inference-header-content-length")
-    # answer_inference calls `read` and `write_answer` itself, because it measures and counts them.
+    # `answer_inference` calls `read` and `write_answer`, because it measures the duration of these steps.
     read = partial(read_infer, request.body, header_length, loaded, request.service.limits.batch)
     plain_body, json_length = answer_inference(loaded, read, write_answer)
 
     accepted_encodings = request.headers.get(b"accept-encoding", b"")
     body, encoding = compress(plain_body, accepted_encodings)
 
-    # If binary tensors follow the JSON, a header states the length of the JSON.
+    # If binary tensors follow the JSON text, a header contains the length of the text.
     content_type = b"application/json" if json_length is None else b"application/octet-stream"
     response = response_of(200, content_type, body)
     if json_length is not None:
@@ -279,9 +284,12 @@ def _infer(request: Request) -> Response:
 
 
 def model_paths(ending: str = "") -> tuple[str, str]:
-    """Return the two paths at which a request for a model is accepted, as templates.
+    """Return the templates of the two paths for requests to a model.
 
-    The first path contains the name of the model. The second path contains the name and the version.
+    The first path contains only the name of the model. The second path contains the name and the version.
+
+    Args:
+        ending: End of both paths, such as `/infer`.
     """
     return f"/v2/models/{{model}}{ending}", f"/v2/models/{{model}}/versions/{{version}}{ending}"
 
@@ -390,4 +398,4 @@ ROUTES: tuple[Route, ...] = (
         body=Body(INFER_BODY, is_required=True, example=EXAMPLE),
     ),
 )
-"""The routes. If a path matches several templates, the first of them is used."""
+"""All routes of the HTTP server. If several templates match a path, the first of them is used."""

@@ -1,1 +1,1 @@
-"""Probe shapes: one module for each shape, with the base classes that every shape implements."""
+"""Shapes of the footprint of a probe, with one module for each shape and one module for the base classes."""

@@ -1,11 +1,11 @@
-"""Base classes of the probe shapes. They declare the methods that the mesh, the load, the readout and drawings need.
+"""Base classes of the probe shapes, with the methods that the mesh, the load, the readout and drawings need.
 
 A footprint is the area on which a probe presses. Points of a footprint are complex numbers x + iy in mm, relative to
 the centroid of the footprint.
 
-The mesh of a polygonal footprint consists of blocks with straight sides. A footprint with a smooth boundary is a
-subclass of `CurvedProbe`. The mesh of such a footprint has blocks with straight sides in a core polygon inside the
-footprint, and blocks with one curved side between the core polygon and the boundary.
+The mesh of a polygonal footprint consists of blocks with straight sides. A probe whose footprint has a smooth boundary
+is a subclass of `CurvedProbe`. Its footprint contains a core polygon. The mesh of the footprint consists of blocks with
+straight sides in the core polygon, and of blocks with one curved side between the core polygon and the boundary.
 """
 
 import math
@@ -26,16 +26,16 @@ NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 """Regular expression of a decimal number in the notation of a probe."""
 
 MIN_REACH = 0.02
-"""Smallest accepted distance of the farthest point of a footprint from its centroid, mm."""
+"""Smallest accepted reach of a footprint, mm. The reach is the distance of the farthest point from the centroid."""
 
 MIN_SIDE = 1e-3
-"""Smallest side or axis of a footprint, mm."""
+"""Smallest accepted length of a side or an axis of a footprint, mm."""
 
 CORE_SHARE = 0.45 * math.sqrt(2.0)
-"""Distance of the corners of the core polygon from the centroid, relative to that of the boundary, dimensionless."""
+"""Ratio of the distance of a corner of the core polygon from the centroid to that of the boundary, dimensionless."""
 
 OUTLINE_POINTS = 180
-"""Number of points of the outline of a curved footprint."""
+"""Number of points by which the outline of a curved footprint is drawn."""
 
 FINE_OUTLINE_POINTS = 1024
 """Number of boundary points from which the reach and the covered area of a curved footprint are computed."""
@@ -47,9 +47,9 @@ class ProbeNotation:
 
     Attributes:
         name: Word before the colon.
-        parameters: Text after the colon, in which each word of capital letters stands for a number (mm).
+        parameters: Text after the colon. Each word of capital letters stands for a number (mm).
         build: Function that creates the probe from the numbers and the rotation (rad, anticlockwise).
-        pattern: Regular expression of the text after the colon. If empty, it is derived from `parameters`.
+        pattern: Regular expression of the text after the colon. If it is empty, it is derived from `parameters`.
     """
 
     name: str
@@ -59,19 +59,22 @@ class ProbeNotation:
 
     @property
     def form(self) -> str:
-        """The notation with placeholders for the numbers. Help texts and error messages show it."""
+        """Notation with placeholders for the numbers, which help texts and error messages show."""
         return f"{self.name}:{self.parameters}"
 
     def parse(self, text: str) -> "Probe | None":
-        """Return the probe that `text` describes, or None if the text has another notation.
+        """Create the probe that a text in this notation describes.
 
         Args:
             text: Notation of a probe, such as "rectangle:4.0x2.0@30".
 
+        Returns:
+            The probe; None if the text is in another notation.
+
         Raises:
-            SceneError: If the notation is correct, but no such footprint can exist.
+            SceneError: If the text is in this notation, but no such footprint can exist.
         """
-        # In `parameters`, such as "WIDTHxHEIGHT", each word in capitals stands for a number.
+        # Each word of capital letters in `parameters`, such as "WIDTHxHEIGHT", is replaced by the pattern of a number.
         pattern = self.pattern or re.sub("[A-Z]+", lambda _: NUMBER, self.parameters)
         match = re.fullmatch(rf"{self.name}:(?P<parameters>{pattern})(?:@(?P<degrees>{NUMBER}))?", text)
         if match is None:
@@ -88,9 +91,10 @@ class FootprintTopology:
     Probes with the same topology use the same mesh template.
 
     Attributes:
-        n_corner: Number of corners of the core polygon. The core polygon of a polygonal footprint is the footprint.
-        is_curved: Whether a layer of blocks with a curved outer side lies between the core polygon and the boundary of
-            the footprint.
+        n_corner: Number of corners of the core polygon. The core polygon of a polygonal footprint is the whole
+            footprint.
+        is_curved: Whether blocks with a curved outer side lie between the core polygon and the boundary of the
+            footprint.
         fills_circle: Whether the boundary of the footprint is the innermost circle of the mesh. Otherwise there is a
             gap between the footprint and the innermost circle.
     """
@@ -101,10 +105,11 @@ class FootprintTopology:
 
 
 class Probe(ABC):
-    """An object that presses on the film over its footprint, with a pressure that does not depend on the film.
+    """Base class of all probes. A probe is a body that presses on the film over its footprint.
 
-    Subclasses are frozen dataclasses. `Circle`, `Ellipse`, `Finger` and `Polygon` are examples. The pressure is uniform
-    unless a subclass overrides `has_uniform_pressure`, `pressure` and `force_share`.
+    The distribution of the pressure over the footprint does not depend on the film. The pressure is uniform unless a
+    subclass overrides `has_uniform_pressure`, `pressure` and `force_share`. Subclasses, such as `Circle`, `Ellipse`,
+    `Finger` and `Polygon`, are frozen dataclasses.
     """
 
     notations: ClassVar[tuple[ProbeNotation, ...]]
@@ -118,7 +123,7 @@ class Probe(ABC):
     @property
     @abstractmethod
     def notation(self) -> str:
-        """Text that `parse_probe` converts back into this probe. It contains lengths in mm, but not the rotation."""
+        """Notation of this probe without its rotation, which `parse_probe` converts back into the probe."""
 
     @property
     @abstractmethod
@@ -135,7 +140,7 @@ class Probe(ABC):
     def period(self) -> float:
         """Smallest rotation that maps the footprint onto itself, rad.
 
-        Zero for a circle, which has no smallest rotation.
+        The period of a circle is zero, because every rotation maps a circle onto itself.
         """
 
     @property
@@ -146,55 +151,71 @@ class Probe(ABC):
     @property
     @abstractmethod
     def outline(self) -> Complexes:
-        """Points along the boundary, anticlockwise, shape (n,), mm: all corners of a polygon, samples of a curve."""
+        """Points x + iy along the boundary, anticlockwise, shape (n,), mm.
+
+        For a polygon, the points are its corners. For a curved footprint, the points lie on the curved boundary.
+        """
 
     @abstractmethod
     def core(self, unit: float) -> Complexes:
-        """Return the corners of the core polygon, anticlockwise, shape (topology.n_corner,), in multiples of `unit` mm.
+        """Return the corners x + iy of the core polygon, anticlockwise.
 
-        The first corner of the core polygon of a curved footprint lies at half a step of the boundary parameter.
+        The corners of the core polygon of a curved footprint are evenly spaced in the boundary parameter. The parameter
+        of the first corner is half of the spacing.
+
+        Args:
+            unit: Unit of the returned corners, mm.
+
+        Returns:
+            Corners, shape (topology.n_corner,), in multiples of `unit`.
         """
 
     @abstractmethod
     def boundary(self, parameter: Array) -> Complexes:
-        """Return points of the boundary, relative to the centroid, rotated by `angle`, mm.
+        """Return points of the boundary of the footprint, which is rotated by `angle`.
 
         Args:
-            parameter: Values from 0 to 2 pi, any shape. The points go round the centroid anticlockwise as the parameter
-                increases. A rotation of the footprint by `period` must be equivalent to an increase of the parameter by
-                `period`.
+            parameter: Values from 0 to 2 pi, any shape. If the parameter increases, the point moves anticlockwise along
+                the boundary. An increase of the parameter by `period` must rotate the point by `period`.
 
         Returns:
-            Points x + iy, of the shape of `parameter`.
+            Points x + iy relative to the centroid, of the shape of `parameter`, mm.
         """
 
     @abstractmethod
     def contains(self, points: Complexes) -> Booleans:
-        """Return whether points lie in the footprint or on its boundary.
+        """Return whether each point lies in the footprint or on its boundary.
 
         Args:
             points: Points x + iy relative to the centroid, any shape, mm.
+
+        Returns:
+            Whether each point lies in the footprint, of the shape of `points`.
         """
 
     def rotated(self, angle: float) -> Self:
-        """Return the probe after a further rotation about its centroid by `angle` (rad, anticlockwise)."""
+        """Return a copy of the probe that is rotated further about its centroid.
+
+        Args:
+            angle: Further rotation, anticlockwise, rad.
+        """
         return replace(self, angle=self.angle + angle)  # type: ignore[type-var]
 
     @abstractmethod
     def farthest_distance(self, at: tuple[float, float]) -> float:
-        """Return the distance of the farthest point of the footprint from the centre of the film, mm.
+        """Return the distance from the centre of the film to the farthest point of the footprint, mm.
 
         Args:
-            at: Position (x, y) of the centroid, relative to the centre of the film, mm.
+            at: Position (x, y) of the centroid relative to the centre of the film, mm.
         """
 
     @abstractmethod
     def covered_area(self, corners: Array, at: complex) -> float:
-        """Return the area of a convex polygon that lies under the footprint, mm^2.
+        """Return the area that the footprint and a convex polygon have in common, mm^2.
 
         Args:
             corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
-            at: Position of the centroid as x + iy, mm.
+            at: Position of the centroid of the footprint as x + iy, mm.
         """
 
     @property
@@ -203,23 +224,23 @@ class Probe(ABC):
         return True
 
     def pressure(self, points: Complexes) -> Array:
-        """Return the pressure at points of the footprint relative to the mean pressure, dimensionless.
+        """Return the pressure at points of the footprint, divided by the mean pressure.
 
         Args:
             points: Points x + iy relative to the centroid, any shape, mm.
 
         Returns:
-            Relative pressure, of the shape of `points`. Its mean over the footprint is 1, and its centre of pressure is
-            the centroid.
+            Relative pressure, of the shape of `points`, dimensionless. Its mean over the footprint is 1, and its centre
+            of pressure is the centroid.
         """
         return np.ones(points.shape)
 
     def force_share(self, corners: Array, at: complex) -> float:
-        """Return the share of the force that acts on a convex polygon, from 0 to 1.
+        """Return the fraction of the force that acts on a convex polygon of the film, from 0 to 1.
 
         Args:
             corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
-            at: Position of the centroid as x + iy, mm.
+            at: Position of the centroid of the footprint as x + iy, mm.
         """
         return self.covered_area(corners, at) / self.area
 
@@ -230,15 +251,16 @@ class Probe(ABC):
 
 
 class CurvedProbe(Probe):
-    """A convex footprint with a smooth boundary that is described by a parameter from 0 to 2 pi.
+    """Base class of probes with a convex footprint whose boundary is smooth.
 
-    A subclass implements `boundary`, `contains`, `notation`, `area`, `reach` and `period`, and has a field `angle`. All
-    other methods are computed from these. A subclass may override them with closed formulas.
+    A subclass has a field `angle` and implements `boundary`, `contains`, `notation`, `area`, `reach` and `period`. The
+    class `CurvedProbe` implements all other methods of `Probe`. A subclass may override these methods with closed
+    formulas.
     """
 
     @property
     def topology(self) -> FootprintTopology:
-        """Topology with a core polygon and a layer up to the boundary.
+        """Topology with a core polygon, and a layer of blocks between the core polygon and the boundary.
 
         The core polygon has the rotational symmetry of the footprint.
         """
@@ -248,47 +270,50 @@ class CurvedProbe(Probe):
 
     @property
     def outline(self) -> Complexes:
-        """Evenly spaced boundary points, shape (OUTLINE_POINTS,), mm."""
+        """Points x + iy of the boundary at evenly spaced parameters, shape (OUTLINE_POINTS,), mm."""
         return self._boundary_points(OUTLINE_POINTS)
 
     def core(self, unit: float) -> Complexes:
-        """Return the corners of the core polygon, in multiples of `unit` mm."""
+        """Return the corners x + iy of the core polygon in multiples of `unit` (mm), shape (n_corner,)."""
         n_corner = self.topology.n_corner
         parameter = 2.0 * np.pi * (np.arange(n_corner) + 0.5) / n_corner
         return np.asarray(CORE_SHARE * self.boundary(parameter) / unit)
 
     def farthest_distance(self, at: tuple[float, float]) -> float:
-        """Return the distance of the farthest boundary point from the centre of the film, mm."""
+        """Return the distance from the centre of the film to the farthest point of the boundary, mm."""
         return float(np.abs(complex(*at) + self._boundary_points(FINE_OUTLINE_POINTS)).max())
 
     def covered_area(self, corners: Array, at: complex) -> float:
-        """Return the area of a convex polygon that lies under the footprint, mm^2.
+        """Return the area that the footprint and a convex polygon have in common, mm^2.
 
         The curved boundary of the footprint is approximated by a polygon with `FINE_OUTLINE_POINTS` corners.
         """
         return shared_area(to_complex(corners), at + self._boundary_points(FINE_OUTLINE_POINTS))
 
     def _boundary_points(self, count: int) -> Complexes:
-        """Return boundary points at evenly spaced parameters, shape (count,), mm."""
+        """Return points x + iy of the boundary at evenly spaced parameters, shape (count,), mm."""
         return self.boundary(2.0 * np.pi * np.arange(count) / count)
 
 
 def check_angle(angle: float) -> None:
     """Raise an error if the rotation of a footprint is not a finite number.
 
+    Args:
+        angle: Rotation, rad.
+
     Raises:
-        SceneError: If `angle` (rad) is infinite or not a number.
+        SceneError: If `angle` is infinite or not a number.
     """
     if not np.isfinite(angle):
         raise SceneError(f"probe angle: expected a finite number, got {angle}")
 
 
 def check_reach(reach: float, what: str = "probe reach") -> None:
-    """Raise an error if a footprint is so small that its size is probably in metres instead of millimetres.
+    """Raise an error if a footprint is so small that its size was probably given in metres.
 
     Args:
         reach: Distance of the farthest point of the footprint from its centroid, mm.
-        what: Name of this distance in the error message.
+        what: Name of the reach in the error message.
 
     Raises:
         SceneError: If `reach` is below `MIN_REACH` or infinite.
@@ -297,11 +322,11 @@ def check_reach(reach: float, what: str = "probe reach") -> None:
 
 
 def check_side(what: str, length: float) -> None:
-    """Raise an error if a side or an axis of a footprint is too short.
+    """Raise an error if a side or an axis of a footprint is too short or infinite.
 
     Args:
-        what: Name of the side in the error message.
-        length: Length of the side, mm.
+        what: Name of the side or axis in the error message.
+        length: Length of the side or axis, mm.
 
     Raises:
         SceneError: If `length` is below `MIN_SIDE` or infinite.

@@ -1,4 +1,4 @@
-"""Circular probe, and the base class of all probes with a circular footprint."""
+"""Circular probe with a uniform pressure, and the base class of all probes with a circular footprint."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -13,10 +13,12 @@ from isocharge.simulate.sensor.size_check import tidy
 
 @dataclass(frozen=True)
 class RoundProbe(CurvedProbe):
-    """A circular footprint. Subclasses implement `notation`, and `pressure` if the pressure is not uniform.
+    """Base class of probes with a circular footprint.
+
+    A subclass implements `notation`. A subclass whose pressure is not uniform also overrides `pressure`.
 
     Attributes:
-        radius: Radius, mm.
+        radius: Radius of the footprint, mm.
     """
 
     radius: float
@@ -26,62 +28,62 @@ class RoundProbe(CurvedProbe):
 
     @property
     def area(self) -> float:
-        """Area, mm^2."""
+        """Area of the footprint, mm^2."""
         return float(np.pi * self.radius**2)
 
     @property
     def reach(self) -> float:
-        """Radius, mm."""
+        """Distance of the farthest point of the footprint from its centre, which is the radius, mm."""
         return self.radius
 
     @property
     def angle(self) -> float:
-        """Zero: a rotation does not change a circle."""
+        """Rotation of the footprint, which is always zero, because a rotation does not change a circle."""
         return 0.0
 
     @property
     def period(self) -> float:
-        """Zero: every rotation maps a circle onto itself."""
+        """Period of the footprint, which is always zero, because every rotation maps a circle onto itself."""
         return 0.0
 
     @property
     def topology(self) -> FootprintTopology:
-        """A square core polygon, and a layer of blocks up to the innermost circle of the mesh."""
+        """Topology with a square core polygon, and a layer of blocks up to the innermost circle of the mesh."""
         return FootprintTopology(n_corner=4, is_curved=True, fills_circle=True)
 
     def rotated(self, angle: float) -> Self:
-        """Return the same circle."""
+        """Return the same probe, because a rotation does not change a circle."""
         del angle
         return self
 
     def boundary(self, parameter: Array) -> Complexes:
-        """Return points of the boundary, mm; the parameter is the polar angle."""
+        """Return points x + iy of the circle, mm. The parameter is the polar angle, rad."""
         return np.asarray(self.radius * np.exp(1j * parameter))
 
     def contains(self, points: Complexes) -> Booleans:
-        """Return whether points lie in the circle."""
+        """Return whether each point x + iy (mm, relative to the centre) lies in the circle."""
         return np.asarray(np.abs(points) <= self.radius)
 
     def farthest_distance(self, at: tuple[float, float]) -> float:
-        """Return the distance of the farthest point of the circle from the centre of the film, mm."""
+        """Return the distance from the centre of the film to the farthest point of the circle, mm."""
         return float(np.hypot(*at)) + self.radius
 
     def covered_area(self, corners: Array, at: complex) -> float:
-        """Return the area of a polygon that lies in the circle, mm^2."""
+        """Return the area that the circle and a convex polygon have in common, mm^2."""
         return float(area_in_disk(to_complex(corners), at, self.radius))
 
 
 @dataclass(frozen=True)
 class Circle(RoundProbe):
-    """A circular footprint with uniform pressure.
+    """Probe with a circular footprint and a uniform pressure.
 
     Attributes:
-        radius: Radius, mm.
+        radius: Radius of the footprint, mm.
     """
 
     notations = (ProbeNotation("circle", "RADIUS", lambda numbers, _angle: Circle(numbers[0])),)
 
     @property
     def notation(self) -> str:
-        """Text that `parse_probe` converts back into this probe."""
+        """Notation of this probe, which `parse_probe` converts back into the probe."""
         return f"circle:{tidy(self.radius)}"

@@ -1,4 +1,4 @@
-"""Elliptical probe."""
+"""Probe with an elliptical footprint."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ from isocharge.simulate.sensor.size_check import tidy
 
 @dataclass(frozen=True)
 class Ellipse(CurvedProbe):
-    """An elliptical footprint.
+    """Probe with an elliptical footprint and a uniform pressure.
 
     Attributes:
         width: Length of the axis along x before the rotation, mm.
@@ -40,40 +40,47 @@ class Ellipse(CurvedProbe):
 
     @property
     def notation(self) -> str:
-        """Text that `parse_probe` converts back into this probe, without the rotation."""
+        """Notation of this probe without its rotation, which `parse_probe` converts back into the probe."""
         return f"ellipse:{tidy(self.width)}x{tidy(self.height)}"
 
     @property
     def area(self) -> float:
-        """Area, mm^2."""
+        """Area of the ellipse, mm^2."""
         return float(0.25 * np.pi * self.width * self.height)
 
     @property
     def reach(self) -> float:
-        """Half of the longer axis, mm."""
+        """Distance of the farthest point of the ellipse from its centre, which is half of the longer axis, mm."""
         return 0.5 * max(self.width, self.height)
 
     @property
     def period(self) -> float:
-        """Half a turn, rad."""
+        """Smallest rotation that maps the ellipse onto itself, which is half a turn, rad."""
         return float(np.pi)
 
     def boundary(self, parameter: Array) -> Complexes:
-        """Return points of the boundary, mm; the parameter is the eccentric angle."""
+        """Return points x + iy of the ellipse, mm. The parameter is the eccentric angle, rad."""
         before_rotation = 0.5 * self.width * np.cos(parameter) + 0.5j * self.height * np.sin(parameter)
         return np.asarray(before_rotation * np.exp(1j * self.angle))
 
     def contains(self, points: Complexes) -> Booleans:
-        """Return whether points lie in the ellipse."""
+        """Return whether each point x + iy (mm, relative to the centre) lies in the ellipse."""
         return np.asarray(np.abs(self._on_unit_disk(points)) <= 1.0)
 
     def covered_area(self, corners: Array, at: complex) -> float:
-        """Return the area of a polygon that lies in the ellipse, mm^2."""
-        # The map onto the unit disk divides areas by the product of the semi-axes.
+        """Return the area that the ellipse and a convex polygon have in common, mm^2."""
+        # Map the ellipse onto the unit disk. This map divides areas by the product of the semi-axes.
         area_on_unit_disk = area_in_disk(self._on_unit_disk(to_complex(corners) - at), 0.0, 1.0)
         return float(area_on_unit_disk) * 0.25 * self.width * self.height
 
     def _on_unit_disk(self, points: Complexes) -> Complexes:
-        """Apply the affine map that maps the ellipse onto the unit disk to points (relative to the centre, mm)."""
+        """Apply to points the affine map that transforms the ellipse into the unit disk.
+
+        Args:
+            points: Points x + iy relative to the centre of the ellipse, any shape, mm.
+
+        Returns:
+            Transformed points, of the same shape, dimensionless.
+        """
         unrotated = points * np.exp(-1j * self.angle)
         return np.asarray(2.0 * unrotated.real / self.width + 2.0j * unrotated.imag / self.height)

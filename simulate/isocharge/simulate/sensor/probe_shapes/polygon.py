@@ -1,4 +1,4 @@
-"""Convex polygonal probes: rectangles, equilateral triangles and polygons with any corners."""
+"""Probes with a convex polygonal footprint, such as rectangles and equilateral triangles."""
 
 import math
 from dataclasses import dataclass
@@ -27,19 +27,21 @@ from isocharge.simulate.sensor.probe_shapes.base import (
 from isocharge.simulate.sensor.size_check import tidy
 
 MAX_CORNERS = 64
-"""Largest number of corners of a polygon. A circle gives the charges of a polygon with more corners with fewer
-unknowns."""
+"""Largest number of corners of a polygon.
+
+A polygon with more corners has nearly the charges of a circle, which needs fewer unknowns.
+"""
 
 CORNERS_PATTERN = rf"{NUMBER},{NUMBER}(?:;{NUMBER},{NUMBER})+"
-"""Regular expression of the corners `X,Y;X,Y;...` of a polygon."""
+"""Regular expression of the corners `X,Y;X,Y;...` of a polygon in the notation of a probe."""
 
 
 @dataclass(frozen=True)
 class Polygon(Probe):
-    """A convex polygonal footprint.
+    """Probe with a convex polygonal footprint and a uniform pressure.
 
     Attributes:
-        corners: Corners (x, y) relative to the centroid, anticlockwise, mm, before the rotation.
+        corners: Corners (x, y) before the rotation, relative to the centroid, anticlockwise, mm.
         angle: Rotation about the centroid, anticlockwise, rad.
         name: Kind of polygon in the notation: "rectangle", "triangle" or "polygon".
     """
@@ -82,15 +84,17 @@ class Polygon(Probe):
 
     @classmethod
     def of(cls, corners: Array, angle: float = 0.0, name: str = "polygon") -> "Polygon":
-        """Create a polygon from corners that need not be relative to their centroid.
+        """Create a polygon from its corners, which are shifted such that the centroid becomes the origin.
 
         Args:
-            corners: Corners (x, y), anticlockwise, shape (n, 2), mm. They are shifted so that the centroid is the
-                origin.
+            corners: Corners (x, y) relative to any point, anticlockwise, shape (n, 2), mm.
             angle: Rotation about the centroid, anticlockwise, rad.
-            name: Kind of polygon in the notation.
+            name: Kind of polygon in the notation: "rectangle", "triangle" or "polygon".
+
+        Raises:
+            SceneError: If the corners do not form a convex polygon, or if the polygon is too small.
         """
-        # Corners that are not valid are not shifted. The constructor reports them.
+        # Invalid corners have no centroid and are not shifted. The constructor then raises the error.
         points = np.asarray(corners, dtype=float)
         is_table = points.ndim == 2 and points.shape[0] >= 3 and points.shape[1] == 2
         if is_table and np.isfinite(points).all() and is_convex(points):
@@ -99,7 +103,7 @@ class Polygon(Probe):
 
     @classmethod
     def rectangle(cls, width: float, height: float, angle: float = 0.0) -> "Polygon":
-        """Create a rectangle.
+        """Create a probe with a rectangular footprint.
 
         Args:
             width: Length of the sides along x before the rotation, mm.
@@ -114,10 +118,10 @@ class Polygon(Probe):
 
     @classmethod
     def triangle(cls, side: float, angle: float = 0.0) -> "Polygon":
-        """Create an equilateral triangle.
+        """Create a probe whose footprint is an equilateral triangle. Before the rotation, one corner points to +y.
 
         Args:
-            side: Length of the sides, mm. One corner points to +y before the rotation.
+            side: Length of the sides, mm.
             angle: Rotation about the centroid, anticlockwise, rad.
         """
         check_side("probe side", side)
@@ -128,7 +132,7 @@ class Polygon(Probe):
 
     @property
     def notation(self) -> str:
-        """Text that `parse_probe` converts back into this probe, without the rotation."""
+        """Notation of this probe without its rotation, which `parse_probe` converts back into the probe."""
         corners = np.array(self.corners)
         first_corner, second_corner, *_ = corners
         if self.name == "rectangle":  # the first corner lies at (width / 2, height / 2)
@@ -141,7 +145,7 @@ class Polygon(Probe):
 
     @property
     def area(self) -> float:
-        """Area, mm^2."""
+        """Area of the polygon, mm^2."""
         return area_of(np.array(self.corners))
 
     @property
@@ -152,8 +156,8 @@ class Polygon(Probe):
     @property
     def period(self) -> float:
         """Smallest rotation that maps the polygon onto itself, rad."""
-        # A rotation that maps the polygon onto itself maps each corner to the corner that is `step` corners ahead. The
-        # smallest such step divides the number of corners.
+        # A rotation that maps the polygon onto itself maps each corner to another corner, which is a fixed number of
+        # corners ahead (`step`). The smallest possible step divides the number of corners.
         corners = to_complex(np.array(self.corners))
         for step in range(1, corners.size):
             if corners.size % step != 0:
@@ -162,36 +166,43 @@ class Polygon(Probe):
             corners_ahead = np.roll(corners, -step)
             if np.allclose(corners_ahead, corners * rotation, rtol=0.0, atol=1e-9 * self.reach):
                 return float(math.tau * step / corners.size)
-        return math.tau
+        return math.tau  # only a full turn maps the polygon onto itself
 
     @property
     def topology(self) -> FootprintTopology:
-        """The polygon is its own core polygon."""
+        """Topology of a polygonal footprint, whose core polygon is the whole footprint."""
         return FootprintTopology(len(self.corners), is_curved=False, fills_circle=False)
 
     @property
     def outline(self) -> Complexes:
-        """Corners x + iy relative to the centroid, rotated, anticlockwise, shape (n_corner,), mm."""
+        """Corners x + iy of the rotated polygon relative to its centroid, anticlockwise, shape (n_corner,), mm."""
         return np.asarray(to_complex(np.array(self.corners)) * np.exp(1j * self.angle))
 
     def core(self, unit: float) -> Complexes:
-        """Return the corners of the polygon, rotated, in multiples of `unit` mm."""
+        """Return the corners x + iy of the rotated polygon in multiples of `unit` (mm), shape (n_corner,)."""
         return np.asarray(self.outline / unit)
 
     def boundary(self, parameter: Array) -> Complexes:
-        """Return points of the boundary, mm. The parameter starts half-way along the edge before the first corner."""
-        corners = np.append(self.outline, self.outline[:1])
+        """Return points x + iy of the boundary, mm.
+
+        The parameter 0 is the middle of the edge that ends at the first corner. Each edge covers the same range of the
+        parameter.
+
+        Args:
+            parameter: Values from 0 to 2 pi, any shape.
+        """
+        corners = np.append(self.outline, self.outline[:1])  # the first corner is repeated, which closes the boundary
         corner_parameter = 2.0 * np.pi * (np.arange(corners.size) + 0.5) / (corners.size - 1)
         return np.asarray(np.interp(parameter, corner_parameter, corners, period=2.0 * np.pi))
 
     def contains(self, points: Complexes) -> Booleans:
-        """Return whether points lie in the polygon."""
+        """Return whether each point x + iy (mm, relative to the centroid) lies in the polygon."""
         return np.asarray(min_edge_cross_product(self.outline, points) >= 0.0)
 
     def farthest_distance(self, at: tuple[float, float]) -> float:
-        """Return the distance of the farthest corner from the centre of the film, mm."""
+        """Return the distance from the centre of the film to the farthest corner, mm."""
         return float(np.abs(complex(*at) + self.outline).max())
 
     def covered_area(self, corners: Array, at: complex) -> float:
-        """Return the area that a convex polygon shares with the footprint, mm^2."""
+        """Return the area that the footprint and a convex polygon have in common, mm^2."""
         return shared_area(to_complex(corners), at + self.outline)
