@@ -5,7 +5,14 @@ import pytest
 
 from isocharge.common.errors import ChargeError, SceneError
 from isocharge.simulate import ChargeMap, Domain, FunctionMap
-from isocharge.simulate.forward.charge_map import as_charges, check_forces, check_radius, differences, within
+from isocharge.simulate.forward.charge_map import (
+    as_charges,
+    check_forces,
+    check_radius,
+    differences,
+    one_sided_differences,
+    within,
+)
 from isocharge.simulate.numerics.disk import sunflower
 
 DOMAIN = Domain(5.0, (0.1, 2.0))
@@ -59,6 +66,17 @@ def test_maps_implement_the_charge_map_protocol(charge_map):
         behind[:, axis] = contact[:, axis] - step if axis < 2 else contact[:, 2] * np.exp(-step)
         expected = (charge_map.charges(ahead) - charge_map.charges(behind)) / (2.0 * step)
         np.testing.assert_allclose(slope[..., axis], expected, atol=5e-4 * np.abs(expected).max())
+
+
+def test_one_sided_differences_are_exact_for_linear_charges_and_nearly_exact_for_products():
+    """The charges are x + 2 y + 3 ln F and x y, so that the derivatives are known."""
+    contact = contacts(DOMAIN)
+    x, y, _ = contact.T
+    zero = np.zeros(len(contact))
+    charge, slope = one_sided_differences(linear, contact)
+    np.testing.assert_array_equal(charge, linear(contact))
+    np.testing.assert_allclose(slope[:, 0], np.tile([1.0, 2.0, 3.0], (len(contact), 1)), atol=1e-9)
+    np.testing.assert_allclose(slope[:, 1], np.column_stack([y, x, zero]), atol=1e-9)
 
 
 @pytest.mark.parametrize("charge_map", CHECKED, indirect=True)

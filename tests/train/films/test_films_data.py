@@ -16,6 +16,7 @@ from isocharge.train.films import films_data
 from isocharge.train.films.films_data import (
     DrawnFilms,
     FilmsSource,
+    _draw_charges_of_every_kind,
     draw_film_presses,
     draw_misfit_films,
     draw_near_films,
@@ -65,6 +66,19 @@ def test_misfit_examples_are_those_of_their_film(source, monkeypatch):
         contact, new_residual = search(charge_map, nearest_charge, source.noise.sigma(nearest_charge), candidates=64)
         assert np.linalg.norm(new_residual, axis=1).max() < 0.05
         assert (np.hypot(contact[:, 0], contact[:, 1]) <= source.domain.radius * (1 + 1e-9)).all()
+
+
+def test_a_search_with_fewer_charges_for_each_derivative_finds_the_same_misfits(source, monkeypatch):
+    """The search with central differences is the reference."""
+    job = (0, source.prior.draw(np.random.default_rng(8), 1)[0])
+    charge, residual = _draw_charges_of_every_kind(source, 60, 0, job)
+    monkeypatch.setattr(FilmsSource, "search_map", FilmsSource.charge_map)
+    reference_charge, reference_residual = _draw_charges_of_every_kind(source, 60, 0, job)
+    np.testing.assert_array_equal(charge, reference_charge)
+    misfit = np.linalg.norm(residual, axis=1)
+    reference_misfit = np.linalg.norm(reference_residual, axis=1)
+    assert reference_misfit.max() > 10.0
+    np.testing.assert_allclose(misfit, reference_misfit, rtol=2e-3, atol=2e-3)
 
 
 def test_the_projection_is_perpendicular_to_the_derivatives_of_the_charges(source):

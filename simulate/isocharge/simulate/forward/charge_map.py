@@ -15,6 +15,11 @@ from isocharge.common.errors import ChargeError, SceneError
 STEPS = (0.05, 0.05, 1e-3)
 """Steps of the central differences in x and y (mm) and in ln F (dimensionless), where F is the force."""
 
+ONE_SIDED_STEPS = (0.01, 0.01, 1e-3)
+"""Steps of the one-sided differences in x and y (mm) and in ln F (dimensionless).
+
+They are smaller than `STEPS`, because the error of a one-sided difference decreases only linearly with the step."""
+
 MIN_LOG_FORCE_HALF_WIDTH = 0.05
 """Smallest half width of a domain in ln F, dimensionless.
 
@@ -304,6 +309,31 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
     values_down = values[:, 1]
     derivatives = (values_up - values_down) / (2.0 * variable_steps)[:, None, None]  # shape (3, n, k)
     return np.moveaxis(derivatives, 0, 2)
+
+
+def one_sided_differences(function: Callable[[Array], Array], contact: Array) -> tuple[Array, Array]:
+    """Compute a function of contacts and approximations of its derivatives, with four values of the function.
+
+    Central differences need six values and are more accurate. The errors of these derivatives are proportional to
+    `ONE_SIDED_STEPS`. They are small enough for the steps of a search, whose result is checked by the values alone.
+
+    Args:
+        function: Function of contacts (x, y, F), shape (n, 3), mm and N, that returns values, shape (n, k). The
+            function is called once, because one call is faster than four.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        Values, shape (n, k), and derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values
+        per mm, per mm and per 1.
+    """
+    contact = np.asarray(contact, dtype=float)
+    steps = np.array(ONE_SIDED_STEPS)
+    stepped_contacts = _step_each_variable(contact, steps)  # shape (3, n, 3), one block per stepped variable
+    all_contacts = np.concatenate([contact[None], stepped_contacts])
+    all_values = np.asarray(function(all_contacts.reshape(-1, 3))).reshape(4, len(contact), -1)
+    values = all_values[0]
+    derivatives = (all_values[1:] - values) / steps[:, None, None]  # shape (3, n, k)
+    return values, np.moveaxis(derivatives, 0, 2)
 
 
 def _step_each_variable(contact: Array, steps: Array) -> Array:

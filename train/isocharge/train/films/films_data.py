@@ -20,7 +20,7 @@ from isocharge.common.errors import DatasetError
 from isocharge.common.progress import track
 from isocharge.simulate import NoiseModel, Piezo
 from isocharge.simulate.execution.workers import in_order
-from isocharge.simulate.forward.charge_map import Domain, FunctionMap, linearised
+from isocharge.simulate.forward.charge_map import Domain, FunctionMap, linearised, one_sided_differences
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 from isocharge.train.data.misfit_charges import ExampleOptions, draw_misfit_examples
@@ -236,6 +236,14 @@ def _check_most_charges_are_positive(film_presses: FilmPresses) -> None:
     )
 
 
+class SearchMap(FunctionMap):
+    """Charge map for searches, whose derivatives are computed from fewer charges than those of `FunctionMap`."""
+
+    def linearised(self, contact: Array) -> tuple[Array, Array]:
+        """See `LinearisedMap`."""
+        return one_sided_differences(self.function, contact)
+
+
 @dataclass(frozen=True)
 class FilmsSource:
     """Films and contacts from which the training data of the misfit network are drawn.
@@ -265,6 +273,15 @@ class FilmsSource:
             return np.clip(forward_map.charges(contact), LOWEST_CHARGE, HIGHEST_CHARGE)
 
         return FunctionMap(charges, forward_map.electrodes, self.domain)
+
+    def search_map(self, parameters: Array) -> SearchMap:
+        """Return the map of `charge_map` for searches.
+
+        Args:
+            parameters: Parameters of the film, shape (n_parameter,).
+        """
+        charge_map = self.charge_map(parameters)
+        return SearchMap(charge_map.function, charge_map.electrodes, charge_map.domain)
 
 
 @dataclass(frozen=True)
@@ -319,7 +336,7 @@ def _draw_charges_of_every_kind(source: FilmsSource, charges: int, seed: int, jo
         Array of shape (2, charges, n_electrode) with the charges, pC, and then their residuals at the nearest contact.
     """
     film_number, parameters = job
-    charge_map = source.charge_map(parameters)
+    charge_map = source.search_map(parameters)
     # The numbers after the seed make these random numbers independent of those of other films and other data sets.
     rng = np.random.default_rng([seed, 3, film_number])
     contact = draw_contacts(rng, source.domain, charges)
