@@ -61,7 +61,7 @@ def server_command(pytriton: Path, options: argparse.Namespace) -> list[str]:
 
 
 def server_environment(pytriton: Path) -> dict[str, str]:
-    """Return the environment variables of this process, with the folders for Triton first in the search paths.
+    """Return the environment variables of this process, with the folders of Triton at the front of the search paths.
 
     Args:
         pytriton: Folder of the installed package `pytriton`.

@@ -1,6 +1,6 @@
 """Modules that are shared by the packages `simulate`, `train`, `serve` and `cli`.
 
-The modules handle errors, files, tables of numbers, progress and resumable runs, among others.
+For example, the modules handle errors, files, tables of numbers, progress and resumable runs.
 
 These modules do not import any other package of isocharge.
 """

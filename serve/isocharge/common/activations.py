@@ -13,7 +13,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Activation:
-    """An activation function, which is applied to each output of a hidden layer.
+    """Activation function that is applied to each output of a hidden layer.
 
     Attributes:
         name: Name of the activation function in configurations and files.

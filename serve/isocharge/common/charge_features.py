@@ -1,4 +1,4 @@
-"""Computation of the input features of a network from charges.
+"""Conversion of charges into the input features of a network.
 
 The features are logarithms of positive charges. If the charges can have both signs, the features are inverse hyperbolic
 sines of the charges.
@@ -13,7 +13,7 @@ from isocharge.common.arrays import Array
 
 @dataclass(frozen=True)
 class ChargeFeatures:
-    """Function that computes the features of charges Q, which are the inputs of the first layer of a network.
+    """Function that computes features from charges Q. The features are the inputs of a network's first layer.
 
     If all charges are positive, the features are ln(clip(Q) / typical). If the charges can have both signs, the
     features are asinh(clip(Q) / typical) - mean. The function asinh is linear for small arguments and logarithmic for
@@ -34,7 +34,7 @@ class ChargeFeatures:
 
     @property
     def n_electrode(self) -> int:
-        """Number of electrodes, and therefore of charges of a press."""
+        """Number of electrodes, which is also the number of charges of a press."""
         return self.typical_pC.size
 
     def evaluate(self, charge_pC: Array) -> Array:

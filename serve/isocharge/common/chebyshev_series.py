@@ -14,7 +14,7 @@ CHUNK_SIZE = 4096
 
 @dataclass(frozen=True)
 class Series:
-    """A sum of products of Chebyshev polynomials in three coordinates: x, y and the logarithm of the force.
+    """Sum of products of Chebyshev polynomials in three coordinates: x, y and the logarithm of the force.
 
     Each coordinate is scaled to the range from -1 to 1.
 
@@ -28,8 +28,8 @@ class Series:
     def values_and_derivatives(self, coordinates: Array) -> Array:
         """Evaluate the series and its derivatives with respect to the three coordinates.
 
-        The points are processed in chunks of at most `CHUNK_SIZE` points. For each chunk, the terms of the series are
-        first summed over the polynomials in x and y, and then over the polynomials in the logarithm of the force.
+        The points are processed in chunks of at most `CHUNK_SIZE` points. For each chunk, the first sum is over the
+        polynomials in x and y, and the second sum is over the polynomials in the logarithm of the force.
 
         Args:
             coordinates: Scaled coordinates of n points, shape (n, 3). Coordinates outside [-1, 1] are clipped.
@@ -51,8 +51,8 @@ class Series:
 
             # Sum over the polynomials in the logarithm of the force:
             # (points, 1, n_force) @ (points, n_force, 4 * n_electrode).
-            evaluated = force_terms[:, None, :] @ force_coefficients
-            evaluated_chunks.append(evaluated[:, 0, :])
+            chunk_values = force_terms[:, None, :] @ force_coefficients
+            evaluated_chunks.append(chunk_values[:, 0, :])
         return np.concatenate(evaluated_chunks).reshape(len(coordinates), 4, n_electrode)
 
     @cached_property
@@ -68,8 +68,8 @@ class Series:
         x_degree, y_degree = position_degrees(degree)  # degrees in x and y of each product, shape (n_term,)
 
         coefficients = series_and_derivatives[:, x_degree, y_degree]  # (4, n_term, force_degree + 1, n_electrode)
-        terms_first = coefficients.transpose(1, 2, 0, 3)  # shape (n_term, force_degree + 1, 4, n_electrode)
-        return np.asarray(terms_first.reshape(len(x_degree), -1))
+        coefficients_by_term = coefficients.transpose(1, 2, 0, 3)  # shape (n_term, force_degree + 1, 4, n_electrode)
+        return np.asarray(coefficients_by_term.reshape(len(x_degree), -1))
 
 
 def position_degrees(degree: int) -> tuple[Integers, Integers]:

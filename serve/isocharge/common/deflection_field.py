@@ -1,16 +1,16 @@
 """Deflection of a round film under a round probe, and the file that stores the deflection.
 
-The deflection is a table over the force and the distance of the probe from the centre of the film. The film is
-elastically isotropic, so every press is a rotated press on the x axis. The points of the table lie on rings. A disk
+The deflection is tabulated for several forces and several distances of the probe from the centre of the film. The film
+is elastically isotropic, so every press is a rotated press on the x axis. The points of the table lie on rings. A disk
 automorphism maps rings around the origin to rings around the probe,
 
     z -> (z + c) / (1 + c z),  c = tanh((atanh(p + r) + atanh(p - r)) / 2),
 
 where z = x + i y is a point, p is the distance of the probe from the centre and r is the radius of the probe, all in
-film radii. The deflection varies smoothly over these rings. A few hundred numbers are therefore sufficient for the
-deflection of one press. The deflection of a membrane is proportional to the cube root of the force. Between two forces
-of the table, the deflection divided by the cube root of the force is therefore interpolated over the logarithm of the
-force. The package `simulate` writes the file, and the live page of `serve` shows the deflection.
+film radii. The deflection varies smoothly over these rings. A few hundred numbers are therefore sufficient to describe
+the deflection of one press. The deflection of a membrane is proportional to the cube root of the force. The deflection
+is therefore divided by the cube root of the force, and the quotient is interpolated over the logarithm of the force.
+The package `simulate` writes the file, and the live page of `serve` shows the deflection.
 """
 
 import base64
@@ -43,7 +43,7 @@ MAX_NUMBERS = 1 << 18
 
 @dataclass(frozen=True)
 class DeflectionField:
-    """Deflection of one film under one probe, as a table.
+    """Table of the deflection of one film under one probe.
 
     Attributes:
         film: Properties of the film, with the keys `FILM_KEYS`.
@@ -106,7 +106,7 @@ def _is_close(given: object, value: float) -> bool:
 
 
 def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, rings: Array, angles: int) -> Complexes:
-    """Compute the points at which a deflection field contains the deflection, for a probe on the x axis.
+    """For a probe on the x axis, compute the points at which a deflection field contains the deflection.
 
     Rings around the origin are mapped to rings around the probe by the disk automorphism
 
@@ -163,8 +163,8 @@ Increasing = Annotated[tuple[Finite, ...], Meta(min_length=1)]
 class _File(Struct):
     """Content of the file of a deflection field.
 
-    The key `deflection` contains 16-bit integers in base64. Each integer is a deflection divided by `scale_mm`, in
-    steps of 1 / `N_STEPS`.
+    The key `deflection` contains 16-bit integers in base64. An integer n stands for the deflection `scale_mm` * n /
+    `N_STEPS`.
     """
 
     isocharge_deflection: Annotated[int, Meta(ge=VERSION, le=VERSION, description=f"the version {VERSION}")]
@@ -180,8 +180,8 @@ class _File(Struct):
     def __post_init__(self) -> None:
         """Check that the values of the keys are consistent with each other.
 
-        The film must have exactly the keys `FILM_KEYS`. The forces, the distances and the rings must increase. There
-        must be one deflection for each combination of force, distance, ring and angle.
+        The film must have exactly the keys `FILM_KEYS`. The forces, the distances and the rings must be in ascending
+        order, without duplicates. There must be one deflection for each combination of force, distance, ring and angle.
 
         Raises:
             WrongKey: If the value of a key is wrong. The error names the first such key.

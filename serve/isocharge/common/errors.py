@@ -16,7 +16,7 @@ MAX_VALUE_CHARACTERS = 200
 
 
 def cut(text: str) -> str:
-    """Shorten a text to `MAX_VALUE_CHARACTERS` characters and make it printable, for an error message."""
+    """Shorten a text for an error message to `MAX_VALUE_CHARACTERS` characters, and make the text printable."""
     if len(text) <= MAX_VALUE_CHARACTERS:
         return printable(text)
     return printable(text[:MAX_VALUE_CHARACTERS]) + "..."

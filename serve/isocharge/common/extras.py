@@ -22,7 +22,7 @@ PACKAGES = {
 
 @contextmanager
 def require(*extras: str) -> Iterator[None]:
-    """Convert a failed import in the `with` block to an error that contains the command to install the extras.
+    """If an import in the `with` block fails, raise an error with the command that installs the extras.
 
     Args:
         extras: Names of the extras in pyproject.toml. `PACKAGES` contains the packages of each extra.

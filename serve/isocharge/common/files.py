@@ -79,7 +79,7 @@ def _too_large_error(path: Path, max_bytes: int) -> OSError:
 
 
 def bounded_lines(file: TextIO, max_characters: int = MAX_LINE_CHARACTERS) -> Iterator[str]:
-    """Yield the lines of a text file, each with its line end, and refuse lines that are too long.
+    """Yield the lines of a text file including their line ends, and refuse lines that are too long.
 
     Args:
         file: The text file, which is open for reading.
@@ -113,7 +113,7 @@ def read_needed(path: Path, error: type[IsochargeError], advice: str, max_bytes:
 
 
 def refuse_existing(path: Path) -> None:
-    """Check that no file and no folder exists at the path of an output.
+    """Check that neither a file nor a folder exists at the path of an output.
 
     Raises:
         OutputExists: If a file or a folder exists at the path.
@@ -123,7 +123,7 @@ def refuse_existing(path: Path) -> None:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name, flush it to disk, and then rename it.
+    """Write a file under a temporary name, flush the file to disk, and rename it.
 
     A program that reads the file therefore reads either the complete old content or the complete new content.
 
@@ -134,21 +134,21 @@ def write_whole(path: Path, data: bytes) -> None:
     Raises:
         OSError: If the file cannot be written. The old file then remains unchanged.
     """
-    temporary = _temporary_path(path)
+    temporary_path = _temporary_path(path)
     try:
-        with temporary.open("wb") as file:
+        with temporary_path.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
+        temporary_path.replace(path)
     finally:
-        temporary.unlink(missing_ok=True)  # a file with the temporary name only exists if an error occurred
+        temporary_path.unlink(missing_ok=True)  # a file with the temporary name only exists if an error occurred
 
 
 class AtomicWriter:
     """Writer of a new file. Each call of `write` appends its data either completely or not at all.
 
-    The class has those methods of a binary file that MCAP and text writers use.
+    The class has the methods of a binary file that MCAP writers and text writers use.
     """
 
     def __init__(self, path: Path) -> None:
@@ -224,19 +224,19 @@ def new_file(path: Path) -> Iterator[Path]:
         OutputError: If the file or folder cannot be written.
     """
     refuse_existing(path)
-    temporary = _temporary_path(path)
+    temporary_path = _temporary_path(path)
     try:
         with as_output_errors(path):
-            yield temporary
-            flush_to_disk(temporary)
+            yield temporary_path
+            flush_to_disk(temporary_path)
             refuse_existing(path)  # another process may have created the path in the meantime
-            temporary.rename(path)
+            temporary_path.rename(path)
             flush_to_disk(path.parent)
     finally:
         # After an error, the temporary path is still a folder or a file, and is removed.
-        shutil.rmtree(temporary, ignore_errors=True)  # does nothing for a file
+        shutil.rmtree(temporary_path, ignore_errors=True)  # does nothing for a file
         with suppress(OSError):
-            temporary.unlink()  # fails if the path does not exist any more
+            temporary_path.unlink()  # fails if the path does not exist any more
 
 
 @contextmanager
@@ -257,9 +257,9 @@ def new_folder(path: Path) -> Iterator[Path]:
     """
     missing_parents = [parent for parent in path.parents if not parent.exists()]
     try:
-        with new_file(path) as temporary:
-            temporary.mkdir(parents=True)
-            yield temporary
+        with new_file(path) as temporary_path:
+            temporary_path.mkdir(parents=True)
+            yield temporary_path
     finally:
         remove_empty(missing_parents)  # they are only empty after an error; otherwise they contain the new folder
 
@@ -271,7 +271,7 @@ def _temporary_path(path: Path) -> Path:
 
 @contextmanager
 def as_output_errors(path: Path, advice: str = "choose another output") -> Iterator[None]:
-    """Convert an OSError that the `with` block raises to an OutputError.
+    """If the `with` block raises an OSError, raise an OutputError instead.
 
     Args:
         path: Path of the output, for the error message.
@@ -290,7 +290,7 @@ def as_output_errors(path: Path, advice: str = "choose another output") -> Itera
 
 
 def remove_empty(folders: Iterable[Path]) -> None:
-    """Remove the given folders, except for folders that contain files or other folders.
+    """Remove those of the given folders that contain neither files nor folders.
 
     Args:
         folders: The folders. Inner folders must come before outer folders. Paths that do not exist are ignored.
@@ -303,8 +303,8 @@ def remove_empty(folders: Iterable[Path]) -> None:
 def flush_to_disk(path: Path) -> None:
     """Flush a file or a folder to disk, so that its content survives a power failure.
 
-    For a folder, the names of its files are flushed. The function does nothing on Windows, where a folder cannot be
-    opened.
+    If the path is a folder, the names of its files are flushed. The function does nothing on Windows, where a folder
+    cannot be opened.
 
     Args:
         path: The file or the folder.

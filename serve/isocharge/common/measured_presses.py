@@ -1,4 +1,4 @@
-"""Measured presses: presses on a film whose charges were measured.
+"""Presses on a film, together with the charges that were measured during each press.
 
 For each press, the position, the force or both may also be known. A file of presses is a CSV or Parquet file with the
 columns `x_mm`, `y_mm`, `force_N` and one column for the charges of each electrode in pC. The columns may be in any
@@ -194,7 +194,7 @@ class MeasuredPresses:
 
     @property
     def columns(self) -> dict[str, Array]:
-        """Columns of a file that contains these presses, by the names of the columns, each of shape (n,).
+        """Columns of a file that contains these presses, as a dictionary from names to arrays of shape (n,).
 
         A column of temperatures is omitted if the temperatures of all presses are unknown.
         """
@@ -340,7 +340,7 @@ def read_presses(
 
 
 def _none_if_unknown(temperature_C: Array) -> Array | None:
-    """Return a column of temperatures unchanged; return None instead if all temperatures are unknown.
+    """Return a column of temperatures, or None if all temperatures are unknown.
 
     Args:
         temperature_C: Temperatures, shape (n,), degrees Celsius; NaN if unknown.
@@ -365,7 +365,7 @@ def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
 
 
 def read_press_list(path: Path) -> Array:
-    """Read the positions and forces of presses that a machine will make, in their order.
+    """Read the positions and forces of the presses that a machine will make, in the order of the rows.
 
     Args:
         path: CSV or Parquet file with the columns x_mm, y_mm and force_N; see `read_presses`. All other columns are
@@ -434,10 +434,10 @@ def row_words(rows: Sequence[int], row_noun: str, max_listed: int = 10) -> str:
     """
     plural = f"{row_noun}es" if row_noun.endswith("s") else f"{row_noun}s"  # "presses" and "lines"
     noun = row_noun if len(rows) == 1 else plural
-    listed = ", ".join(map(str, rows[:max_listed]))
+    listed_numbers = ", ".join(map(str, rows[:max_listed]))
     if len(rows) <= max_listed:
-        return f"{noun} {listed}"
-    return f"{noun} {listed} and {len(rows) - max_listed} more"
+        return f"{noun} {listed_numbers}"
+    return f"{noun} {listed_numbers} and {len(rows) - max_listed} more"
 
 
 def _check_electrodes(electrodes: Collection[str]) -> None:

@@ -1,4 +1,4 @@
-"""Reading of the arrays of an npz file that may come from an untrusted source.
+"""Reader for npz files that may come from an untrusted source.
 
 An npz file is a zip archive. The archive contains one entry in NumPy's npy format for each array. The declared sizes,
 the compression method and the size of the LZMA dictionary are checked before any entry is decompressed. A small file
@@ -166,7 +166,7 @@ def text_item(arrays: Mapping[str, np.ndarray], name: str) -> str:
 
 
 def _checked_entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """Check the entries of an archive, and return the entries by the names of their arrays.
+    """Check the entries of an archive, and return a dictionary from the names of the arrays to the entries.
 
     Args:
         archive: The npz file.
@@ -233,7 +233,7 @@ def _decompress(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytearray:
 
 
 def _parse_npy(content: bytearray, name: str) -> np.ndarray:
-    """Return the array that the bytes of an npy file contain. The array shares the memory of the bytes.
+    """Convert the bytes of an npy file into the array that the file contains. The array shares the memory of the bytes.
 
     Args:
         content: Bytes of the npy file.

@@ -1,4 +1,4 @@
-"""Multilayer perceptron with a skip layer: definition, and evaluation with NumPy.
+"""Definition of a multilayer perceptron with a skip layer, and its evaluation with NumPy.
 
 For inputs x, the hidden layer l computes h_l = f(h_(l-1) W_l + b_l), where h_0 = x and f is the activation function.
 The output layer computes y = h_L V + c + x S from the result h_L of the last hidden layer. The skip layer S maps the

@@ -1,9 +1,9 @@
 """Conversion of text to characters that are safe to print on a terminal.
 
-Names and units from boards, headers of files, metadata of models and contents of recordings may contain characters that
-a terminal executes or hides. Examples are escape sequences that move the cursor or change the title of the window,
-marks that reverse the direction of writing, and characters without width. Such characters are replaced by the escape
-sequences that JSON uses, such as `\\u001b`. A text in JSON therefore remains valid JSON.
+Text from boards, files, models and recordings may contain characters that a terminal executes or hides. Examples are
+escape sequences that move the cursor or change the title of the window, marks that reverse the direction of writing,
+and characters without width. Such characters are replaced by the escape sequences that JSON uses, such as `\\u001b`. A
+text in JSON therefore remains valid JSON.
 """
 
 IGNORABLE_RANGES = (
@@ -64,5 +64,5 @@ def _escape(character: str) -> str:
     if character in SHORT_ESCAPES:
         return SHORT_ESCAPES[character]
     utf16 = character.encode("utf-16-be", "surrogatepass")  # a single surrogate is accepted, too
-    code_units = (utf16[position : position + 2] for position in range(0, len(utf16), 2))  # two bytes each
+    code_units = (utf16[offset : offset + 2] for offset in range(0, len(utf16), 2))  # two bytes each
     return "".join(f"\\u{code_unit.hex()}" for code_unit in code_units)

@@ -1,7 +1,7 @@
 """Reporting of the progress of long computations.
 
-A computation reports its progress to a function that is called the listener. The listener is stored in a context
-variable. The functions of a computation therefore need no additional argument for the listener.
+A computation reports its progress to a function, the listener. The listener is stored in a context variable. The
+functions of a computation therefore need no additional argument for the listener.
 """
 
 import threading
@@ -21,7 +21,7 @@ _listener: ContextVar[Listener | None] = ContextVar("progress", default=None)
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Pass the progress that the present thread reports in the `with` block to a listener.
+    """During the `with` block, pass the progress that the present thread reports to a listener.
 
     Args:
         listener: Function that is called with the arguments of `report` for each report.
@@ -55,7 +55,7 @@ def report(title: str, done: int, total: int, note: str = "") -> None:
 
 @contextmanager
 def second_thread() -> Iterator[Executor]:
-    """Provide an executor with one thread whose calls report their progress to the listener of the present thread.
+    """Provide an executor with one thread. Its calls report their progress to the listener of the present thread.
 
     At the end of the `with` block, the executor waits for all calls. If the block raises an exception, calls that have
     not started are cancelled, and the running call ends with a `CancelledError` when it next reports its progress.

@@ -50,7 +50,7 @@ MAX_PART_BYTES = 1 << 30
 
 
 class ResumableRun:
-    """The draft of a run, which stores the finished parts. `resume_folder` and `resume_parts` create it.
+    """Draft of a run, which stores the finished parts of this run. `resume_folder` and `resume_parts` create it.
 
     Attributes:
         target: File or folder that the run writes.
@@ -183,7 +183,7 @@ class _StoringExecutor(Executor):
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit a task whose result is stored as a part of the run, and return the future of the stored result.
 
-        If an earlier run has stored the result, the result is loaded. If not, the executor that was given to the
+        If an earlier run has stored the result, the result is loaded. Otherwise, the executor that was given to the
         constructor computes the task. If the constructor was given no executor, the task is computed before this method
         returns.
 
@@ -204,6 +204,7 @@ class _StoringExecutor(Executor):
             stored_future.set_result(result)
         else:
             task_future = self._executor.submit(function, *args, **kwargs)
+            # The argument of both callbacks is the finished future, which they do not need.
             task_future.add_done_callback(lambda _: self._store(part_name, task_future, stored_future))
             # If the caller cancels the returned future, the task is also cancelled.
             stored_future.add_done_callback(lambda _: task_future.cancel())
@@ -235,7 +236,7 @@ class _StoringExecutor(Executor):
 
 
 def _decode_array(data: bytes) -> Array:
-    """Return the array of numbers that the bytes of an npy file contain.
+    """Convert the bytes of an npy file into the array of numbers that the file contains.
 
     Args:
         data: Bytes of the npy file.
@@ -257,7 +258,7 @@ def _encode_array(array: Array) -> bytes:
 
 
 def draft_of(target: Path) -> Path:
-    """Return the path of the draft of a run that writes the target."""
+    """Return the path of the draft for the target of a run."""
     path_with_name = target if target.name else target.absolute()  # the path "." has no name
     return path_with_name.parent / f"{path_with_name.name}.part"
 
@@ -284,8 +285,8 @@ def refuse_finished(target: Path) -> None:
 def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
     """Begin or resume a run in the `with` block. At the end of the block, the draft becomes the target folder.
 
-    If the block raises an exception, the draft is kept for the next run, unless it contains no finished part, or the
-    next run would fail with the same error.
+    If the block raises an exception, the draft is kept for the next run. However, it is removed if it contains no
+    finished part, or if the next run would fail with the same error.
 
     Args:
         target: Folder that the run writes.
@@ -306,10 +307,10 @@ def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fa
 
 @contextmanager
 def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
-    """Begin or resume a run in the `with` block, which writes the target itself, for example as a single file.
+    """Begin or resume a run in the `with` block. The block itself writes the target, for example as a single file.
 
-    The draft is removed at the end of the block. If the block raises an exception, the draft is kept for the next run,
-    unless it contains no finished part, or the next run would fail with the same error.
+    The draft is removed at the end of the block. If the block raises an exception, the draft is kept for the next run.
+    However, it is removed if it contains no finished part, or if the next run would fail with the same error.
 
     Args:
         target: File or folder that the run writes.
@@ -366,9 +367,9 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
     try:
         if is_new:
             # The folder appears only with both files, even if the process is killed meanwhile.
-            with new_folder(folder) as temporary:
-                (temporary / "lock").touch()
-                write_whole(temporary / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
+            with new_folder(folder) as temporary_folder:
+                (temporary_folder / "lock").touch()
+                write_whole(temporary_folder / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
         with locked(folder / "lock"):
             _check_same_run(folder, identity)
             yield
@@ -379,7 +380,7 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
 
 
 def output_errors(target: Path) -> AbstractContextManager[None]:
-    """Return a context manager that converts an OSError to an OutputError whose message states how to resume the run.
+    """Return a context manager that converts an OSError to an OutputError. Its message states how to resume the run.
 
     Args:
         target: File or folder that the run writes.
@@ -442,21 +443,21 @@ def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
         )
 
 
-def _differences(saved: Any, current: Any, name: str = "") -> Iterator[str]:
+def _differences(saved_settings: Any, current_settings: Any, name: str = "") -> Iterator[str]:
     """Yield a description of each setting in which an unfinished run differs from the present run.
 
     If a setting is a table, the settings in the table are compared one by one. If one of the runs does not have a
     setting, the setting counts as None.
 
     Args:
-        saved: All settings of the unfinished run, or one of them.
-        current: All settings of the present run, or the same one of them.
+        saved_settings: All settings of the unfinished run, or one of them.
+        current_settings: All settings of the present run, or the same one of them.
         name: Name of the setting that is compared; empty for all settings.
     """
-    if isinstance(saved, dict) and isinstance(current, dict):
-        for key in sorted(saved.keys() | current.keys()):
-            if saved.get(key) != current.get(key):
+    if isinstance(saved_settings, dict) and isinstance(current_settings, dict):
+        for key in sorted(saved_settings.keys() | current_settings.keys()):
+            if saved_settings.get(key) != current_settings.get(key):
                 inner_name = f"{name}.{key}" if name else key
-                yield from _differences(saved.get(key), current.get(key), inner_name)
+                yield from _differences(saved_settings.get(key), current_settings.get(key), inner_name)
     else:
-        yield f"{name or 'run.json'} is {cut(str(saved))} there, {cut(str(current))} here"
+        yield f"{name or 'run.json'} is {cut(str(saved_settings))} there, {cut(str(current_settings))} here"

@@ -44,7 +44,7 @@ N_AXES = 4
 
 @dataclass(frozen=True)
 class StressSeries:
-    """Stress of one film under one probe, as the coefficients of two Chebyshev series.
+    """Coefficients of two Chebyshev series that describe the stress of one film under one probe.
 
     Attributes:
         film: Properties of the film, with the keys `isocharge.common.deflection_field.FILM_KEYS`.

@@ -67,7 +67,7 @@ Text = Annotated[str, Meta(min_length=1, max_length=1000)]
 
 
 class Settings(Struct, frozen=True, forbid_unknown_fields=True):
-    """Base class for a table of a file in which unknown keys are errors.
+    """Base class for the tables of a file. An unknown key in such a table is an error.
 
     Each subclass must repeat `frozen=True`, because type checkers require it.
     """
@@ -207,7 +207,7 @@ def _prefix(where: str) -> str:
 
 
 def _first_mistake(value: object, kind: Any, cause: Exception) -> str:
-    """Describe the first mistake in a value, for an error message.
+    """Return a description of the first mistake in a value for an error message.
 
     Args:
         value: Value from TOML or JSON.
@@ -386,7 +386,7 @@ def _union_members(expected_type: Any) -> Iterator[Any]:
 
 
 def _join(path: str, key: str) -> str:
-    """Join the names of the keys that lead to a table and the name of a key of the table, as in "film.radius_mm".
+    """Join the path of a table and the name of one of its keys, for example as "film.radius_mm".
 
     Args:
         path: Names of the keys that lead to the table; empty for the whole file.
@@ -408,10 +408,10 @@ def _describe_type(value_type: inspect.Type) -> str:
         case inspect.Metadata(type=annotated_type, extra_json_schema=annotation):
             description_in_annotation = (annotation or {}).get("description")
             return description_in_annotation or _describe_type(annotated_type)
-        case inspect.FloatType(gt=above, ge=minimum, le=maximum):
-            return _describe_number("number", above, minimum, maximum)
-        case inspect.IntType(gt=above, ge=minimum, le=maximum):
-            return _describe_number("whole number", above, minimum, maximum)
+        case inspect.FloatType(gt=exclusive_minimum, ge=minimum, le=maximum):
+            return _describe_number("number", exclusive_minimum, minimum, maximum)
+        case inspect.IntType(gt=exclusive_minimum, ge=minimum, le=maximum):
+            return _describe_number("whole number", exclusive_minimum, minimum, maximum)
         case inspect.BoolType():
             return "true or false"
         case inspect.StrType(max_length=int(max_length)):
@@ -442,7 +442,7 @@ _NOUNS: tuple[tuple[Any, str], ...] = (
 
 
 def _noun(value_type: inspect.Type) -> str:
-    """Return the noun for the values of a type, such as "number"; "value" for a type that is not in `_NOUNS`.
+    """Return the noun for the values of a type, such as "number". For a type that is not in `_NOUNS`, it is "value".
 
     Args:
         value_type: The type, as `msgspec.inspect.type_info` returns it.
@@ -459,12 +459,12 @@ def _one_of(words: Iterable[object]) -> str:
     return f"one of {', '.join(map(str, words))}"
 
 
-def _describe_number(noun: str, above: float | None, minimum: float | None, maximum: float | None) -> str:
+def _describe_number(noun: str, exclusive_minimum: float | None, minimum: float | None, maximum: float | None) -> str:
     """Describe numbers with bounds for an error message, for example as "a number from 0 to 1".
 
     Args:
         noun: Noun for the numbers: "number" or "whole number".
-        above: Lower bound that is not allowed itself; None if there is no such bound.
+        exclusive_minimum: Lower bound that is not allowed itself; None if there is no such bound.
         minimum: Smallest allowed number; None if there is no such bound.
         maximum: Largest allowed number; None if there is no such bound.
     """
@@ -474,10 +474,10 @@ def _describe_number(noun: str, above: float | None, minimum: float | None, maxi
     if maximum is not None and abs(maximum) == MAX_FLOAT:
         maximum = None
 
-    if above == 0 and maximum is None:
+    if exclusive_minimum == 0 and maximum is None:
         return f"a positive {noun}"
-    if above is not None:
-        description = f"a {noun} above {_bound_text(above)}"
+    if exclusive_minimum is not None:
+        description = f"a {noun} above {_bound_text(exclusive_minimum)}"
         return description if maximum is None else f"{description} and at most {_bound_text(maximum)}"
     if minimum is not None:
         description = f"a {noun} from {_bound_text(minimum)}"

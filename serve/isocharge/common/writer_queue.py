@@ -1,7 +1,7 @@
 """A queue whose items are written by a separate thread, so that the producer never waits for a slow consumer.
 
 The thread writes the oldest item first. If the consumer is so slow that more than `MAX_WAITING` items are waiting, the
-oldest items are dropped and counted. A slow consumer therefore gets the newest items.
+oldest items are dropped and counted. A slow consumer therefore receives the newest items.
 """
 
 import threading
@@ -25,7 +25,7 @@ After this time, the waiting items count as lost.
 class WriterQueue(Generic[T]):
     """Queue of limited length with a thread that writes the items of the queue.
 
-    The queue is a context manager, which closes the queue at the end of the `with` block.
+    The queue is a context manager. At the end of the `with` block, the queue is closed.
 
     Attributes:
         lost: Number of items that were dropped without being written.
@@ -113,7 +113,7 @@ class WriterQueue(Generic[T]):
         return self._taken_count > earlier_count or self._error is not None
 
     def _raise_error(self) -> None:
-        """Raise the exception with which the thread has ended, if there is one that was not raised before."""
+        """If the thread has ended with an exception, raise this exception, but only once."""
         error = self._error
         self._error = None  # so that the exception is raised only once
         if error is not None:
@@ -130,7 +130,7 @@ class WriterQueue(Generic[T]):
                 self._change.notify_all()
 
     def _next(self) -> T | None:
-        """Wait until there is an item and the consumer accepts an item, and take the oldest item from the queue.
+        """Wait until an item is waiting and the consumer is ready, and take the oldest item from the queue.
 
         The item remains in the queue until the consumer accepts an item. `put` can therefore drop old items while the
         consumer is slow.

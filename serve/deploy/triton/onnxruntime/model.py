@@ -13,7 +13,7 @@ import triton_python_backend_utils as pb_utils
 
 
 class TritonPythonModel:
-    """One version of one model. Triton creates the object and calls its methods."""
+    """One version of one model. Triton creates the object of this class and calls its methods."""
 
     @staticmethod
     def auto_complete_config(config):

@@ -62,7 +62,7 @@ LATENCY_S = 0.5
 
 
 class FollowedPress(NamedTuple):
-    """Frame of the live part in which both the virtual sensor and the model have a contact.
+    """Frame of the live part in which both the virtual sensor and the model report a contact.
 
     Attributes:
         number: Number of the press, counted from 1.
@@ -126,7 +126,7 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None, se
 
 @contextmanager
 def _demo_step(name: str, description: str, durations_s: dict[str, float]) -> Iterator[None]:
-    """Context manager of one step of the demo, which prints a title and shows the progress of the step.
+    """Context manager that prints the title of one step of the demo and shows the progress of the step.
 
     Args:
         name: Name of the step.
@@ -190,7 +190,7 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
 
 
 def _contact_of(record: PredictionRecord) -> tuple[float, float, float]:
-    """Return x (mm), y (mm) and the force (N) of a record. Values that the record does not contain are 0."""
+    """Return x (mm), y (mm) and the force (N) of a record. A value that the record does not contain is 0."""
     return record.x_mm or 0.0, record.y_mm or 0.0, record.force_N or 0.0
 
 

@@ -138,7 +138,7 @@ def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
 
 
 def _record_values(record: Any, electrodes: tuple[str, ...]) -> tuple[Any, ...]:
-    """Return the values of a record: its numbers, the charge of each electrode, and whether each flag is set.
+    """Return the numbers of a record, the charge of each electrode, and a truth value for each flag.
 
     Missing values are None.
 
@@ -286,7 +286,7 @@ def _draw_over_time(figure: Any, groups: _Groups, traces: dict[str, Array], time
 
 
 def _draw_with_std(axes: Any, groups: _Groups, traces: dict[str, Array], name: str, colour: str) -> None:
-    """Draw a quantity over time, and a band of two standard deviations to both sides of the quantity.
+    """Draw a quantity over time, with a band of two standard deviations on both sides.
 
     Args:
         axes: Axes of matplotlib.
@@ -295,7 +295,7 @@ def _draw_with_std(axes: Any, groups: _Groups, traces: dict[str, Array], name: s
         name: Name of the column, such as "x_mm".
         colour: Colour of the line and of the band.
     """
-    quantity, _, unit = name.partition("_")
+    quantity, _underscore, unit = name.partition("_")
     values = traces[name]
     two_std = 2.0 * traces[f"{quantity}_std_{unit}"]
     groups.draw_band(axes, values - two_std, values + two_std, color=colour, alpha=0.25, lw=0.0)
@@ -342,7 +342,7 @@ def _label_axes(axes: Any, label: str) -> None:
     """
     axes.set_ylabel(label, fontsize=9)
     axes.grid(alpha=0.3)
-    handles, _ = axes.get_legend_handles_labels()
+    handles, _labels = axes.get_legend_handles_labels()
     if handles:
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8, ncols=8)
 

@@ -233,7 +233,7 @@ def _load(model: str, models: Path | None) -> Predictor:
 
 
 def _load_labelled(label: str, models: Path | None) -> Predictor:
-    """Load the version of a model that a label `NAME/VERSION` in a recording names."""
+    """Load the version of a model with the label `NAME/VERSION`, which is read from a recording."""
     return Predictor(find_labelled_model(label, models))
 
 

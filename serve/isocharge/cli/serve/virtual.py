@@ -174,7 +174,7 @@ def virtual_command(
 
 
 def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) -> tuple[Sensor, Probe]:
-    """Return the described sensor and probe or, if there is a seed, a sensor and a probe that vary at random.
+    """Return the described sensor and probe. If there is a seed, vary the sensor and the probe at random.
 
     Args:
         sensor_name: Name or file of the sensor.
@@ -237,7 +237,7 @@ def _frame_settings(frames: FrameFormat | None, board: BoardEncoder | None) -> d
 
 
 def _largest_distance_mm(radius_mm: float, scripted_presses: Script | None) -> float:
-    """Return the distance from the centre of the film up to which charges are needed, mm.
+    """Return the largest distance from the centre of the film at which charges are needed, mm.
 
     Args:
         radius_mm: Largest distance of a random press, mm.
@@ -250,7 +250,7 @@ def _largest_distance_mm(radius_mm: float, scripted_presses: Script | None) -> f
 
 
 def _largest_force_N(force_max_N: float, scripted_presses: Script | None) -> float:
-    """Return the force up to which charges are needed, N.
+    """Return the largest force for which charges are needed, N.
 
     Args:
         force_max_N: Largest force of a random press, N.

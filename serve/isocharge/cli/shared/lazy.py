@@ -75,7 +75,7 @@ def load_command(command: LazyCommand) -> TyperCommand:
     Raises:
         MissingExtra: If the extra of the command is not installed.
     """
-    module_name, _, function_name = command.function_path.partition(":")
+    module_name, _colon, function_name = command.function_path.partition(":")
     # A missing package of the extra raises MissingExtra, whose message names the install command.
     import_context = require(command.extra) if command.extra else nullcontext()
     with import_context:

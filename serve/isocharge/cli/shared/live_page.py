@@ -49,7 +49,7 @@ STATE_INTERVAL_S = 0.25
 
 
 class RecordingHeader(NamedTuple):
-    """Content of the header of a recording that the user begins on the live page.
+    """Header of a recording that the user begins on the live page.
 
     Attributes:
         policy: Value of `Policy`, which states for which frames records are computed.
@@ -203,7 +203,7 @@ def live_page(
 
 
 class PageFeed:
-    """Sends the records of a stream to its live page, and the counters of the stream a few times per second."""
+    """Writer that sends the records and, a few times per second, the counters of a stream to its live page."""
 
     def __init__(self, link: ReaderEnd, touch: TouchStream, stream: RecordedStream | None = None) -> None:
         """Store the stream and its link. No records have been sent yet.
@@ -236,7 +236,7 @@ class PageFeed:
             self._send_state(record)
 
     def _rate_Hz(self) -> float | None:
-        """Compute the frame rate of the board (Hz) from the times of the latest records; None if it is unknown."""
+        """Compute the frame rate (Hz) from the times of the latest records, or return None if the rate is unknown."""
         elapsed_s = self._timestamps_s[-1] - self._timestamps_s[0]
         if not elapsed_s > 0.0:  # also if a time is NaN
             return None

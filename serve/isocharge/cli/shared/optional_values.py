@@ -1,7 +1,7 @@
 """Command-line options whose value may be omitted, as in `--live` or `--live 8080`.
 
 Typer requires a value for every option that is not a flag. Commands of the class `OptionalValueCommand` therefore
-insert the default value into the command line before Typer parses it.
+insert the default value into the command line before Typer parses the command line.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,18 +48,18 @@ def insert_omitted_values(words: Sequence[str]) -> list[str]:
         >>> insert_omitted_values(["--live", "--seconds", "5"])
         ['--live', '127.0.0.1:8001', '--seconds', '5']
     """
-    completed: list[str] = []
-    for position, word in enumerate(words):
+    completed_words: list[str] = []
+    for index, word in enumerate(words):
         if word == "--":
-            return [*completed, *words[position:]]
-        completed.append(word)
+            return [*completed_words, *words[index:]]
+        completed_words.append(word)
         option = OPTIONAL_VALUES.get(word)
         if option is None:
             continue
-        is_last = position + 1 == len(words)
-        if is_last or not option.is_value(words[position + 1]):
-            completed.append(option.default)
-    return completed
+        is_last = index + 1 == len(words)
+        if is_last or not option.is_value(words[index + 1]):
+            completed_words.append(option.default)
+    return completed_words
 
 
 class OptionalValueCommand(TyperCommand):

@@ -322,7 +322,7 @@ class _ProgressLines:
         self._next_line_s = time.monotonic() + PROGRESS_LINE_INTERVAL_S
 
     def __call__(self, title: str, done: int, total: int, note: str) -> None:
-        """Print a line that `done` of `total` steps are complete, unless the latest line is too recent."""
+        """Print how many of the `total` steps are complete, unless the latest line is too recent."""
         if time.monotonic() >= self._next_line_s:
             self._next_line_s = time.monotonic() + PROGRESS_LINE_INTERVAL_S
             say(f"{title}: {done} of {total} {note}".rstrip())
@@ -358,7 +358,9 @@ def _progress_bars() -> Iterator[Listener]:
         bar_of_title: dict[str, TaskID] = {}
 
         def update_bar(title: str, done: int, total: int, note: str) -> None:
-            """Show that `done` of `total` steps are complete in the bar with this title. Create the bar if necessary.
+            """In the bar with the given title, show that `done` of `total` steps are complete.
+
+            If there is no bar with this title, create it.
 
             If fewer steps are complete than before, the work has started again. The bar then also starts again.
 

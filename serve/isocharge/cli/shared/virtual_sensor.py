@@ -60,7 +60,7 @@ def film_charges(forward_map: ForwardMap) -> Charges:
 
 
 def film_charges_per_K(forward_map: ForwardMap) -> Charges | None:
-    """Return the function that computes how much the touch charges of contacts change per kelvin of warming, pC/K.
+    """Return the function that computes the change of the touch charges per kelvin of warming, pC/K.
 
     The result is None if the temperature of the film does not change the pretension of the film. If the temperature
     changes the pretension, further presses are simulated in order to determine the effect.

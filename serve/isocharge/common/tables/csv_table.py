@@ -1,8 +1,8 @@
 """Reading and writing of columns of numbers as CSV text.
 
 A line that begins with # is a comment, unless the line is a part of a quoted cell. Blank lines are ignored. Blanks
-before and after a name or a number are also ignored. Numbers must have a decimal point, and not a decimal comma. The
-texts `nan` and `inf` are not accepted.
+before and after a name or a number are also ignored. Numbers must be written with a decimal point, not with a decimal
+comma. The texts `nan` and `inf` are not accepted.
 """
 
 import codecs
@@ -166,13 +166,13 @@ def csv_text(columns: Mapping[str, Array]) -> str:
     Args:
         columns: Columns by their names, each of shape (n,).
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(columns)  # the keys of `columns`, which are the names
     rows = np.column_stack(list(columns.values()))  # shape (n, n_column)
     for row in rows.tolist():
         writer.writerow("" if math.isnan(value) else repr(value) for value in row)
-    return text.getvalue()
+    return buffer.getvalue()
 
 
 class _LinesWithoutComments:
@@ -277,7 +277,7 @@ def _decoding_advice(cause: UnicodeDecodeError, lines_before: int) -> str:
 
 
 def _other_format_advice(data: bytes) -> str | None:
-    """Return advice if a file has another format than CSV text in UTF-8; None if its format is not recognised.
+    """Return advice for a file that is not CSV text in UTF-8, or None if its format is not recognised.
 
     Args:
         data: First bytes of the file.
@@ -300,7 +300,7 @@ def _is_comment(line: str, names: Collection[str]) -> bool:
 
 
 def _number(cell: str) -> float | None:
-    """Return the number in a cell; NaN if the cell is empty, and None if it does not contain a finite number."""
+    """Return the number in a cell. The result is NaN for an empty cell, and None for a cell without a finite number."""
     text = cell.strip()
     if not text:
         return math.nan

@@ -45,7 +45,7 @@ class ColumnMeaning:
     is_known_by_unit: bool = False
 
 
-def header_advice(columns: Iterable[str], absent: Mapping[str, ColumnMeaning]) -> Iterator[str]:
+def header_advice(columns: Iterable[str], absent_columns: Mapping[str, ColumnMeaning]) -> Iterator[str]:
     """Yield advice for each column of a file that is probably a missing column under another name.
 
     If several columns of the file resemble the same missing column, advice is given only for the first of these
@@ -53,22 +53,22 @@ def header_advice(columns: Iterable[str], absent: Mapping[str, ColumnMeaning]) -
 
     Args:
         columns: Names of the columns of the file that have no meaning.
-        absent: Meanings of the missing columns, by the names of the missing columns.
+        absent_columns: Meanings of the missing columns, by the names of the missing columns.
     """
-    remaining = dict(absent)  # missing columns for which no advice was given yet
+    remaining_columns = dict(absent_columns)  # missing columns for which no advice was given yet
     for column in columns:
         if len(column) > MAX_COLUMN_CHARACTERS:  # such a long text is not the name of a quantity
             continue
-        for name, meaning in remaining.items():
+        for name, meaning in remaining_columns.items():
             advice = _advice(column, name, meaning)
             if advice:
                 yield advice
-                del remaining[name]  # the `break` ends the loop, so the change of the dictionary does no harm
+                del remaining_columns[name]  # the `break` ends the loop, so the change of the dictionary does no harm
                 break
 
 
 def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
-    """Return advice if a column of a file is probably a given missing column; return an empty text otherwise.
+    """If a column of a file is probably a given missing column, return advice. Otherwise return an empty text.
 
     Three kinds of names are recognised. A name of the first kind differs from the missing name only by capital letters.
     A name of the second kind consists of words that mean the missing column. A name of the third kind consists of such

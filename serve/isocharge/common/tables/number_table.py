@@ -183,8 +183,8 @@ class NumberTable(ABC):
         missing_names = [name for name in required if name not in self.header]
         if missing_names:
             # The file may contain a missing column under another name. The message then contains advice.
-            absent = {name: rule.meaning for name, rule in known_rules.items() if name not in self.header}
-            advice = islice(header_advice(other_columns, absent), MAX_LISTED_NAMES)
+            absent_columns = {name: rule.meaning for name, rule in known_rules.items() if name not in self.header}
+            advice = islice(header_advice(other_columns, absent_columns), MAX_LISTED_NAMES)
             self._refuse_header("; ".join([f"missing: {_listed(missing_names)}", *advice]))
 
         repeated_names = [name for name in chosen_rules if self.header.count(name) > 1]
@@ -203,8 +203,8 @@ class NumberTable(ABC):
         Raises:
             error: If a column has such a name. The column is probably an optional column whose name is misspelt.
         """
-        absent = {name: rule.meaning for name, rule in optional.items() if name not in self.header}
-        advice = list(islice(header_advice(columns, absent), MAX_LISTED_NAMES))
+        absent_columns = {name: rule.meaning for name, rule in optional.items() if name not in self.header}
+        advice = list(islice(header_advice(columns, absent_columns), MAX_LISTED_NAMES))
         if advice:
             self._refuse_header(f"{'; '.join(advice)}; or remove the column")
 

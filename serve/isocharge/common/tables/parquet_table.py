@@ -119,7 +119,7 @@ class ParquetTable(NumberTable):
         return numbers
 
     def _decode(self, index: int, name: str) -> Array:
-        """Decode one column in batches of rows, which limits the memory.
+        """Decode one column in batches of rows, in order to limit the memory.
 
         Args:
             index: Index under which Parquet stores the column.
@@ -133,15 +133,15 @@ class ParquetTable(NumberTable):
         """
         row_count = self._metadata.num_rows  # the number of rows that the metadata declare
         numbers = np.empty(row_count)
-        decoded_rows = 0  # number of rows that are decoded
+        decoded_row_count = 0  # number of rows that are decoded
         all_groups = list(range(self._metadata.num_row_groups))
         for batch in self._parquet.reader.iter_batches(ROWS_PER_BATCH, all_groups, [index], use_threads=False):
-            batch_end = decoded_rows + batch.num_rows
+            batch_end = decoded_row_count + batch.num_rows
             if batch_end > row_count:  # the column has more rows than the metadata declare
                 break
-            numbers[decoded_rows:batch_end] = _as_float64(batch.column(0))  # the only column of the batch
-            decoded_rows = batch_end
-        if decoded_rows != row_count:
+            numbers[decoded_row_count:batch_end] = _as_float64(batch.column(0))  # the only column of the batch
+            decoded_row_count = batch_end
+        if decoded_row_count != row_count:
             raise self.error(
                 f"{self.where}, column {shown(name)}: expected {row_count:,} rows as in the metadata of the file, got "
                 "another number; the file is damaged, write it again"
@@ -251,7 +251,7 @@ def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
 
 @contextmanager
 def _pyarrow_errors_converted(where: str, error: type[InputError]) -> Iterator[None]:
-    """Convert all exceptions that pyarrow raises for a damaged file in the `with` block to one class of errors.
+    """If pyarrow raises an exception for a damaged file in the `with` block, raise a given error instead.
 
     Args:
         where: Name of the file, for the error message.

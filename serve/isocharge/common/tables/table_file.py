@@ -68,7 +68,7 @@ def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
 
 @contextmanager
 def _os_errors_converted(path: Path, error: type[InputError], expected: str) -> Iterator[None]:
-    """Convert an OSError that the `with` block raises to an error of a given class.
+    """If the `with` block raises an OSError, raise an error of a given class instead.
 
     Args:
         path: The file, for the error message.

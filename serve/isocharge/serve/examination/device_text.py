@@ -25,8 +25,7 @@ def device_text(examination: Examination) -> str:
     """Return the device file of a board as TOML text.
 
     The file begins with comments that describe the board. The section `[gain]` comes last. If the channels are not in
-    pC, the section ends with lines for the conversion to pC. The lines for the conversion are comments, which the user
-    completes.
+    pC, this section ends with comments for the conversion to pC, which the user completes.
 
     Args:
         examination: Result of the port check, with the content of the device file.
@@ -48,7 +47,7 @@ def device_text(examination: Examination) -> str:
 
 
 def _description(examination: Examination) -> Iterator[str]:
-    """Yield comments for the device file that describe what the board sends.
+    """For the device file, yield comments that describe what the board sends.
 
     Args:
         examination: Result of the port check.

@@ -79,7 +79,7 @@ class ElectrodeCheck:
 
 
 def _order_sentence(expected_channels: Mapping[str, str], found_channels: Mapping[str, str]) -> str:
-    """Return a sentence that states whether the channels are swapped, turned, or in another order.
+    """Return a sentence about the order of the channels, which may be swapped, turned or otherwise different.
 
     The channels are turned if the channels of all electrodes are shifted by the same number of electrodes around the
     film. For example, the channels of A, B and C are turned by one place if the presses near A, B and C change the
@@ -94,12 +94,12 @@ def _order_sentence(expected_channels: Mapping[str, str], found_channels: Mappin
     if not wrong_electrodes:
         return "every channel belongs to its electrode"
 
-    # For each electrode that was pressed, find the electrode to which the answering channel was assumed to belong.
+    # For each electrode that was pressed, find the electrode to which the found channel was assumed to belong.
     expected_electrode = {channel: electrode for electrode, channel in expected_channels.items()}
     assumed_electrodes = []
     for electrode in electrodes:
-        answering_channel = found_channels[electrode]
-        assumed_electrodes.append(expected_electrode[answering_channel])
+        found_channel = found_channels[electrode]
+        assumed_electrodes.append(expected_electrode[found_channel])
 
     # With two electrodes, turned channels are also swapped. "Swapped" is the simpler description.
     if len(electrodes) > 2:
@@ -120,7 +120,7 @@ def check_electrodes(
     ask: Callable[[str], None],
     timeout_s: float = PRESS_TIMEOUT_S,
 ) -> ElectrodeCheck:
-    """Ask the user for a press near each electrode in turn, and find the channel that changes most under each press.
+    """For each electrode, ask the user for a press near it, and find the channel that changes most under this press.
 
     Args:
         port: The open port.
@@ -160,11 +160,10 @@ def check_electrodes(
 
 
 def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
-    """Find the channel that changes most under the press near each electrode.
+    """For each electrode, find the channel that changes most under the press near the electrode.
 
-    The changes depend on the forces of the presses and on the gains of the channels. In order to remove the effects of
-    the forces and the gains, the rows and the columns of the matrix of changes are divided alternately by their means
-    (Sinkhorn and Knopp 1967).
+    The changes depend on the forces of the presses and on the gains of the channels. To remove these effects, the rows
+    and the columns of the matrix of changes are divided alternately by their means (Sinkhorn and Knopp 1967).
 
     Args:
         changes: Change of each channel under the press near each electrode, shape (electrodes, channels), any unit.
@@ -200,7 +199,7 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
 
 
 def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str, Any]:
-    """Return the content of a device file in which each electrode has the channel that the presses have shown.
+    """Assign the channels found by the presses to the electrodes, and return the new content of a device file.
 
     Settings of single electrodes, such as gains and offsets, belong to the amplifiers, so they are moved together with
     the channels.
@@ -212,13 +211,13 @@ def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str
     # Each electrode receives the settings of the electrode to which its channel was assumed to belong.
     expected_electrode = {channel: electrode for electrode, channel in check.expected.items()}
     source_electrode = {electrode: expected_electrode[channel] for electrode, channel in check.found.items()}
-    corrected = {name: _reassigned_settings(section, source_electrode) for name, section in table.items()}
-    corrected["channels"] = dict(check.found)
-    return corrected
+    corrected_sections = {name: _reassigned_settings(section, source_electrode) for name, section in table.items()}
+    corrected_sections["channels"] = dict(check.found)
+    return corrected_sections
 
 
 def _reassigned_settings(section: Any, source_electrode: Mapping[str, str]) -> Any:
-    """Return a section of a device file in which each electrode receives the settings of a given electrode.
+    """Move settings between electrodes in a section of a device file, and return the new section.
 
     A setting with one value for each electrode is a table, such as `offset = {A = 1.0, B = 2.0}`. All other settings
     are returned unchanged.
@@ -229,14 +228,14 @@ def _reassigned_settings(section: Any, source_electrode: Mapping[str, str]) -> A
     """
     if not isinstance(section, Mapping):
         return section
-    reassigned = {}
+    reassigned_section = {}
     for key, setting in section.items():
         is_for_each_electrode = isinstance(setting, Mapping) and set(setting) == set(source_electrode)
         if is_for_each_electrode:
-            reassigned[key] = {electrode: setting[source] for electrode, source in source_electrode.items()}
+            reassigned_section[key] = {electrode: setting[source] for electrode, source in source_electrode.items()}
         else:
-            reassigned[key] = setting
-    return reassigned
+            reassigned_section[key] = setting
+    return reassigned_section
 
 
 class _Blocks:
@@ -257,7 +256,7 @@ class _Blocks:
     def next_block(self, deadline_s: float) -> tuple[Array, Array] | None:
         """Collect the frames of one block of time, and return the median and the noise of each channel.
 
-        A block lasts for `BLOCK_S`, or longer until a first frame has arrived.
+        A block lasts for `BLOCK_S`, or longer if no frame has arrived during this time.
 
         Args:
             deadline_s: Time on the monotonic clock until which the function waits for frames, s.
@@ -361,8 +360,8 @@ def _wait_for_rest(blocks: _Blocks, electrode: str, deadline_s: float, timeout_s
     recent_blocks: deque[tuple[Array, Array]] = deque(maxlen=REST_BLOCKS)
     while (block := blocks.next_block(deadline_s)) is not None:
         recent_blocks.append(block)
-        levels = np.array([level for level, _ in recent_blocks])  # shape (blocks, channels)
-        noise = np.median([block_noise for _, block_noise in recent_blocks], axis=0)
+        levels = np.array([level for level, _block_noise in recent_blocks])  # shape (blocks, channels)
+        noise = np.median([block_noise for _level, block_noise in recent_blocks], axis=0)
         variation = np.ptp(levels, axis=0)  # largest minus smallest level of each channel
         change_of_press = CHANGE_SIGMAS * noise  # smallest change that counts as the beginning of a press
         is_quiet = bool(np.all(variation <= 0.5 * change_of_press))

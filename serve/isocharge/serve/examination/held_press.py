@@ -3,8 +3,8 @@
 The description states whether the charge of the press is constant, leaks, creeps or drifts.
 
 The gain of the board may be unknown. A press is therefore not recognised by a charge in pC, but by the first large
-change of the channels within 0.2 s. The size of the press is the projection of the channels onto the direction of this
-change, minus the rest level before the press. If the rest level drifts, it is extrapolated along a straight line.
+change of the channels within 0.2 s. The size of the press is the projection of the channel values onto the direction of
+this change, minus the rest level before the press. If the rest level drifts, it is extrapolated along a straight line.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ END_BLOCKS = 5
 
 @dataclass(frozen=True)
 class HeldPress:
-    """A press that was held during the port check, and the settings that correct the change of its charge.
+    """A press that was held during the port check, and settings that correct the change of its charge.
 
     Attributes:
         begin_s: Time at which the press began, s since the first frame.
@@ -150,7 +150,7 @@ def _find_step(levels: Array) -> _Step:
 def _extrapolate_rest(
     component: Reals, block_times_s: Reals, rest_blocks: int, step_size: float
 ) -> tuple[Reals, float]:
-    """Extrapolate the rest level, which was measured before a press, to the time of the press.
+    """Extrapolate the rest level from the time before a press to the time of the press.
 
     A straight line is fitted to the blocks before the press. The line is used if its slope is significant and so large
     that it would affect the description of the press. If the line is not used, the rest level is the mean of the blocks
@@ -204,10 +204,10 @@ def _block_means(values: Array, times_s: Array) -> Array | None:
 
 
 def _end_of_press(component: Array, settled_block: int, step_size: float) -> int:
-    """Return the number of the block at which the press ends.
+    """Return the index of the block at which the press ends.
 
-    The press ends where the component first falls by a large part of the step within two blocks. If the component never
-    falls by so much, the press is held to the end, and the result is the number of all blocks.
+    The press ends when the component first falls by a large part of the step within two blocks. If the component never
+    falls by so much, the press is held to the end, and the result is the total number of blocks.
 
     Args:
         component: Mean of each block, projected onto the change of the channels by the press, shape (blocks,).
@@ -232,7 +232,7 @@ def _with_drift(
     The section `[leak]` of a device file corrects an exponential loss of charge with the time constant `tau_s`, and
     removes the drift at rest as well. If the rest level drifts but the press loses no charge, `tau_s` is set to a value
     that is so large that no loss is corrected. If the press also loses charge exponentially, `[leak]` already has the
-    time constant of the press. The description then asks the user to measure again without a drift.
+    time constant of the press. In this case, the description asks the user to measure again without a drift.
 
     Args:
         description: Description of the press, a sentence.

@@ -1,4 +1,4 @@
-"""Reception of bytes from a port, search for the baud rate of the port, and parsing of the frames."""
+"""Functions that find the baud rate of a port, receive bytes from the port, and parse the frames."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -177,7 +177,7 @@ class Capture:
 
     @property
     def rate_Hz(self) -> float:
-        """Frames per second, Hz; 0 for fewer than two frames, and if their times do not increase."""
+        """Frame rate, Hz; 0 if there are fewer than two frames, or if the times of the frames do not increase."""
         if len(self.frames) < 2:
             return 0.0
         span_s = self.times_s[-1] - self.times_s[0]
@@ -192,7 +192,7 @@ class Capture:
         return channel_names(self.frames[-1]) if self.frames else ()
 
     def values(self) -> tuple[Array, Array]:
-        """Return the values of all frames that have as many channels as the last frame, and their times.
+        """Return the values and the times of all frames that have as many channels as the last frame.
 
         Frames with another number of channels are left out, because the values form one array.
 

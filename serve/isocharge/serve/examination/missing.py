@@ -129,7 +129,7 @@ def _channel_count_sentences(findings: BoardFindings) -> Iterator[str]:
 
 
 def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
-    """Yield a sentence for each property of the charges of a channel that prevents a tare or disturbs the contact.
+    """Yield a sentence for each problem of a channel that prevents a tare or makes contacts inaccurate.
 
     The tare is the measurement of the charge at rest. A tare requires a small noise and a small offset of each channel.
 
@@ -166,7 +166,7 @@ def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
 
 
 def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield a sentence for each missing setting or property without which the force of a held press seems to change.
+    """Yield sentences about settings and properties whose lack makes the force of a held press seem to change.
 
     The settings correct the leak of the amplifiers. Touches are also computed without these settings.
 
@@ -179,15 +179,15 @@ def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
     if not findings.capture.frames:
         return
     device = findings.device
-    held = findings.held
+    held_press = findings.held
     has_device_clock = findings.capture.frames[0].t_us is not None
     if device.leak is not None and not has_device_clock:
         yield (
             "send the time of a device clock in each frame (t_us, t_ms or t_s): without it the leak is corrected with "
             "the arrival times, which jitter"
         )
-    if held is not None:
-        for name, section in held.sections.items():
+    if held_press is not None:
+        for name, section in held_press.sections.items():
             if name not in device.table:  # the device file has no such section yet
                 yield f"put {section_text(name, section)} into a device file"
     elif device.leak is None:

@@ -182,19 +182,23 @@ def examine_received(
     capture = read_frames(received, device)
     unit = "pC" if device.gain is not None else unit_of(capture)
     electrode_at_position = electrode_positions(capture, device)
-    unused = tuple(name for position, name in enumerate(capture.names) if position not in electrode_at_position)
-    held = find_held_press(*capture.values()) if capture.frames else None
-    rest_end_s = math.inf if held is None else held.begin_s  # the film is at rest until a held press begins
+    unused_channels = tuple(
+        name for position, name in enumerate(capture.names) if position not in electrode_at_position
+    )
+    held_press = find_held_press(*capture.values()) if capture.frames else None
+    rest_end_s = math.inf if held_press is None else held_press.begin_s  # the film is at rest until a held press begins
     channels = tuple(_measure_channels(capture, device, electrode_at_position, rest_end_s))
-    touch_sentence = _touch_sentence(capture, device, electrode_at_position, held, unit)
+    touch_sentence = _touch_sentence(capture, device, electrode_at_position, held_press, unit)
 
     # Complete the device file, and test whether the film can be tared with its settings. Proposed offsets that were
     # measured on a touched film are wrong.
-    table = _completed_table(proposal.table, held, without_offsets=is_proposed and bool(touch_sentence))
-    findings = BoardFindings(capture, channels, unused, device, proposal.electrodes, unit, held, touch_sentence)
+    table = _completed_table(proposal.table, held_press, without_offsets=is_proposed and bool(touch_sentence))
+    findings = BoardFindings(
+        capture, channels, unused_channels, device, proposal.electrodes, unit, held_press, touch_sentence
+    )
     electrode_names = proposal.electrodes or tuple(electrode_at_position.values())
     is_at_rest = bool(electrode_at_position) and not touch_sentence
-    works = is_at_rest and _can_be_tared(received, table, electrode_names)
+    can_be_tared = is_at_rest and _can_be_tared(received, table, electrode_names)
 
     # The first frame shows whether the frames have a number and a time. Without frames, both are None.
     first_frame = capture.frames[0] if capture.frames else Frame(None, None, ())
@@ -214,44 +218,46 @@ def examine_received(
         device_clock=first_frame.t_us is not None,
         unit=unit,
         channels=channels,
-        unused=unused,
-        held="" if held is None else held.description,
+        unused=unused_channels,
+        held="" if held_press is None else held_press.description,
         touch=touch_sentence,
         missing=tuple(missing_sentences(findings)),
         missing_for_held_presses=tuple(held_press_sentences(findings)),
-        works=works,
+        works=can_be_tared,
         device=table,
     )
 
 
-def _completed_table(table: Mapping[str, Any], held: HeldPress | None, *, without_offsets: bool) -> dict[str, Any]:
+def _completed_table(
+    table: Mapping[str, Any], held_press: HeldPress | None, *, without_offsets: bool
+) -> dict[str, Any]:
     """Return the content of a device file, completed with the sections that follow from a held press.
 
     Args:
         table: Sections of the device file by name. They take precedence over the sections of the press.
-        held: The press, with sections that correct the change of its charge; None if there was none.
+        held_press: The press, with sections that correct the change of its charge; None if no press was held.
         without_offsets: Whether the key `offset` of the section `[gain]` is removed. Offsets that were measured on a
             touched film are wrong.
 
     Returns:
         The completed sections by name. The given table is not changed.
     """
-    completed = dict(table)
-    if held is not None:
-        for name, section in held.sections.items():
-            completed.setdefault(name, section)  # keeps a section that the device file already has
-    if without_offsets and "gain" in completed:
-        gain = completed.pop("gain")
+    completed_table = dict(table)
+    if held_press is not None:
+        for name, section in held_press.sections.items():
+            completed_table.setdefault(name, section)  # keeps a section that the device file already has
+    if without_offsets and "gain" in completed_table:
+        gain = completed_table.pop("gain")
         remaining_gain = {key: value for key, value in gain.items() if key != "offset"}
         if remaining_gain:  # an empty section is not valid
-            completed["gain"] = remaining_gain
-    return completed
+            completed_table["gain"] = remaining_gain
+    return completed_table
 
 
 def _touch_sentence(
-    capture: Capture, device: Device, electrode_at_position: Mapping[int, str], held: HeldPress | None, unit: str
+    capture: Capture, device: Device, electrode_at_position: Mapping[int, str], held_press: HeldPress | None, unit: str
 ) -> str:
-    """Return a sentence for the user if the film was touched before any held press; otherwise an empty text.
+    """Return a sentence if the film was touched before any held press; otherwise, return an empty text.
 
     The film should be at rest before a held press.
 
@@ -265,7 +271,7 @@ def _touch_sentence(
     if not capture.frames or not electrode_at_position:
         return ""
     # The last moments before a held press do not count as rest, because the force is already rising.
-    rest_end_s = math.inf if held is None else held.begin_s - PRESS_MARGIN_S
+    rest_end_s = math.inf if held_press is None else held_press.begin_s - PRESS_MARGIN_S
     charges, times_s = _rest_charges(capture, device, electrode_at_position, rest_end_s)
     touch = find_touch(charges, times_s, unit_is_pC=unit == "pC")
     if touch is None:
@@ -282,7 +288,7 @@ def _touch_sentence(
 
 
 def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
-    """Return whether a tare of the film (measurement of its charge at rest) succeeds with a device file.
+    """Return whether a tare succeeds with a device file. A tare is a measurement of the charges at rest.
 
     The result is also true if the device file switches the tare off, or if there are too few frames to judge. Twice as
     many frames as a tare needs are enough to judge. The result is false if there are no frames, or if reading the
@@ -313,7 +319,7 @@ def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: 
 
 
 def electrode_positions(capture: Capture, device: Device) -> dict[int, str]:
-    """Return the name of each electrode by the position of its channel in the frame.
+    """Return a dictionary from the position of each channel in the frame to the name of its electrode.
 
     If the device file has no section `[channels]`, every channel is an electrode with the name of the channel.
     """

@@ -54,8 +54,8 @@ ELECTRODES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 def rest_of(values: Array) -> float:
     """Compute the rest level of a channel, which is the median of its finite values. It is 0 without finite values."""
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if len(finite) else 0.0
+    finite_values = values[np.isfinite(values)]
+    return float(np.median(finite_values)) if len(finite_values) else 0.0
 
 
 def noise_of(values: Array) -> float:
@@ -63,7 +63,7 @@ def noise_of(values: Array) -> float:
 
     Presses have little effect on these differences. If the noise is normally distributed, the median magnitude of a
     difference is 0.6745 * sqrt(2) standard deviations. For coarse counts, most differences may be 0. In this case, the
-    mean magnitude of the differences is used, which is 2 / sqrt(pi) standard deviations.
+    mean magnitude of a difference is used, which is 2 / sqrt(pi) standard deviations.
 
     Args:
         values: Values of the channel, shape (n,), any unit. Values that are not finite are left out.
@@ -71,8 +71,8 @@ def noise_of(values: Array) -> float:
     Returns:
         The standard deviation in the unit of the values; 0 if there are fewer than two finite values.
     """
-    finite = values[np.isfinite(values)].astype(float)
-    differences = np.abs(np.diff(finite))
+    finite_values = values[np.isfinite(values)].astype(float)
+    differences = np.abs(np.diff(finite_values))
     if len(differences) == 0:
         return 0.0
     median_difference = float(np.median(differences))
@@ -122,8 +122,8 @@ def propose(received: ReceivedData, electrodes: tuple[str, ...], gain: Mapping[s
         table["channels"] = {electrode: capture.names[position] for electrode, position in positions.items()}
 
     # Measure the offsets in the frames in which the film is at rest, which end before a held press.
-    held = find_held_press(values, times_s)
-    rest_values = values if held is None else values[times_s < held.begin_s]
+    held_press = find_held_press(values, times_s)
+    rest_values = values if held_press is None else values[times_s < held_press.begin_s]
     rest_columns = {electrode: rest_values[:, position] for electrode, position in positions.items()}
     largest_tared_offset_pC = TareRule().offset_limit_pC  # a tare fails if a channel rests at a larger value
     has_large_offset = any(abs(rest_of(column)) > largest_tared_offset_pC for column in rest_columns.values())
@@ -176,9 +176,9 @@ def unit_of(capture: Capture) -> str:
         return "pC"
     values, _times_s = capture.values()  # shape (frames, channels)
     finite_rows = values[np.isfinite(values).all(axis=1)]  # frames in which all values are finite
-    largest = float(np.abs(finite_rows).max(initial=0.0))
+    largest_magnitude = float(np.abs(finite_rows).max(initial=0.0))
     is_constant = len(finite_rows) == 0 or bool((finite_rows == finite_rows[0]).all())
-    if is_constant and largest <= LARGEST_STILL_PC:
+    if is_constant and largest_magnitude <= LARGEST_STILL_PC:
         return "pC"
     has_whole_numbers = bool((finite_rows == np.round(finite_rows)).all())
     if has_whole_numbers:
@@ -186,7 +186,7 @@ def unit_of(capture: Capture) -> str:
 
     largest_noise = max(noise_of(column) for column in finite_rows.T)
     names_state_volts = all(name.endswith("V") for name in capture.names)
-    has_values_of_volts = largest <= LARGEST_V and 0.0 < largest_noise <= LARGEST_NOISE_V
+    has_values_of_volts = largest_magnitude <= LARGEST_V and 0.0 < largest_noise <= LARGEST_NOISE_V
     if names_state_volts or has_values_of_volts:
         return "V"
     return "pC"
@@ -273,9 +273,9 @@ def _channels_of_similar_noise(values: Array, candidates: list[int], count: int)
 def _offset_setting(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, Any]:
     """Return the setting `offset` of the section `[gain]`, which contains the values of the channels without charge.
 
-    If a channel rests near half of the range of a converter, half of the range is its offset. For a channel with
-    another rest level, the measured rest level is the offset. If the difference between offset and rest level would
-    prevent a tare at any electrode, the measured rest levels are used for all electrodes.
+    If a channel rests near half of the range of a converter, half of the range is its offset. For any other rest level,
+    the offset of the channel is the measured rest level. If the difference between offset and rest level would prevent
+    a tare at any electrode, the measured rest levels are used for all electrodes.
 
     Args:
         columns: Values of the channel of each electrode at rest, each of shape (n,), in the unit of the board.
@@ -306,7 +306,7 @@ def _offset_setting(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> di
 
 
 def _zero_limits(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, float]:
-    """Return the largest magnitude of the rest level of each electrode that counts as 0, in the unit of the board.
+    """For each electrode, return the largest rest level (magnitude) that counts as 0, in the unit of the board.
 
     If the gain is known, the limit is half of the largest offset that a tare accepts. If the gain is not known, the
     limit is derived from the noise.
@@ -322,7 +322,7 @@ def _zero_limits(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[
 
 
 def _largest_charge_of_unit(gain: Mapping[str, Any]) -> float:
-    """Compute an upper limit for the magnitude of the charge of one unit of the board, pC.
+    """Compute an upper limit for the magnitude of the charge that corresponds to one unit of the board, pC.
 
     The charge of one unit is `pC_per_unit`, or the product of `V_per_unit` and `feedback_pF`. The limit is valid for
     all electrodes. The limit can be larger than the charge of any electrode, because the largest values of the two
@@ -348,14 +348,14 @@ def _proposed_offset(column: Array) -> float | int:
     Args:
         column: Values of the channel at rest, shape (n,).
     """
-    rest = rest_of(column)
+    rest_level = rest_of(column)
     has_whole_numbers = bool((column == np.round(column)).all())
     if has_whole_numbers:
         for bits in CONVERTER_BITS:
             half_range = 1 << (bits - 1)  # 2^(bits - 1)
-            if abs(rest - half_range) <= HALF_SCALE_SHARE * half_range:
+            if abs(rest_level - half_range) <= HALF_SCALE_SHARE * half_range:
                 return half_range
-    return _round_rest_level(rest)
+    return _round_rest_level(rest_level)
 
 
 def _round_rest_level(rest: float) -> float | int:

@@ -38,7 +38,7 @@ MAX_SLOW_CHANGE_PC = 100.0
 
 
 class TouchFound(NamedTuple):
-    """The touched channel, and the largest change of its charge while the film should be at rest.
+    """A touched channel, and the largest change of its charge during the time when the film should be at rest.
 
     Attributes:
         position: Position of the channel in the frame.
@@ -73,10 +73,10 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
     # Smooth the blocks with the median of three consecutive blocks. The result has the shape (blocks - 2, channels).
     smoothed = np.median([blocks[:-2], blocks[1:-1], blocks[2:]], axis=0)
     touches: list[TouchFound] = []
-    for position, channel_levels in enumerate(smoothed.T):
+    for channel_index, channel_levels in enumerate(smoothed.T):
         if not np.isfinite(channel_levels).all():
             continue
-        min_change = _smallest_touch(values[:, position], unit_is_pC)
+        min_change = _smallest_touch(values[:, channel_index], unit_is_pC)
 
         # Compute the change of the channel within each window of half a second, and during the whole time.
         windows = sliding_window_view(channel_levels, min(STEEP_BLOCKS, len(channel_levels)))
@@ -87,7 +87,7 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
         if is_fast_touch or is_slow_touch:
             # A window begins one block later than its index, because smoothing has removed the first block.
             middle_block = int(np.argmax(window_changes)) + STEEP_BLOCKS // 2 + 1
-            touches.append(TouchFound(position, total_change, BLOCK_S * middle_block))
+            touches.append(TouchFound(channel_index, total_change, BLOCK_S * middle_block))
     return max(touches, key=lambda touch: touch.change, default=None)
 
 

@@ -1,9 +1,9 @@
 """Conversion of prediction records to ROS 2 messages: the wrench of a press, the pose of a press, and a record as text.
 
-The name of the coordinate frame of the messages is the field `frame_id` of the record. This field is the name of the
-sensor, unless the user has given the film another name. The section Coordinates of README.md defines the origin and the
-axes x and y of this coordinate frame. ROS requires right-handed coordinate frames. The axis z therefore points from the
-film towards the probe, against the direction of the push.
+The name of the coordinate frame of the messages is the field `frame_id` of the record. The field `frame_id` is the name
+of the sensor, unless the user has given the film another name. The section Coordinates of README.md defines the origin
+and the axes x and y of this coordinate frame. ROS requires right-handed coordinate frames. The axis z therefore points
+from the film towards the probe, against the direction of the push.
 
 The wrench is the load of the probe on the film. If a probe presses with the force F at (x, y), the wrench has the force
 (0, 0, -F) and the torque (-y F, x F, 0) about the origin. The pose is the point of contact in the plane of the unloaded
@@ -12,8 +12,8 @@ model reports. If contacts are tracked, the wrench and the pose describe the tra
 record as text also contains the contact that was estimated from the single frame.
 
 The messages are encoded in CDR, the binary format of ROS 2. The messages of the wrench and of the pose consist of a
-header and numbers of double precision. This module has its own encoder, because the encoder of `mcap-ros2-support` is
-available only as a part of a writer, which is much slower and cannot write JSON. The tests decode the messages with
+header and numbers of double precision. This module has its own encoder. The encoder of `mcap-ros2-support` is available
+only as a part of a writer that is much slower and cannot write JSON. The tests decode the messages with
 `mcap-ros2-support` and with rosbags.
 """
 

@@ -1,9 +1,10 @@
-"""Encoding and decoding of the binary frames of isocharge, which have the byte stuffing COBS.
+"""Encoding and decoding of the binary frames of isocharge, which use the byte stuffing COBS.
 
 The fields of a frame are, in this order: version (u8), frame counter (u16), clock in us (u32), number n of charges
 (u8), flags (u8), n charges in pC (f32), and checksum (u16). All numbers are little-endian. The checksum is the
-CRC-16/CCITT-FALSE of all bytes before it. Each frame ends with a zero byte, and COBS ensures that no other byte of a
-frame is zero. If bytes are damaged, the parser therefore continues with the frame that begins after the next zero byte.
+CRC-16/CCITT-FALSE of all bytes before the checksum. Each frame ends with a zero byte, and COBS ensures that no other
+byte of a frame is zero. If bytes are damaged, the parser therefore continues with the frame that begins after the next
+zero byte.
 """
 
 import binascii
@@ -38,7 +39,7 @@ MAX_STUFFED_LENGTH = MAX_FRAME_LENGTH + 1 + MAX_FRAME_LENGTH // MAX_BLOCK
 
 
 def encode_frame(frame: Frame) -> bytes:
-    """Encode a frame as bytes, including its delimiter. A missing counter or clock is encoded as zero.
+    """Encode a frame as bytes, and append the delimiter. A missing counter or clock is encoded as zero.
 
     Raises:
         struct.error: If a number does not fit its field.

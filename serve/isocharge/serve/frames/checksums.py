@@ -1,9 +1,9 @@
-"""Checksums of frames, under the names that catalogues and manuals use for them.
+"""Checksums of frames, under the names that catalogues and manuals use.
 
 A cyclic redundancy check (CRC) is described by the parameters that Williams defines in "A painless guide to CRC error
-detection algorithms" (1993). Names and parameters are taken from Cook's catalogue of parametrised CRC algorithms. This
-catalogue also lists other names, for example CRC-16/IBM-3740 for CRC-16/CCITT-FALSE. A device file can describe a CRC
-that has no name here by its parameters.
+detection algorithms" (1993). Names and parameters are taken from Cook's catalogue of parametrised CRC algorithms. The
+catalogue also lists alternative names, for example CRC-16/IBM-3740 for CRC-16/CCITT-FALSE. If a CRC has no name in this
+module, a device file can state the parameters of the CRC.
 """
 
 from collections.abc import Callable
@@ -34,13 +34,13 @@ class Crc:
     def table(self) -> tuple[int, ...]:
         """Lookup table with one entry for each of the 256 possible values of a byte.
 
-        The entry of a byte is the value of the register after this byte, if the register was zero before.
+        The entry for a byte is the register value that results if the byte is processed with a register of zero.
         """
         return tuple(map(self._table_entry, range(256)))
 
     @cached_property
     def initial_register(self) -> int:
-        """The initial value `start`, with its bits in the order of the register."""
+        """Initial value of the register, with the bits of `start` in the order of the register."""
         return self._in_register_order(self.start)
 
     def _in_register_order(self, number: int) -> int:
@@ -51,11 +51,11 @@ class Crc:
         return int(bits[::-1], 2)
 
     def _table_entry(self, byte: int) -> int:
-        """Compute the value of the register after one byte, if the register was zero before this byte.
+        """Compute the register value that results if one byte is processed with a register of zero.
 
-        The register of `width` bits contains the remainder of a division by the polynomial. The register is shifted by
-        one bit for each bit of the byte. If the bit that leaves the register is 1, the polynomial is subtracted from
-        the register. All coefficients are computed modulo 2, so the subtraction is an exclusive or.
+        The register has `width` bits, and contains the remainder of a division by the polynomial. For each bit of the
+        byte, the register is shifted by one bit. If the bit that leaves the register is 1, the polynomial is subtracted
+        from the register. The subtraction is an exclusive or, because all coefficients are computed modulo 2.
         """
         polynomial = self._in_register_order(self.polynomial)
         if self.reflected:  # the byte enters at the low end of the register, and its lowest bit leaves first
@@ -81,10 +81,10 @@ class Crc:
     def __call__(self, data: bytes) -> int:
         """Compute the check value of a sequence of bytes.
 
-        For each byte, the register is shifted by 8 bits. The 8 bits that leave the register are combined with the byte
-        by an exclusive or. This operation gives the index of an entry in `table`. The entry is combined with the
-        shifted register by another exclusive or. After the last byte, the register is combined with the value `final`
-        by an exclusive or as well.
+        For each byte, the register is shifted by 8 bits. The exclusive or of the byte and the 8 bits that leave the
+        register is the index of an entry in `table`. The exclusive or of this entry and the shifted register is the new
+        value of the register. After the last byte, the check value is the exclusive or of the register and the value
+        `final`.
         """
         table = self.table
         register = self.initial_register
@@ -106,8 +106,8 @@ class Crc:
 def _fletcher_16(data: bytes) -> int:
     """Compute Fletcher's checksum (1982), which has two bytes.
 
-    The low byte of the checksum is the sum of all data bytes, modulo 255. The high byte is the sum of all values that
-    the low byte had after each data byte, modulo 255.
+    The low byte of the checksum is the sum of all data bytes, modulo 255. The high byte is the sum of the successive
+    values of the low byte after each data byte, modulo 255.
     """
     byte_sum = 0
     sum_of_sums = 0

@@ -1,6 +1,6 @@
 """Frame formats that a device file can select with the key `format` of its section `[frames]`.
 
-Each class of a section declares the keys of one format, and creates the parser of this format.
+Each format has a section class, which declares the keys of the format and creates the parser.
 """
 
 import re
@@ -34,8 +34,9 @@ class AutoParser(Parser):
         """Return the frames that end within `data`.
 
         Until the format is recognised, the data are split into pieces. A piece ends with a zero byte or a line feed,
-        because one of these bytes ends each frame. Each piece is passed to the parsers of all formats. As soon as one
-        of the parsers finds a frame, all further data are passed to this parser alone.
+        because every frame ends with one of these two bytes. Each piece is passed to the parsers of all formats. As
+        soon as one of the parsers finds a frame, all further data are passed only to the parser that has found the
+        frame.
         """
         is_recognised = len(self._candidates) == 1
         if is_recognised:
@@ -58,10 +59,10 @@ class AutoParser(Parser):
             candidate.reset()
 
     def _feed_recognised(self, parser: Parser, data: bytes) -> list[Frame]:
-        """Pass data to the parser of the recognised format, and return the frames that it finds.
+        """Pass data to the parser of the recognised format, and return the frames that the parser finds.
 
-        The description of the format and the moduli of the counter and the clock are copied from the parser. Both are
-        copied in each call, because the parser may recognise them only after many frames.
+        In each call, the description of the format and the moduli of the counter and the clock are copied from the
+        parser. The values are copied repeatedly, because the parser may determine them only after many frames.
 
         Args:
             parser: Parser of the recognised format.
@@ -93,7 +94,7 @@ class TextFrames(FrameSection, tag="text", frozen=True):
 
     @property
     def meanings(self) -> Mapping[str, str]:
-        """Meaning of each name that the board uses for its counter or a clock: `seq`, `t_us`, `t_ms` or `t_s`."""
+        """Meaning (`seq`, `t_us`, `t_ms` or `t_s`) of each name that the board uses for its counter or a clock."""
         meanings = {self.seq: "seq", self.t_us: "t_us", self.t_ms: "t_ms", self.t_s: "t_s"}
         return {name: meaning for name, meaning in meanings.items() if name}
 
@@ -105,7 +106,7 @@ class TextFrames(FrameSection, tag="text", frozen=True):
 class AutoFrames(TextFrames, tag="auto", frozen=True):
     """Section for a board that sends either the binary frames of isocharge or lines of text.
 
-    The parser recognises which of these two formats the board sends.
+    The parser recognises which of the two formats the board sends.
     """
 
     def parser(self) -> Parser:

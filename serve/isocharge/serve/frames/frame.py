@@ -1,4 +1,4 @@
-"""Classes that all frame formats have in common, such as the frame and the base classes of the parsers.
+"""Classes that all frame formats share, such as the frame and the base classes of the parsers.
 
 A parser converts bytes to frames, and is independent of the source of the bytes. Except for datagrams, the frames and
 counters do not depend on how the bytes are divided into chunks. A parser stores only a limited number of bytes, even if
@@ -35,7 +35,7 @@ Raw = TypeVar("Raw")
 
 
 class SequenceGaps:
-    """Detector of missing frames, repeated frames and restarts of the board, which compares successive frame counters.
+    """Detector of missing frames, repeated frames and restarts of the board. It compares successive frame counters.
 
     Attributes:
         lost: Number of frames that are missing between received frames.
@@ -54,14 +54,12 @@ class SequenceGaps:
     def reset(self) -> None:
         """Treat the next frame as the first frame of a new connection, so that no gap is counted before this frame.
 
-        The numbers of lost frames, repeated frames and restarts are kept.
+        The counts of lost frames, repeated frames and restarts are not reset.
         """
         self._last_seq = None
 
     def update(self, seq: int | None, modulus: int = SEQ_MODULUS) -> tuple[str, ...]:
-        """Compare the counter of the next frame with the counter of the previous frame.
-
-        Missing frames, repeated frames and restarts are counted.
+        """Compare the counter of the next frame with the counter of the previous frame, and update the counts.
 
         Args:
             seq: Counter of the next frame; None if the format has no counter.
@@ -90,11 +88,11 @@ class SequenceGaps:
 
 
 class CounterWrap:
-    """Estimator of the modulus of a counter in text, which is the value at which the counter wraps to 0.
+    """Estimator of the modulus of a counter that is sent as text.
 
-    The modulus has to be estimated, because text does not show how many bits a counter has. If the counter decreases,
-    it has either wrapped or restarted. A wrap is assumed if the decrease is consistent with one of the moduli that
-    boards usually have.
+    The modulus is the value at which the counter wraps to 0. The modulus has to be estimated, because text does not
+    show how many bits the counter has. A decrease means that the counter has either wrapped or restarted. A wrap is
+    assumed if the decrease is consistent with one of the moduli that boards usually have.
     """
 
     def __init__(self, usual_moduli: Iterable[int], initial_modulus: int, max_step_ratio: int) -> None:
@@ -113,7 +111,7 @@ class CounterWrap:
         self._largest_value = 0
 
     def update(self, value: int | None) -> int:
-        """Process the next value of the counter, and return the present estimate of its modulus.
+        """Process the next value of the counter, and return the present estimate of the modulus.
 
         Args:
             value: Next value of the counter; None if a connection has ended. The value after None is not compared with
@@ -139,10 +137,10 @@ class CounterWrap:
         The result is the smallest usual modulus that is consistent with a wrap. If no usual modulus is consistent with
         a wrap, a restart is assumed, and the present estimate of the modulus is returned.
 
-        A modulus is consistent with a wrap if it is larger than all values so far, and if the step across the wrap is
-        plausible. The step across the wrap is the difference of the last two values, computed modulo this modulus. The
-        step is plausible if it is at most `max_step_ratio` times the last increase and at most half of the modulus. A
-        step of more than half of the modulus would rather be a step back.
+        A modulus is consistent with a wrap if the modulus is larger than all values so far, and if the step across the
+        wrap is plausible. The step across the wrap is the difference of the last two values modulo the tested modulus.
+        The step is plausible if it is at most `max_step_ratio` times the last increase and at most half of the modulus.
+        A step of more than half of the modulus is more likely to be a step back.
 
         Args:
             step: Present value minus previous value, which is negative.
@@ -229,7 +227,7 @@ class ChecksumError(ValueError):
 
 
 class Columns:
-    """Meanings of the numbers in a row: each number is the frame counter, a clock, the flags or a channel.
+    """Meanings of the numbers in a row. Each number is the frame counter, a clock, the flags or a channel.
 
     Args:
         names: Names of all numbers; an empty text for a number without a name.
@@ -245,10 +243,10 @@ class Columns:
     """
 
     def __init__(self, names: Sequence[str], scales: Sequence[float], flags_column: int | None = None) -> None:
-        """Find the columns of the frame counter, of the clock and of the channels by their names.
+        """Use the column names to find the columns of the frame counter, the clock and the channels.
 
         If there are several clocks, the first clock in the order of `TIMES_US` is used, and the other clocks are
-        ignored. Each column that contains neither the counter, nor a clock, nor the flags is a channel.
+        ignored. A column is a channel if it contains neither the counter, nor a clock, nor the flags.
 
         Args:
             names: Names of all columns; an empty text for a column without a name.
@@ -323,7 +321,7 @@ class Parser(ABC):
         self._tail = b""
 
     def _try_decode(self, decode: Callable[[Raw], Frame], raw: Raw, dropped_size: int) -> list[Frame]:
-        """Try to decode one frame, and count either an intact frame or rejected bytes.
+        """Try to decode one frame, and count either an intact frame or a rejected piece.
 
         Args:
             decode: Function that decodes a frame, and raises ValueError or OverflowError if `raw` is not a frame.
@@ -343,7 +341,7 @@ class Parser(ABC):
 
 
 class DelimitedParser(Parser):
-    """Base class of parsers for pieces of bytes that end with a delimiter of one byte.
+    """Base class of parsers that divide the bytes into pieces at a delimiter of one byte.
 
     A piece is a frame or a part of a frame, such as a line of text. Pieces that are too long are dropped.
 
@@ -364,8 +362,8 @@ class DelimitedParser(Parser):
         """Return the frames that end within `data`.
 
         The bytes are divided into pieces at the delimiters. The bytes after the last delimiter are an unfinished piece,
-        which is stored for the next call. If an unfinished piece is longer than `max_length`, it is dropped together
-        with all bytes up to the next delimiter.
+        which is stored for the next call. If an unfinished piece is longer than `max_length`, the piece and all bytes
+        up to the next delimiter are dropped.
         """
         *pieces, tail = (self._tail + data).split(self._delimiter)
         frames = []
@@ -391,12 +389,12 @@ class DelimitedParser(Parser):
     def _parse_piece(self, piece: bytes) -> list[Frame]:
         """Return the frames that a piece completes.
 
-        An implementation must count every piece that it rejects.
+        Implementations of this method must count every piece that they reject.
         """
 
 
 class StuffedParser(DelimitedParser):
-    """Parser of frames with byte stuffing. Every piece that is not empty should be a frame.
+    """Parser of frames with byte stuffing. Every piece is expected to be empty or to be a frame.
 
     Args:
         delimiter: The byte after each frame.
@@ -413,7 +411,7 @@ class StuffedParser(DelimitedParser):
         self._decode = decode
 
     def _parse_piece(self, piece: bytes) -> list[Frame]:
-        """Decode a piece, and return a list with its frame.
+        """Decode a piece, and return a list that contains the frame.
 
         The list is empty if the piece is empty or is not a frame.
         """

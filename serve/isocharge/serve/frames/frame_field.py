@@ -1,4 +1,4 @@
-"""Definition of one field of a frame whose layout is described in a device file."""
+"""Definition of a single field of a frame whose layout is described in a device file."""
 
 import struct
 import sys
@@ -23,7 +23,8 @@ STRUCT_FORMATS = {
 }
 """Format of each type of a field in the notation of the module `struct`.
 
-A number of three bytes is read as bytes, because `struct` has no format for such numbers."""
+A number of three bytes is read as bytes, because `struct` has no format for such numbers.
+"""
 
 LARGEST_FLOATS = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": sys.float_info.max}
 """Largest number that each floating-point type of a field can represent (IEEE 754)."""
@@ -82,7 +83,7 @@ class Field(Settings, frozen=True):
     def struct_format(self) -> str:
         """Format of the field in the notation of the module `struct`.
 
-        For example, the format of four bytes of padding is `4x`.
+        For example, four bytes of padding have the format `4x`.
         """
         if self.kind != PADDING:
             return STRUCT_FORMATS[self.kind]
@@ -123,22 +124,22 @@ class Field(Settings, frozen=True):
         return self.kind.startswith("i")
 
     def holds(self, value: float) -> bool:
-        """Return whether the field can contain a value, which is given in the unit of the channel."""
+        """Return whether the field can contain a given value in the unit of the channel."""
         return self.smallest_count <= value / self.scale <= self.largest_count
 
-    def limited(self, value: float) -> float:
-        """Return the value nearest to `value` that the field can contain.
+    def nearest_value(self, value: float) -> float:
+        """Return the value in the range of the field that is nearest to a given value.
 
         Both values are in the unit of the channel.
         """
-        return self._limited_count(value / self.scale) * self.scale
+        return self._nearest_count(value / self.scale) * self.scale
 
-    def _limited_count(self, count: float) -> float:
-        """Return the number nearest to `count` that is inside the range of the field."""
+    def _nearest_count(self, count: float) -> float:
+        """Return the number in the range of the field that is nearest to a given number."""
         return min(max(count, self.smallest_count), self.largest_count)
 
     def pack(self, value: float, byte_order: ByteOrder) -> float | bytes:
-        """Convert a value to the form in which `struct` can pack it.
+        """Convert a value to a form that the module `struct` can pack.
 
         The result is a number, or bytes for a field of three bytes. A counter or clock in an integer field wraps around
         if it exceeds the range of the field. Every other value is limited to the range of the field.
@@ -157,7 +158,7 @@ class Field(Settings, frozen=True):
         wraps = self.name in (SEQ, *TIMES_US) and not is_float
         if wraps:
             count = (round(count) - self.smallest_count) % self.modulus + self.smallest_count
-        limited_count = self._limited_count(count)
+        limited_count = self._nearest_count(count)
         if is_float:
             return limited_count
         whole_count = round(limited_count)

@@ -19,15 +19,16 @@ the device file contains the following keys.
     ]
 
 The types of the fields are u8, u16, u24, u32, i8, i16, i24, i32, f32, f64 and `pad`. Padding (`pad`) has either a
-`count` of bytes without a meaning, or a constant `value` in hexadecimal, which every frame must contain. For example,
-the constant value can be the length of the frame. The field `seq` is the frame counter. A field with the name `t_us`,
-`t_ms` or `t_s` is the clock. The field `flags` contains bits such as `SATURATED_BIT` (`isocharge.serve.frames.frame`).
-All other fields are channels.
+`count` or a `value`. The `count` is a number of bytes without a meaning. The `value` is a constant in hexadecimal that
+every frame must contain, for example the length of the frame. The field `seq` is the frame counter. A field with the
+name `t_us`, `t_ms` or `t_s` is the clock. The field `flags` contains bits such as `SATURATED_BIT`
+(`isocharge.serve.frames.frame`). All other fields are channels.
 
 If a frame with a sync pattern is damaged, the parser searches for the next sync pattern from the following byte. The
-reason is that the pattern may have occurred by chance inside the data of another frame, and an intact frame may begin a
-few bytes later. With byte stuffing, all bytes between two delimiters are dropped if they are not an intact frame. In a
-datagram, only the damaged frames are dropped, unless the length of the datagram is wrong.
+parser does not skip the length of a frame, because an intact frame may begin only a few bytes later. This happens if
+the pattern has occurred by chance inside another frame. In a stream with byte stuffing, all bytes between two
+delimiters are dropped if they are not an intact frame. In a datagram, only the damaged frames are dropped, unless the
+length of the datagram is wrong.
 """
 
 import struct
@@ -81,7 +82,7 @@ class CrcParameters(Settings, frozen=True):
     final: HexadecimalNumber = "0"
 
     def __post_init__(self) -> None:
-        """Check the numbers, and raise WrongKey for the first number that has more bits than the checksum."""
+        """Check that no number has more bits than the checksum, and raise WrongKey for the first number that does."""
         for key in ("polynomial", "start", "final"):
             text = getattr(self, key)
             has_too_many_bits = int(text, 16) >= 1 << self.width
@@ -102,7 +103,7 @@ class CrcParameters(Settings, frozen=True):
 
 
 class FrameSection(Settings, frozen=True, tag_field="format"):
-    """Keys that the section `[frames]` has for every format. They describe how frames are requested from the board.
+    """Keys of the section `[frames]` that every format has. These keys describe how to request frames from the board.
 
     Attributes:
         request: Bytes that request one frame, in hexadecimal; None for a board that sends frames without a request.
@@ -183,19 +184,19 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     @cached_property
     def channels(self) -> tuple[Field, ...]:
-        """The fields that contain neither the frame counter, nor a clock, nor the flags."""
+        """The fields that are channels, because they contain neither the frame counter, nor a clock, nor the flags."""
         return tuple(self.fields[position] for position, _ in self.columns.channels)
 
     @cached_property
     def check(self) -> Checksum:
-        """The checksum that the key `checksum` selects by a name or describes by the parameters of a CRC."""
+        """The checksum that the key `checksum` selects by name or describes by the parameters of a CRC."""
         if isinstance(self.checksum, str):
             return CHECKSUMS[self.checksum]
         return self.checksum.checksum
 
     @cached_property
     def columns(self) -> Columns:
-        """Meanings of the fields: each field is the frame counter, a clock, the flags or a channel."""
+        """Meanings of the fields. Each field is the frame counter, a clock, the flags or a channel."""
         names = [field.name for field in self.fields]
         scales = [field.scale for field in self.fields]
         flags_column = names.index(FLAGS) if FLAGS in names else None
@@ -203,7 +204,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     @property
     def seq_modulus(self) -> int:
-        """Value at which the field `seq` wraps to 0; `SEQ_MODULUS` if there is no such field."""
+        """Value at which the field `seq` wraps to 0. The value is `SEQ_MODULUS` if there is no field `seq`."""
         position = self.columns.seq_column
         if position is None:  # frames have no counter
             return SEQ_MODULUS
@@ -211,7 +212,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     @property
     def t_us_modulus(self) -> int:
-        """Time in us at which the field of the clock wraps to 0; `T_US_MODULUS` if there is no such field."""
+        """Time in us at which the clock field wraps to 0. The value is `T_US_MODULUS` if there is no clock field."""
         position = self.columns.clock_column
         if position is None:  # frames have no clock
             return T_US_MODULUS
@@ -219,7 +220,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     @cached_property
     def three_byte_fields(self) -> tuple[tuple[int, bool], ...]:
-        """Fields of three bytes, each as its position and whether it is signed.
+        """Fields of three bytes. Each element contains the position of a field and whether the field is signed.
 
         Fields of three bytes are converted separately, because the module `struct` cannot read them as numbers.
         """
@@ -227,7 +228,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     @cached_property
     def constants(self) -> tuple[tuple[int, bytes], ...]:
-        """Constant bytes that follow the sync pattern in every frame, each as a position and the bytes from there on.
+        """Constant bytes that every frame contains after the sync pattern, and the position of these bytes.
 
         Constant bytes are padding for which the device file states a `value`.
         """
@@ -240,7 +241,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         return tuple(constants)
 
     def checksum_of(self, data: bytes) -> bytes:
-        """Compute the checksum that follows `data`, which is a frame without its checksum."""
+        """Compute the checksum of a frame from the bytes of the frame before the checksum."""
         covered_bytes = data[self.checksum_from :]
         value = self.check.compute(covered_bytes)
         byte_order = self.checksum_order or self.byte_order
@@ -288,7 +289,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         return self.columns.frame([0] * len(self.fields))
 
     def encode(self, frame: Frame) -> bytes:
-        """Return the bytes that a board sends for a frame, including byte stuffing and delimiter if there are any.
+        """Return the bytes that a board sends for a frame, including any byte stuffing and delimiter.
 
         The first value of the frame belongs to the first channel, the second value to the second channel, and so on.
 
@@ -337,14 +338,14 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         max_length = 2 * self.length + 2
 
         def decode_stuffed(piece: bytes) -> Frame:
-            """Remove the byte stuffing from a piece, and decode the frame that it contains."""
+            """Remove the byte stuffing from a piece, and decode the frame in the piece."""
             return self.decode(stuffing.decode(piece))
 
         return StuffedParser(stuffing.delimiter, max_length, decode_stuffed, *_parser_arguments(self))
 
 
 def _parser_arguments(layout: FrameLayout) -> tuple[str, int, int]:
-    """Return the description of the format and the two moduli of a layout, which are the arguments of `Parser`."""
+    """Return the arguments of `Parser` for a layout: the description of the format and the two moduli."""
     names = ", ".join(field.name for field in layout.fields)
     return f"described frames of {layout.length} bytes: {names}", layout.seq_modulus, layout.t_us_modulus
 
@@ -360,8 +361,9 @@ class SyncParser(Parser):
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
 
-        A frame may begin wherever the sync pattern occurs. If the bytes from the pattern onwards are not a frame, the
-        search for the pattern continues one byte later. Bytes of an unfinished frame are stored for the next call.
+        A frame may begin at every occurrence of the sync pattern. If the bytes from the pattern onwards are not a
+        frame, the parser continues to search for the pattern one byte later. Bytes of an unfinished frame are stored
+        for the next call.
         """
         sync = self.layout.sync
         length = self.layout.length
@@ -395,9 +397,9 @@ class DatagramParser(Parser):
         self.layout = layout
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames of one datagram, which contains one or several whole frames.
+        """Return the frames that one datagram contains.
 
-        A datagram whose length is not a multiple of the length of a frame is rejected as a whole.
+        If the length of the datagram is not a multiple of the length of a frame, the whole datagram is rejected.
         """
         length = self.layout.length
         has_only_whole_frames = len(data) % length == 0

@@ -1,4 +1,4 @@
-"""Byte stuffing, an encoding in which the byte that separates frames never occurs inside a frame.
+"""Byte stuffing, which ensures that the byte that separates frames never occurs inside a frame.
 
 - COBS (Consistent Overhead Byte Stuffing, Cheshire and Baker 1999) ends each frame with a zero byte. Each zero byte in
   the data is replaced by the distance to the next zero byte. An additional byte at the beginning contains the distance
@@ -30,7 +30,7 @@ class Stuffing(NamedTuple):
 
 
 def cobs_encode(data: bytes) -> bytes:
-    """Encode bytes by COBS, so that the result contains no zero byte.
+    """Encode bytes with COBS, so that the result contains no zero byte.
 
     The result is at most 1 + len(data) // 254 bytes longer than `data`.
     """
@@ -41,11 +41,11 @@ def cobs_encode(data: bytes) -> bytes:
 
 
 def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
-    """Encode a block of bytes without zeros, together with the zero after the block if there is one.
+    """Encode a block of bytes without zeros. If a zero follows the block, encode the zero as well.
 
-    The block is cut into pieces of at most `MAX_BLOCK` bytes. Each piece is preceded by a distance byte, which contains
-    the length of the piece plus 1. A decoder adds a zero after each piece, except after a piece with the distance
-    `MAX_BLOCK` + 1 and after the last piece of a frame.
+    The block is cut into pieces of at most `MAX_BLOCK` bytes. Before each piece, a distance byte contains the length of
+    the piece plus 1. A decoder adds a zero after each piece, with two exceptions: a piece with the distance `MAX_BLOCK`
+    + 1, and the last piece of a frame.
 
     Args:
         block: Bytes that contain no zero.
@@ -67,8 +67,8 @@ def cobs_decode(data: bytes) -> bytes:
     """Decode bytes that `cobs_encode` has encoded.
 
     The data consist of blocks. Each block begins with a distance byte, which is followed by `distance - 1` decoded
-    bytes. A zero is added after the decoded bytes of each block, except after a block with the distance 255 and after
-    the last block.
+    bytes. After the decoded bytes of each block, the decoder adds a zero. No zero is added after a block with the
+    distance 255 or after the last block.
 
     Raises:
         ValueError: If a distance points beyond the end, or `data` contains a zero.
@@ -115,8 +115,8 @@ def _hdlc_encode(data: bytes) -> bytes:
 def _hdlc_decode(piece: bytes) -> bytes:
     """Remove the byte stuffing of HDLC.
 
-    The byte 7D announces a byte in which the encoder has inverted the bit 0x20. The decoder drops the byte 7D, and
-    inverts the bit 0x20 of the following byte again.
+    After the byte 7D, the encoder has inverted the bit 0x20 of the next byte. The decoder therefore drops the byte 7D,
+    and inverts the bit 0x20 of the next byte again.
 
     Raises:
         ValueError: If the byte 7D is not followed by another byte.

@@ -1,20 +1,22 @@
 """Parser for boards that send frames as lines of text.
 
-A board sends either one line for each frame, or a cycle of several lines, each of which contains a part of the frame.
-The parser recognises the layout when lines with the same layout, or the same cycle of lines, have occurred three times
-in succession. From then on, lines with another layout are dropped and counted.
+A board sends each frame either as a single line or as a cycle of several lines. Each line of a cycle contains a part of
+the frame. The parser recognises the layout as soon as the same kind of line, or the same cycle of lines, has occurred
+three times in succession. After the recognition, lines with another layout are dropped and counted.
 
 Reading may start in the middle of a cycle. The lines of a cycle are therefore sorted by name, with the frame counter
-and the clock before the channels. The line that comes first in this order begins the cycle. Reading may also start in
-the middle of a line. The first line is therefore dropped if it contains numbers without names.
+and the clock before the channels. A cycle begins with the line whose name comes first in the sorted order.
 
-Text has no checksum, except for sentences in the style of NMEA 0183. A damaged digit in an otherwise intact line is
-therefore not detected. A line that cannot be parsed but occurs repeatedly, such as the echo of a request, is dropped
-and does not prevent the recognition of the layout.
+Reading may also start in the middle of a line. If the first line contains numbers without names, it is therefore
+dropped.
+
+Text has no checksum, except for sentences in the style of NMEA 0183. The parser therefore cannot detect a damaged digit
+in an otherwise intact line. If the same line occurs repeatedly but cannot be parsed, for example because it is the echo
+of a request, the line is dropped. Such a line does not prevent the recognition of the layout.
 
 A column with the name `seq` is the frame counter. A column with the name `t_us`, `t_ms` or `t_s` is the clock of the
-device. All other columns are channels. The values at which the counter and the clock wrap to 0 are unknown at first.
-The parser estimates each of these values when it observes the first wrap.
+device. All other columns are channels. At first, the values at which the counter and the clock wrap to 0 are unknown.
+The parser estimates the value for the counter or the clock when it observes the first wrap.
 """
 
 from collections.abc import Mapping, Sequence
@@ -62,7 +64,7 @@ class Layout:
     """
 
     def __init__(self, notation: Notation, names: tuple[str, ...], value_count: int, line_count: int = 1) -> None:
-        """Store the layout, and find the columns of the frame counter, the clock and the channels by their names.
+        """Store the layout, and find the columns of the frame counter, the clock and the channels.
 
         Args:
             notation: Notation of the lines.
@@ -119,9 +121,10 @@ class TextParser(DelimitedParser):
         self._clock_wrap.update(None)
 
     def _parse_piece(self, piece: bytes) -> list[Frame]:
-        """Parse a line, and return the frames that it completes.
+        """Parse a line, and return the frames that the line completes.
 
-        Lines are collected until their layout can be recognised. The frames of the collected lines are returned then.
+        Lines are collected until their layout can be recognised. When the layout is recognised, the frames of the
+        collected lines are returned.
 
         Args:
             piece: Bytes of the line, without the line feed.
@@ -152,15 +155,16 @@ class TextParser(DelimitedParser):
         return self._read(self.layout, line, size)
 
     def _reject(self, size: int) -> list[Frame]:
-        """Count a rejected line, and return an empty list, because the line completes no frame."""
+        """Count a rejected line, and return an empty list, because a rejected line completes no frame."""
         self.counts.count_rejected(size)
         return []
 
     def _reject_unreadable(self, piece: bytes, size: int) -> list[Frame]:
         """Count a line that cannot be parsed.
 
-        If the line is equal to the previous line that could not be parsed, it is probably the echo of a request. The
-        lines that were collected to recognise a layout are then kept. Otherwise, the collected lines are dropped.
+        If the line is equal to the previous line that could not be parsed, it is probably the echo of a request. After
+        an echo, the lines that were collected to recognise a layout are kept. After any other line, the collected lines
+        are dropped.
 
         Args:
             piece: Bytes of the line.
@@ -184,8 +188,9 @@ class TextParser(DelimitedParser):
     def _name_columns(self, header: Line, size: int) -> None:
         """Use the names in a header as the names of the columns, unless the columns already have names.
 
-        If the layout is already recognised and its columns cannot have these names, the header is counted as rejected.
-        A header can appear at this stage because the board was reset, or because a line only looks like a header.
+        If the layout is already recognised and its columns cannot have the names in the header, the header is counted
+        as rejected. A header can appear after the recognition if the board was reset, or if another line looks like a
+        header.
 
         Args:
             header: Parsed line with the names of the columns.
@@ -203,17 +208,17 @@ class TextParser(DelimitedParser):
             self._reject(size)
 
     def _set_layout(self, layout: Layout) -> None:
-        """Use a layout for all further lines, and describe it in the attribute `format`."""
+        """Use a layout for all further lines, and describe the layout in the attribute `format`."""
         self.layout = layout
         self._clock_wrap = clock_wrap(layout.columns.clock_unit_us)
         names = ", ".join(layout.names) or f"{layout.value_count} columns without names"
         self.format = f"text, {layout.notation}: {printable(names)}"
 
     def _recognise(self, line: Line, size: int) -> list[Frame]:
-        """Add a line to the collected lines, and return their frames if their layout can now be recognised.
+        """Add a line to the collected lines. If their layout can now be recognised, return their frames.
 
         A layout is recognised if the latest lines consist of `RECOGNITION_REPEATS` equal cycles. A cycle consists of
-        one or several lines that together contain one frame. Collected lines before these cycles are counted as
+        one or several lines that together contain one frame. Collected lines before the equal cycles are counted as
         rejected.
 
         Args:
@@ -250,8 +255,9 @@ class TextParser(DelimitedParser):
     def _layout_of(self, lines: list[Line]) -> Layout:
         """Determine the layout of a frame from the lines of one cycle. For most boards, a cycle is a single line.
 
-        The names of several lines are sorted, because the given lines may begin in the middle of a cycle. If a single
-        line has no names, its values get the names of the columns, provided that there are as many names as values.
+        If the cycle has several lines, their names are sorted, because the given lines may begin in the middle of a
+        cycle. If the cycle is a single line without names, the values get the known names of the columns, provided that
+        the number of names is equal to the number of values.
         """
         first_line = lines[0]
         notation = first_line.notation
@@ -289,9 +295,10 @@ class TextParser(DelimitedParser):
     def _read_cycle_line(self, layout: Layout, line: Line, size: int) -> list[Frame]:
         """Store the values of one line of a cycle. A cycle is a sequence of lines that together contain one frame.
 
-        A line is identified by the first of its names that is not the name of a clock, because every line of a cycle
-        may contain the clock. A new cycle begins with the line whose name comes first in the layout. A new cycle also
-        begins if the present cycle already contains a value with the name of the line, because lines must be missing.
+        Each line is identified by its first name other than the name of a clock, because every line of a cycle may
+        contain the clock. A new cycle begins with the line whose name comes first in the layout. A new cycle also
+        begins if the present cycle already contains a value with the name of the line, which means that lines of the
+        present cycle are missing.
 
         Args:
             layout: The recognised layout.
@@ -330,7 +337,7 @@ class TextParser(DelimitedParser):
         self._clear_cycle()
 
     def _clear_cycle(self) -> None:
-        """Delete the values of the present cycle, so that a new cycle can begin."""
+        """Delete the stored values of the present cycle, so that a new cycle can begin."""
         self._cycle_values = {}
         self._cycle_bytes = 0
 
@@ -356,7 +363,8 @@ class TextParser(DelimitedParser):
 def clock_wrap(unit_us: float) -> CounterWrap:
     """Create the estimator of the time at which a clock wraps to 0.
 
-    The estimator assumes that the clock has 16, 24 or 32 bits, or is computed from a 32-bit clock in us or ms.
+    The estimator assumes that the clock has 16, 24 or 32 bits, or that the board computes the time from a 32-bit clock
+    in us or ms.
 
     Args:
         unit_us: Unit of the clock, us.
@@ -370,7 +378,7 @@ def clock_wrap(unit_us: float) -> CounterWrap:
 
 
 def _counter_and_clock_first(name: str) -> tuple[bool, str]:
-    """Return the key by which a name is sorted: the frame counter and the clock come before the channels."""
+    """Return a sorting key for names that places the frame counter and the clock before the channels."""
     is_channel = name != SEQ and name not in TIMES_US
     return is_channel, name
 
@@ -378,9 +386,9 @@ def _counter_and_clock_first(name: str) -> tuple[bool, str]:
 def _repeated_cycle_length(lines: list[Line]) -> int:
     """Return the number of lines in the cycle that has just occurred `RECOGNITION_REPEATS` times in succession.
 
-    The result is 0 if there is no such cycle. Two lines are equal in this comparison if they have the same notation,
-    the same names and the same number of values. A cycle of several lines is possible only for pairs of name and value
-    and for Teleplot. In these two notations, each line may contain a part of the frame.
+    If no cycle has occurred so often, the result is 0. Two lines count as equal if they have the same notation, the
+    same names and the same number of values. A cycle of several lines is possible only with the notations `pairs` and
+    `teleplot`, because only in these two notations may a line contain a part of a frame.
 
     Args:
         lines: The lines received last, at least one, in the order in which they arrived.

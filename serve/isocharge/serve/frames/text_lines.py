@@ -1,6 +1,6 @@
 """Functions that parse the lines of text that boards send, and functions that write frames as lines of text.
 
-A board may use one of the following notations.
+A board may send its lines in any of the following notations.
 
 | notation | example |
 |---|---|
@@ -68,7 +68,7 @@ NO_READING = Line(Notation.nothing)
 
 
 def parse_line(data: bytes) -> Line:
-    """Parse a line of text in one of the supported notations, which is recognised from the characters of the line.
+    """Recognise the notation of a line of text from its characters, and parse the line.
 
     Args:
         data: Bytes of the line, without the line feed at its end.
@@ -153,8 +153,8 @@ def _pairs(text: str) -> Line:
 def _teleplot(text: str) -> Line:
     """Parse a Teleplot line of the form `>name:time:value;time:value§unit|flags`, and return its latest value.
 
-    The time, the unit and the flags may be missing. The result contains no value if the line is a text (flag `t`) or
-    contains points of an x-y plot (flag `xy`).
+    The time, the unit and the flags may be missing. If the line is a text (flag `t`) or contains points of an x-y plot
+    (flag `xy`), the result contains no value.
 
     Raises:
         ValueError: If the line has another form.
@@ -181,7 +181,7 @@ def _teleplot(text: str) -> Line:
 def _json(text: str) -> Line:
     """Parse a JSON object that contains numbers, or a JSON list of numbers.
 
-    The result for a list of numbers has the notation CSV, because the numbers have no names.
+    For a list of numbers, the result has the notation CSV, because the numbers have no names.
 
     Raises:
         ValueError: If the text is not valid JSON, or contains no numbers.
@@ -228,7 +228,7 @@ def _json_numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, fl
 
 
 def _named_values(frame: Frame) -> list[tuple[str, str]]:
-    """Return the names and the values of the frame counter, the clock and the channels, as text.
+    """Return the name and the value of the frame counter, of the clock and of each channel as texts.
 
     Channels without names are called A, B, C, and so on. The values of channels have seven significant digits.
     """
@@ -246,23 +246,23 @@ def _named_values(frame: Frame) -> list[tuple[str, str]]:
 
 
 def _write_csv(frame: Frame) -> str:
-    """Return the values of the channels, separated by commas."""
+    """Return the values of the channels as a text with commas between the values."""
     return ",".join(f"{value:.7g}" for value in frame.values)
 
 
 def _write_pairs(frame: Frame) -> str:
-    """Return pairs `name:value` of the counter, the clock and the channels, separated by commas."""
+    """Return a pair `name:value` for the counter, the clock and each channel, with commas between the pairs."""
     return ",".join(f"{name}:{value}" for name, value in _named_values(frame))
 
 
 def _write_teleplot(frame: Frame) -> str:
-    """Return a line `>name:time:value` for the counter and for each channel, in which the time is the clock in ms."""
+    """Return a line `>name:time:value` for the counter and for each channel. The time is the clock in ms."""
     time = "" if frame.t_us is None else f"{frame.t_us / 1e3:.3f}:"
     return "\n".join(f">{name}:{time}{value}" for name, value in _named_values(frame) if name not in TIMES_US)
 
 
 def _write_json(frame: Frame) -> str:
-    """Return a JSON object with the counter, the clock and the channels."""
+    """Return a JSON object that contains the counter, the clock and the channels."""
     fields = ", ".join(f"{json.dumps(name)}: {value}" for name, value in _named_values(frame))
     return "{" + fields + "}"
 
@@ -277,7 +277,7 @@ TEXT_FORMATS: dict[str, Callable[[Frame], str]] = {
 
 
 def encode_text(frame: Frame, notation: str) -> bytes:
-    """Write a frame as a line of text, or as several lines for Teleplot.
+    """Encode a frame as a line of text, or as several lines for Teleplot.
 
     The values of the channels are written with seven significant digits.
 

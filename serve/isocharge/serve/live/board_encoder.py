@@ -1,7 +1,6 @@
 """Encoder that converts charges to the frames that a board sends.
 
-The encoder is the inverse of the computation of charges from frames. Both computations use the settings in the device
-file of the board.
+The encoder reverses the conversion of frames to charges, and uses the same device file of the board.
 """
 
 from collections.abc import Callable
@@ -35,7 +34,7 @@ FRAMES_TO_RECOGNISE = 8
 
 
 class BoardFrames(NamedTuple):
-    """Description of the frames that a board sends, with the function that encodes them.
+    """Description of the frames that a board sends, including the function that encodes a frame.
 
     Attributes:
         names: Names of the channels; empty if the frames contain no names.
@@ -53,12 +52,12 @@ class BoardFrames(NamedTuple):
 
 
 class BoardEncoder:
-    """Encodes charges as the frames of the board that a device file describes.
+    """Encoder that converts charges to frames of the board that a device file describes.
 
     The value of a channel is the charge of its electrode divided by the gain, plus the offset of the board. The device
     file assigns the channels to the electrodes. Channels without an electrode have the value 0. If a value is outside
-    the range of its field, it is set to the nearest limit of the range. The frame then gets the flag `saturated`,
-    provided that frames of this board have flags.
+    the range of its field, the encoder sets the value to the nearest limit of the range. A frame with such a value gets
+    the flag `saturated` if the frames of the board contain flags.
 
     Attributes:
         seq_modulus: Value at which the frame counter of the board wraps to 0.
@@ -68,7 +67,7 @@ class BoardEncoder:
     """
 
     def __init__(self, device: Device, electrodes: tuple[str, ...], notation: str | None = None) -> None:
-        """Assign the electrodes to the channels, and check that frames without charge can be encoded and read again.
+        """Assign the electrodes to the channels, and check that frames of an untouched film can be encoded and parsed.
 
         Args:
             device: Settings of the board.
@@ -101,7 +100,7 @@ class BoardEncoder:
         self._check_reading(device, electrodes)
 
     def _check_offsets(self, where: str, electrodes: tuple[str, ...]) -> None:
-        """Check that each channel can contain the value that the board sends without charge.
+        """Check that each channel can contain the value that the board sends if the charge is zero.
 
         Args:
             where: Name of the device file, for messages.
@@ -121,7 +120,7 @@ class BoardEncoder:
                 )
 
     def _check_reading(self, device: Device, electrodes: tuple[str, ...]) -> None:
-        """Check that the parser of the device file can read frames without charge.
+        """Check that the parser of the device file can read frames in which all charges are zero.
 
         Args:
             device: Settings of the board, which contain the parser.
@@ -146,8 +145,9 @@ class BoardEncoder:
     def encode(self, frame: Frame) -> bytes:
         """Return the bytes that the board sends for the charges of a frame.
 
-        If a value is outside the range of its channel, it is set to the nearest limit of the range. The frame then gets
-        the flag `saturated`, and `clipped` is increased by one. Channels without an electrode have the value 0.
+        If a value is outside the range of its channel, the value is set to the nearest limit of the range. A frame with
+        such a value gets the flag `saturated`, and the count `clipped` is increased by one. Channels without an
+        electrode have the value 0.
 
         Args:
             frame: Frame whose values are the charges of the electrodes, pC, in the order of the electrodes.
@@ -158,7 +158,7 @@ class BoardEncoder:
         is_clipped = False
         for position, value in zip(self._positions, board_values, strict=True):
             channel = channels[position]
-            values[position] = channel.limited(value)
+            values[position] = channel.nearest_value(value)
             if not channel.holds(value):
                 is_clipped = True
         flags = frame.flags
@@ -205,7 +205,7 @@ def _frames_of(device: Device, electrodes: tuple[str, ...], notation: str | None
 
 
 def _layout_frames(layout: FrameLayout, where: str) -> BoardFrames:
-    """Return the description of frames that have the layout of binary fields in a device file.
+    """Return the description of frames whose binary fields are laid out as a device file describes.
 
     Args:
         layout: Layout of the binary fields, as the device file describes it.
@@ -224,7 +224,7 @@ def _layout_frames(layout: FrameLayout, where: str) -> BoardFrames:
 
 
 def _column_frames(columns: tuple[str, ...]) -> BoardFrames:
-    """Return the description of frames that are lines of a CSV.
+    """Return the description of frames that are sent as lines of CSV.
 
     Args:
         columns: Names of the columns. A column contains the frame number, a clock, or the values of a channel.
@@ -235,7 +235,7 @@ def _column_frames(columns: tuple[str, ...]) -> BoardFrames:
 
 
 def _fitting_notations(device: Device, *, has_channel_names: bool) -> tuple[str, tuple[str, ...]]:
-    """Return the notations that fit a device file in which the channels of the frames are not described.
+    """Return the notations that fit a device file without a description of the channels.
 
     Args:
         device: Settings of the board.
@@ -255,7 +255,7 @@ def _fitting_notations(device: Device, *, has_channel_names: bool) -> tuple[str,
 
 
 def _check_notation(where: str, notation: str | None, fitting_notations: tuple[str, ...]) -> None:
-    """Check that the given notation, if there is one, fits the device file.
+    """Check that the notation fits the device file, if a notation is given.
 
     Args:
         where: Name of the device file, for messages.
@@ -279,8 +279,8 @@ def _check_notation(where: str, notation: str | None, fitting_notations: tuple[s
 def _used_channels(device: Device, electrodes: tuple[str, ...]) -> tuple[tuple[str, ...], int]:
     """Return the names of the channels to which electrodes are assigned, and the number of channels in a frame.
 
-    If the device file assigns no channel to an electrode, the electrode uses the channel with its own name. If the
-    device file contains only numbers of channels, the tuple of names is empty.
+    If the device file assigns no channel to an electrode, the electrode uses the channel that has the name of the
+    electrode. If the device file assigns all channels by number, the tuple of names is empty.
 
     Args:
         device: Settings of the board.
@@ -304,7 +304,7 @@ def _used_channels(device: Device, electrodes: tuple[str, ...]) -> tuple[tuple[s
 
 
 def _encode_row(columns: tuple[str, ...], frame: Frame) -> bytes:
-    """Return the line of a CSV that contains a frame.
+    """Encode a frame as a line of CSV.
 
     Args:
         columns: Names of the columns in their order. A column contains the frame number (`seq`), a clock (`t_us`,

@@ -1,6 +1,6 @@
 """Stages that compute the contact of a record from the touch charges of a frame.
 
-The stages process each frame in the following order.
+Each frame is processed by the following stages, in the listed order.
 
 - `PredictionStage` predicts the contact with the model, and adds flags if the contact is not valid.
 - `FilmStage` estimates how the pretension of the film changes from touch to touch (section `[follow]` of the device
@@ -43,7 +43,7 @@ The exponent has this value for a film without pretension, and is smaller for a 
 
 @dataclass(slots=True)
 class CurrentModel:
-    """Reference to the current model, which all stages share.
+    """Holder of the current model, which all stages share.
 
     Attributes:
         predictor: The loaded model. If the film is followed, this is the model of the film at its estimated pretension
@@ -55,7 +55,7 @@ class CurrentModel:
 
 @dataclass(slots=True)
 class ContactFrame:
-    """Frame that the stages process. Each stage changes the attributes of this object.
+    """Frame that the stages process. Each stage changes the attributes of the frame.
 
     Attributes:
         reading: Charges of the frame after the signal chain.
@@ -94,7 +94,7 @@ class PredictionStage(ContactStage):
     """Stage that predicts the contact of each frame with the current model."""
 
     def __init__(self, model: CurrentModel) -> None:
-        """Store the model, and the limits within which its contacts are valid.
+        """Store the model, and the limits within which contacts of the model are valid.
 
         Args:
             model: The current model. Its predictor may be replaced later. The limits of valid contacts then stay the
@@ -104,9 +104,9 @@ class PredictionStage(ContactStage):
         self._validity = model.predictor.validity
 
     def step(self, frame: ContactFrame) -> None:
-        """Predict the contact of a frame, and add the flags of this contact to the frame.
+        """Predict the contact of a frame, and add the flags of the contact to the frame.
 
-        If nothing touches the film, or if the frame has the flag `invalid`, the frame gets no contact.
+        If nothing touches the film, or if the frame has the flag `invalid`, no contact is predicted.
         """
         reading = frame.reading
         if INVALID in reading.flags or not reading.contact or reading.charge_pC is None:
@@ -117,7 +117,7 @@ class PredictionStage(ContactStage):
 
 
 class FilmStage(ContactStage):
-    """Stage that estimates the pretension of the film, and replaces the current model by the model for this pretension.
+    """Stage that estimates the pretension of the film, and uses the model for the estimated pretension.
 
     Attributes:
         follower: Object that estimates the pretension.
@@ -139,10 +139,10 @@ class FilmStage(ContactStage):
         self.follower = FilmFollower(model.predictor, rule, warming_ratio)
 
     def step(self, frame: ContactFrame) -> None:
-        """Correct the contact for the estimated pretension, and then update this estimate with the frame.
+        """Correct the contact for the estimated pretension, and then update the estimate with the frame.
 
-        The model for the new estimate is used from the next frame on. If the pretension can no longer be estimated, a
-        frame with a contact gets the flag `film`.
+        The model for the new estimate is used from the next frame on. If the pretension can no longer be estimated,
+        every frame with a contact gets the flag `film`.
         """
         charge_pC = frame.reading.charge_pC
         if frame.contact is not None and charge_pC is not None:
@@ -169,13 +169,13 @@ class TrackingStage(ContactStage):
     """Stage that tracks the contact from frame to frame."""
 
     def __init__(self, tracker: Tracker, predictor: Predictor, *, is_film_followed: bool) -> None:
-        """Select how the tracker tracks contacts with this model.
+        """Decide whether the tracker uses a mixture of several possible contacts.
 
-        The contact that is tracked at present is not discarded.
+        The contact that the tracker tracks at present is not discarded.
 
-        On some films, several different contacts cause the same charges. The tracker then uses a mixture of Gaussian
-        components, which represents all possible contacts. The mixture needs the file `charges.npz` in the folder of
-        the model, which describes the charges of every contact.
+        On some films, several different contacts cause the same charges. For such a film, the tracker uses a mixture of
+        Gaussian components that represents all possible contacts. The mixture needs the file `charges.npz`, which
+        describes the charges of every contact. The file is in the folder of the model.
 
         Args:
             tracker: Tracker, whose state is used further.
@@ -200,7 +200,7 @@ class TrackingStage(ContactStage):
         """Update the tracker with the contact of the frame, and add the tracked contact and its event to the frame.
 
         If the tracker uses a mixture of several possible contacts, the most probable contact replaces the contact of
-        the model. The flags are then determined for the most probable contact.
+        the model, and determines the flags of the frame.
         """
         tracker = self._tracker
         reading = frame.reading
@@ -221,7 +221,7 @@ class TrackingStage(ContactStage):
 
 
 def _add_error(frame: ContactFrame, contact: Contact, shift: tuple[float, float, float]) -> None:
-    """Include an error in the standard deviations of the contact of a frame and of the tracked contact.
+    """Increase the standard deviations of the contact of a frame and of the tracked contact by an error.
 
     Args:
         frame: The frame, which is changed.
@@ -234,13 +234,13 @@ def _add_error(frame: ContactFrame, contact: Contact, shift: tuple[float, float,
 
 
 class ChargeScaleStage(ContactStage):
-    """Stage that increases the standard deviations of a contact if the common scale of all charges is uncertain.
+    """Stage that adds the uncertainty of the common scale of all charges to the standard deviations of a contact.
 
-    The scale is uncertain if the memory of the film is not known exactly.
+    The common scale is uncertain if the parameters of the film's memory are not known exactly.
     """
 
     def __init__(self, model: CurrentModel) -> None:
-        """Create the stage. The sensitivity of the contact is computed when the first contact is processed.
+        """Create the stage. The stage computes the sensitivity of a contact when the first contact is processed.
 
         Args:
             model: The current model, with which the sensitivity of the contact is computed.
@@ -249,7 +249,7 @@ class ChargeScaleStage(ContactStage):
         self.reset()
 
     def step(self, frame: ContactFrame) -> None:
-        """Include the error of the common scale in the standard deviations of the contact and the tracked contact."""
+        """Add the error of the common scale to the standard deviations of the contact and the tracked contact."""
         if frame.contact is None:
             return
         shift = self._shift(frame, frame.contact)
@@ -263,12 +263,13 @@ class ChargeScaleStage(ContactStage):
         self._sensitivity_predictor = self._model.predictor
 
     def _shift(self, frame: ContactFrame, contact: Contact) -> tuple[float, float, float] | None:
-        """Return the change of the contact if the common scale of all charges is wrong by one standard deviation.
+        """Return the change of the contact that an error of the charge scale by one standard deviation causes.
 
-        The change is computed from a second prediction with slightly larger charges. A contact of the mixture is not
-        predicted by the model, so that there is no second prediction. For such a contact, only the force F is assumed
-        to depend on the scale. F is assumed to be proportional to scale^p with p = `LARGEST_FORCE_EXPONENT`. The change
-        of the force is then dF = p F d(scale).
+        The change is computed from a second prediction with slightly larger charges.
+
+        For a contact of the mixture, there is no second prediction, because the model does not predict such a contact.
+        Only the force F of such a contact is assumed to depend on the scale. The assumption that F is proportional to
+        scale^p, with the exponent p = `LARGEST_FORCE_EXPONENT`, gives the change dF = p F d(scale).
 
         Args:
             frame: The frame.
@@ -293,9 +294,9 @@ class ChargeScaleStage(ContactStage):
 
 
 class TouchOffsetRule(Rule, frozen=True, kw_only=True):
-    """Settings that describe an offset that all charges of a touch may have in common.
+    """Settings that describe a common offset of all charges of a touch.
 
-    Such an offset can be a triboelectric charge or a pyroelectric charge.
+    A triboelectric charge or a pyroelectric charge can cause a common offset.
 
     Attributes:
         std_pC: Standard deviation of the offset, pC. The offset is constant during a touch, and its mean over many
@@ -306,15 +307,15 @@ class TouchOffsetRule(Rule, frozen=True, kw_only=True):
 
 
 class TouchOffsetStage(ContactStage):
-    """Stage that increases the standard deviations of a contact if all charges of its touch may have a common offset.
+    """Stage that adds the uncertainty of a common offset of all charges to the standard deviations of a contact.
 
-    A common offset changes the contact of a light press more than the contact of a strong press. If the contact comes
-    from the mixture of the tracker, its standard deviations are not changed. The effect of an offset on such a contact
-    is not known, because the model does not predict this contact.
+    A common offset changes the contact of a light press more than the contact of a strong press. The standard
+    deviations of a contact of the tracker's mixture are not changed. The model does not predict such a contact, so that
+    the effect of an offset on the contact is not known.
     """
 
     def __init__(self, model: CurrentModel, rule: TouchOffsetRule, warming_ratio: Array | float) -> None:
-        """Create the stage. The sensitivity of the contact is computed when the first contact is processed.
+        """Create the stage. The stage computes the sensitivity of a contact when the first contact is processed.
 
         Args:
             model: The current model, with which the sensitivity of the contact is computed.
@@ -328,7 +329,7 @@ class TouchOffsetStage(ContactStage):
         self.reset()
 
     def step(self, frame: ContactFrame) -> None:
-        """Include the error of a common offset in the standard deviations of the contact and the tracked contact.
+        """Add the error of a common offset to the standard deviations of the contact and the tracked contact.
 
         The error is computed from a second prediction, in which an offset is added to the charges. A contact of the
         mixture is not changed, because the model does not predict such a contact.

@@ -25,9 +25,9 @@
 The sections `[hum]`, `[tare]`, `[leak]`, `[memory]`, `[touch]` and `[common_mode]` contain the settings of the signal
 chain. The classes of these settings are in `isocharge.serve.signal_chain`. The sections `[track]` and `[follow]`
 contain the settings of the tracking. The classes of these settings are in `isocharge.serve.tracking`. The section
-`[touch_offset]` contains the settings of `TouchOffsetRule`. The key `on = false` in a section switches off the stage of
-this section. If the file has no section `[tare]` or `[touch]`, the stage is switched on and has its default settings.
-An unknown key causes an error.
+`[touch_offset]` contains the settings of `TouchOffsetRule`. The key `on = false` switches off the stage to which the
+section belongs. The stages of the sections `[tare]` and `[touch]` are switched on, with their default settings, even if
+the file has no such section. An unknown key causes an error.
 """
 
 from collections.abc import Mapping
@@ -65,7 +65,7 @@ A contact has three unknowns, and warming is a fourth unknown.
 class Gain(Rule, frozen=True, kw_only=True):
     """Settings that convert the unit of a board to charge.
 
-    Each setting is either one number for all electrodes, or one number for each electrode.
+    Each setting is either a single number for all electrodes or a separate number for each electrode.
 
     Attributes:
         pC_per_unit: Charge of one unit, pC.
@@ -80,7 +80,7 @@ class Gain(Rule, frozen=True, kw_only=True):
     offset: Finite | dict[str, Finite] | None = None
 
     def __post_init__(self) -> None:
-        """Check that the gain is given in exactly one form, and that it is not 0.
+        """Check that the section contains exactly one form of the gain, and that the gain is not 0.
 
         The section must contain either `pC_per_unit`, or both `V_per_unit` and `feedback_pF`.
 
@@ -113,7 +113,7 @@ class Gain(Rule, frozen=True, kw_only=True):
     def charge_pC(self, electrode: str, values: Array) -> Array:
         """Convert values of one electrode to charges.
 
-        A missing offset counts as 0, and a missing factor counts as 1.
+        If the offset is missing, the value 0 is used. If a factor is missing, the value 1 is used.
 
         Args:
             electrode: Name of the electrode.
@@ -165,7 +165,7 @@ class LeakSection(LeakRule, frozen=True, kw_only=True):
 
 
 class CommonMode(ThermalRule, frozen=True, kw_only=True):
-    """Section `[common_mode]` of a device file, which contains the settings for estimating the warming of the film.
+    """Section `[common_mode]` of a device file, with the settings for estimating the warming of the film.
 
     Attributes:
         pC_per_K: Charge of each electrode if the film warms by 1 K, pC/K. Only the ratios and the signs are used. None
@@ -176,7 +176,7 @@ class CommonMode(ThermalRule, frozen=True, kw_only=True):
 
 
 class DeviceSections(Settings, frozen=True):
-    """Content of a device file. Each attribute other than the name is a section or a table of the file."""
+    """Content of a device file. Each attribute except `name` is a section or a table of the file."""
 
     name: str = "unnamed board"
     frames: Frames = AutoFrames()
@@ -195,9 +195,9 @@ class DeviceSections(Settings, frozen=True):
 
 
 class Device(DeviceSections, frozen=True):
-    """Settings of a board, which come from its device file.
+    """Settings of a board, as its device file states them.
 
-    The inherited attributes are the sections of the file. A section that is switched off is None.
+    The inherited attributes are the sections of the device file. A section is None if its stage is switched off.
 
     Attributes:
         table: Content of the device file without any conversion, which is stored in recordings.
@@ -219,10 +219,10 @@ class Device(DeviceSections, frozen=True):
         return self.frames.parser()
 
     def chain(self, electrodes: tuple[str, ...]) -> Chain:
-        """Return the settings of the signal chain for a sensor with these electrodes.
+        """Return the settings of the signal chain for a sensor with the given electrodes.
 
-        If the device file does not contain a section, the settings of this section are None. The attribute `leak` is an
-        exception, because it then contains the default settings.
+        If the device file has no section for a stage, the settings of the stage are None. The attribute `leak` is an
+        exception: if the file has no section `[leak]`, the attribute contains the default settings.
 
         Args:
             electrodes: Names of the electrodes of the model, in the order of the charges.
@@ -262,7 +262,7 @@ class Device(DeviceSections, frozen=True):
         )
 
     def _warming_ratio(self, electrodes: tuple[str, ...]) -> Array | float:
-        """Return the charge of each electrode if the film warms, relative to the mean magnitude over all electrodes.
+        """Return the charge that warming adds to each electrode, relative to the mean magnitude over all electrodes.
 
         Args:
             electrodes: Names of the electrodes, in the order of the charges.
@@ -285,7 +285,7 @@ class Device(DeviceSections, frozen=True):
         return charge_pC_per_K / mean_magnitude
 
     def check_gain(self, electrodes: tuple[str, ...]) -> None:
-        """Check that the section `[gain]`, if there is one, contains numbers for exactly these electrodes.
+        """Check that a section `[gain]` contains numbers for exactly the given electrodes.
 
         Raises:
             DeviceError: If the section contains numbers for other electrodes.
@@ -354,8 +354,8 @@ def load_device(path: str | Path | None) -> Device:
 def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     """Convert the content of a device file to the settings of a board.
 
-    If the section `[frames]` has no key `format`, the format of the frames is `auto`. A section that is switched off is
-    treated as if it were missing.
+    If the section `[frames]` has no key `format`, the format of the frames is `auto`. If a section is switched off, it
+    is treated like a missing section.
 
     Args:
         table: Sections and keys of the file, as the docstring of this module describes them.
@@ -380,7 +380,7 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
 def with_settings(device: Device, section: str, **settings: Any) -> Device:
     """Return a copy of the settings of a board in which one section is changed.
 
-    The attribute `table` of the copy, which is stored in recordings, contains the same changes.
+    The attribute `table` of the copy contains the same changes, because recordings store this attribute.
 
     Args:
         device: The settings of the board, which are not changed.

@@ -1,15 +1,15 @@
-"""Determination of the reason why the charges of a held press decrease.
+"""Functions that determine why the charges of a held press decrease.
 
 The cause is either a leak of the amplifiers or creep of the film. A leak removes the same share of the charge in every
-second. With a leak, the logarithm of the charge Q is a linear function of the time t since the touch, namely ln Q = a -
-t / tau. Creep removes the same share of the charge in every decade of time. With creep, the logarithm of the charge is
-a linear function of ln t, namely ln Q = a + b ln t. Both straight lines are fitted to the charges of a press. One of
-the two causes is only reported if the sum of the squared residuals of the other line is at least `MIN_RESIDUAL_RATIO`
-times as large.
+second. The logarithm of the charge Q is then a linear function of the time t since the touch, ln Q = a - t / tau. Creep
+removes the same share of the charge in every decade of time. The logarithm of the charge Q is then a linear function of
+ln t, ln Q = a + b ln t. Both functions are fitted to the charges of a press. One of the two causes is reported only if
+the fit of the other function has a much larger sum of squared residuals. The ratio of the two sums must be at least
+`MIN_RESIDUAL_RATIO`.
 
-A third possible cause is creep together with a thermoelastic step (see `isocharge.serve.signal_chain.memory`). This
-third cause is reported if the sum of the squared residuals of each straight line is at least `MIN_RESIDUAL_RATIO` times
-as large as that of the third law.
+A third possible cause is creep together with a thermoelastic step (see `isocharge.serve.signal_chain.memory`). The
+third cause is reported only if the sum of squared residuals of each linear function is large enough. The ratio of each
+of these sums to the sum of the third law must be at least `MIN_RESIDUAL_RATIO`.
 
 The section [leak] of a device file corrects a leak, and the section [memory] corrects creep. If the section [leak] is
 used to correct creep, the error of the charges increases with time.
@@ -40,9 +40,9 @@ UNDECIDED = (
 
 
 class Fading(NamedTuple):
-    """Law that describes how the charges of a held press decrease.
+    """Law by which the charges of a held press decrease.
 
-    If no law fits clearly better than the others, all attributes have their default values.
+    If no law fits clearly better than the other laws, all attributes have their default values.
 
     Attributes:
         tau_s: Time constant of the leak, s; None if the cause is not a leak.
@@ -58,7 +58,7 @@ class Fading(NamedTuple):
 
     @property
     def sections(self) -> dict[str, dict[str, float]]:
-        """Sections of a device file that correct the decrease, with values rounded to two digits.
+        """Sections of a device file that correct the decrease of the charges, with values of two significant digits.
 
         The section [leak] corrects a leak, and the section [memory] corrects creep. If no section can correct the
         decrease, the dictionary is empty.
@@ -76,7 +76,7 @@ class Fading(NamedTuple):
 
     @property
     def settings(self) -> str:
-        """Text of `sections` as the user writes it into a device file, such as `[leak] tau_s = 10`.
+        """Text of `sections` in the form of a device file, such as `[leak] tau_s = 10`.
 
         The text is empty if there are no sections.
         """
@@ -84,14 +84,14 @@ class Fading(NamedTuple):
 
     @property
     def creep_remedy(self) -> str:
-        """Advice to the user on how to reduce the error that creep causes, as a part of a sentence."""
+        """Part of a sentence that advises the user how to reduce the error that creep causes."""
         if not self.settings:
             return "wait longer before each reading"
         return f"wait longer before each reading, or put {self.settings} into a device file"
 
 
 def section_text(name: str, section: Mapping[str, float]) -> str:
-    """Return the text of a section of a device file in one line, such as `[leak] tau_s = 10`."""
+    """Return a section of a device file as a single line of text, such as `[leak] tau_s = 10`."""
     assignments = ", ".join(f"{key} = {value:g}" for key, value in section.items())
     return f"[{name}] {assignments}"
 
@@ -116,9 +116,9 @@ class LineFit(NamedTuple):
 def law_of_fading(mean_magnitudes: Sequence[tuple[float, float]]) -> Fading:
     """Determine the law by which the charges of a press with a constant force decrease.
 
-    Three laws are fitted to the mean magnitude Q of the charges, and their sums of squared residuals are compared. With
-    a leak, ln Q decreases linearly with time. With creep, ln Q decreases linearly with the logarithm of time. The third
-    law combines creep with a thermoelastic step that decays exponentially.
+    Three laws are fitted to the mean magnitude Q of the charges, and the sums of their squared residuals are compared.
+    With a leak, ln Q decreases linearly with time. With creep, ln Q decreases linearly with the logarithm of time. The
+    third law combines creep with a thermoelastic step that decays exponentially.
 
     Args:
         mean_magnitudes: Pairs (t, Q). The first value is a time since the touch, s. The second value is the mean
@@ -157,8 +157,8 @@ def _fit_creep_and_step(held_s: Array, magnitude_pC: Array, max_squared_residual
     """Fit creep with a thermoelastic step: Q = level - creep * log10(t) + step * exp(-t / warmth_s).
 
     The time constant warmth_s describes how fast the film returns to the temperature of the air. It is set to its
-    default value. The parameters level, creep and step then follow from a linear least-squares fit. The fit is
-    physically possible if the ratios creep / level and step / level are between 0 and 1.
+    default value. The parameters level, creep and step follow from a linear least-squares fit. The fit is physically
+    possible if the ratios creep / level and step / level are between 0 and 1.
 
     Args:
         held_s: Times since the touch, shape (n,), s.
@@ -186,9 +186,9 @@ def _fit_creep_and_step(held_s: Array, magnitude_pC: Array, max_squared_residual
 
 
 def cause_of_fading(mean_magnitudes: Sequence[tuple[float, float]]) -> str:
-    """Return a text that states the possible cause of a decrease of the charges and gives advice to the user.
+    """Return a text that states why the charges may decrease and advises the user what to do.
 
-    The text is the end of a sentence, which begins in the message of the caller.
+    The text is the second part of a sentence. The message of the caller contains the first part.
 
     Args:
         mean_magnitudes: Pairs of a time since the touch, s, and the mean magnitude of the charges at this time, pC. The

@@ -1,6 +1,6 @@
 """Computation of touch charges from chunks of bytes.
 
-A parser finds the frames in the bytes, and a clock computes the time of each frame. The channels of the frame are then
+A parser finds the frames in the bytes, and a clock computes the time of each frame. The channels of each frame are
 assigned to the electrodes, and the signal chain computes the touch charges.
 
 The touch charges do not depend on a model of the film, unless the signal chain estimates warming.
@@ -32,18 +32,19 @@ BYTES_TO_RECOGNISE = 8192
 
 
 class ChannelPicker:
-    """Selects the values of the electrodes from the channels of a frame.
+    """Selector of the values in a frame that belong to the electrodes.
 
     The section `[channels]` of the device file states the name or the number of the channel of each electrode. If the
-    device file has no such section, a channel with the name of an electrode belongs to this electrode. The name of the
-    channel can also contain an addition, as in `A_pC` or `charge.A`. If the channels have no such names, the channels
-    belong to the electrodes in their order. There must then be as many channels as electrodes.
+    device file has no section `[channels]`, a channel belongs to the electrode with the same name. The name of a
+    channel may have a prefix or a suffix, as in `A_pC` or `charge.A`. If the names of the channels do not contain the
+    names of the electrodes, the first channel belongs to the first electrode, and so on. An assignment by order
+    requires as many channels as electrodes.
     """
 
     def __init__(
         self, electrodes: tuple[str, ...], channels: Mapping[str, str], reader: str, where: str = "device file"
     ) -> None:
-        """Store the assignment of the channels to the electrodes.
+        """Store which channel the device file assigns to each electrode.
 
         Args:
             electrodes: Names of the electrodes, in the order of the charges.
@@ -64,8 +65,7 @@ class ChannelPicker:
     def pick(self, frame: Frame) -> Array:
         """Return the values of a frame in the order of the electrodes, shape (n_electrode,), in the unit of the device.
 
-        If the previous frame had the same names and the same number of values, the positions of its channels are used
-        again.
+        If the previous frame had the same names and the same number of values, its channel positions are used again.
 
         Raises:
             ChargeError: If the frame has no value for an electrode.
@@ -79,7 +79,7 @@ class ChannelPicker:
         return np.array(values, dtype=float).reshape(-1)
 
     def positions(self, frame: Frame) -> tuple[int, ...]:
-        """Return the index of each electrode's value among the values of a frame.
+        """Return the index at which each electrode's value is found in the values of a frame.
 
         The docstring of the class describes how the channels are assigned to the electrodes.
 
@@ -102,7 +102,7 @@ class ChannelPicker:
         )
 
     def _position(self, electrode: str, frame: Frame) -> int:
-        """Return the index of the value of one electrode among the values of a frame, as the device file assigns it.
+        """Return the index in the values of a frame that the device file assigns to one electrode.
 
         Args:
             electrode: Name of the electrode.
@@ -124,9 +124,11 @@ class ChannelPicker:
 def check_channels(device: Device, electrodes: tuple[str, ...], reader: str) -> None:
     """Check that each electrode has a channel. No frame is needed for this check.
 
-    If the device file describes the layout of the frames, their channels are known. The channels are then assigned to
-    the electrodes in the same way as in a received frame. Otherwise the channels are not known before the first frame
-    arrives. If the device file has a section `[channels]`, this section must then contain a key for each electrode.
+    If the device file describes the layout of the frames, the channels are known in advance, and are assigned to the
+    electrodes in the same way as in a received frame.
+
+    If the device file does not describe the layout, the channels are unknown until the first frame arrives. A section
+    `[channels]` must therefore contain a key for each electrode.
 
     Args:
         device: Settings of the board.
@@ -156,7 +158,7 @@ def channel_names(frame: Frame) -> tuple[str, ...]:
 
 
 def position_of(name: str, frame: Frame) -> int | None:
-    """Return the index of a channel among the values of a frame, or None if the frame has no such channel.
+    """Return the index of a channel in the values of a frame, or None if the frame has no such channel.
 
     Args:
         name: Name of the channel, or its number from 1, such as `2` or `ch2`.
@@ -171,9 +173,9 @@ def position_of(name: str, frame: Frame) -> int | None:
 
 
 def channel_number(name: str) -> int | None:
-    """Return the number of a channel, which a name such as `2` or `ch2` contains.
+    """Return the channel number in a name such as `2` or `ch2`.
 
-    The channels are counted from 1. The function returns None for every other name.
+    The channels are counted from 1. For a name of any other form, the function returns None.
     """
     digits = name.removeprefix("ch")
     is_number = digits.isascii() and digits.isdigit() and len(digits) <= MAX_CHANNEL_DIGITS
@@ -183,7 +185,7 @@ def channel_number(name: str) -> int | None:
 
 
 def electrode_of(name: str) -> str:
-    """Return the name of the electrode that is part of the name of a channel.
+    """Extract the name of the electrode from the name of a channel.
 
     For example, the function returns `A` if the channel is called `A`, `A_pC`, `charge.A` or `charge_raw_pC.A`.
     """
@@ -192,16 +194,16 @@ def electrode_of(name: str) -> str:
 
 
 class TimedReading(NamedTuple):
-    """Touch charges of a frame, which the signal chain has computed, and the time of the frame."""
+    """Touch charges that the signal chain has computed from a frame, and the time of the frame."""
 
     reading: Reading
     time: ReadingTime
 
 
 class ReadingStream:
-    """Computes touch charges from the chunks of a stream, and stores the state of this computation.
+    """Stream that computes touch charges from chunks of bytes, and stores the state of the computation.
 
-    An object may only be used by one thread.
+    Each object may be used by only one thread.
 
     Attributes:
         parser: Parser that finds the frames in the bytes and counts them.
@@ -248,9 +250,9 @@ class ReadingStream:
 
     @property
     def warming_ratio(self) -> Array | float:
-        """Charge that warming of the film adds to each electrode, relative to the mean magnitude of these charges.
+        """Charge that warming adds to each electrode, relative to the mean magnitude over all electrodes.
 
-        The array has the shape (n_electrode,). A single number applies to all electrodes.
+        The result has the shape (n_electrode,), or is a single number for all electrodes.
         """
         return self._settings.warming_ratios
 
@@ -286,7 +288,7 @@ class ReadingStream:
     def frames(self, chunk: Chunk) -> list[Frame]:
         """Return the frames whose last byte is in a chunk.
 
-        If the chunk follows an outage, discard the earlier state first.
+        If the chunk follows an outage, the earlier state is discarded first.
         """
         if chunk.outage_s > 0.0:
             self._reconnect()
@@ -295,9 +297,8 @@ class ReadingStream:
     def advance(self, frame: Frame, chunk: Chunk) -> TimedReading:
         """Compute the time and the touch charges of the next frame of a chunk.
 
-        The time of the frame is computed with the clock of the device. Missing frames are counted by comparing the
-        number of the frame with the number of the previous frame. The signal chain converts the values of the
-        electrodes to touch charges.
+        The clock of the device determines the time of the frame. Missing frames are counted by comparing the frame
+        number with the previous frame number. The signal chain converts the values of the electrodes to touch charges.
 
         Args:
             frame: The frame.
@@ -337,7 +338,8 @@ class ReadingStream:
         """Finish a chunk whose frames have been processed.
 
         If the chunk contained the end of a frame, the clock of the device is adjusted to the time of arrival of the
-        chunk. Otherwise the method checks that the stream has contained intact frames.
+        chunk. If the chunk contained no end of a frame, the method checks that the stream has contained intact frames
+        so far.
 
         Args:
             frames: The frames that `frames` returned for the chunk.
@@ -362,7 +364,7 @@ class ReadingStream:
     def _reconnect(self) -> None:
         """Discard the state of the parser, the gap counter, the clock and the tare after an outage.
 
-        The state is not valid any more, because frames are missing and the film may have been touched during the
+        The earlier state is no longer valid, because frames are missing and the film may have been touched during the
         outage. The next frame gets the flag `reconnected`.
         """
         self.parser.reset()
@@ -373,7 +375,7 @@ class ReadingStream:
 
 
 def _check_recognised(parser: Parser, max_bytes: int = BYTES_TO_RECOGNISE) -> None:
-    """Check that the stream has contained an intact frame, or at most `max_bytes` bytes.
+    """Check that the first intact frame arrives within at most `max_bytes` bytes.
 
     Raises:
         NoFramesError: If more than `max_bytes` bytes have arrived without an intact frame.

@@ -1,7 +1,7 @@
 """Recording of the chunks and records of a touch stream, and replay of such a recording.
 
 The function `replay` passes the chunks of a recording to a stream that has the same settings as the recorded stream. If
-the replay also uses the same models, its records are identical to the recorded records.
+the replay also uses the same models as the recorded stream, its records are identical to the recorded records.
 """
 
 import logging
@@ -27,15 +27,15 @@ log = logging.getLogger(__name__)
 class RecordedStream:
     """Touch stream that writes its chunks and records to a recording.
 
-    An object may only be used by one thread, except for the methods whose names begin with `request_`. Any thread may
-    call these methods. A request is executed before the next chunk is processed.
+    Each object may be used by only one thread, except that any thread may call the `request_...` methods. A request is
+    executed before the next chunk is processed.
 
     Attributes:
         recorder: Recorder that writes the present recording, or None if nothing is recorded.
     """
 
     def __init__(self, stream: TouchStream, recorder: Recorder | None = None) -> None:
-        """Store the stream and the recorder of its first recording.
+        """Store the stream and the recorder of the first recording.
 
         Args:
             stream: Stream that computes records from chunks.
@@ -59,7 +59,7 @@ class RecordedStream:
         return self._stream.predictor
 
     def request_tare(self) -> None:
-        """Request that the tare is measured again. A signal handler may also call this method."""
+        """Request a new measurement of the tare. A signal handler may also call this method."""
         self._requests.append(self._tare)
 
     def request_film_reset(self) -> None:
@@ -72,9 +72,9 @@ class RecordedStream:
     def request_recording(self, recorder: Recorder | None) -> None:
         """Request to end the present recording, and to begin another recording.
 
-        If an earlier request was not executed yet, it is replaced by this request. When a recording begins, the stream
-        is restarted and the tare is measured again. A replay can then compute the same records, although it only has
-        the bytes of the recording.
+        The new request replaces an earlier request that was not executed yet. When a recording begins, the stream is
+        restarted and the tare is measured again. A replay can therefore compute the same records from the bytes of the
+        recording alone.
 
         Args:
             recorder: Recorder of the next recording, which this object opens and closes. None to record nothing.
@@ -87,11 +87,11 @@ class RecordedStream:
         self._requests.append(partial(self._mark, marker))
 
     def request_model(self, load: Load) -> None:
-        """Request to replace the model by another model.
+        """Request to replace the present model by another model.
 
-        The new model is loaded in a separate thread. As soon as it has been loaded, it is used for all later chunks. If
-        the new model cannot be loaded, or has other electrodes, an error is logged and the present model remains in
-        use. A signal handler may also call this method.
+        The new model is loaded in a separate thread, and is used for all chunks after it has been loaded. If the new
+        model cannot be loaded, or has other electrodes, an error is logged and the present model remains in use. A
+        signal handler may also call this method.
 
         Args:
             load: Function that loads and returns the new model.
@@ -99,10 +99,10 @@ class RecordedStream:
         self._next_load = load
 
     def follow(self, chunks: Iterable[Chunk]) -> Generator[PredictionRecord]:
-        """Process the chunks, record them, and yield their prediction records.
+        """Process and record the chunks, and yield their prediction records.
 
         Requests are executed before each chunk. A chunk is recorded after its last record has been yielded. The caller
-        must close this generator before it closes its recorder. The present chunk is then recorded even if the program
+        must close the generator before closing the recorder, so that the present chunk is recorded even if the program
         is interrupted.
 
         Args:
@@ -136,7 +136,7 @@ class RecordedStream:
             self._end_recording()
 
     def _record_chunk(self) -> None:
-        """If a chunk was not recorded yet, write the chunk and its records to the recording."""
+        """Write the latest chunk and its records to the recording, unless they were already recorded."""
         if self.recorder is not None and self._current_chunk is not None:
             chunk, record_lines = self._current_chunk
             self.recorder.chunk(chunk, record_lines)
@@ -145,8 +145,8 @@ class RecordedStream:
     def _begin_requested_recording(self) -> None:
         """End the present recording, and begin the requested recording if there is one.
 
-        Before the new recording begins, the stream is restarted. The records of the recording therefore depend only on
-        the bytes in the recording. If the file cannot be created, an error is logged.
+        Before a new recording begins, the stream is restarted. The records of the new recording therefore depend only
+        on the bytes in this recording. If the file of the recording cannot be created, an error is logged.
         """
         if not self._next_recorder:  # an earlier call of this method has already executed the latest request
             return
@@ -165,7 +165,7 @@ class RecordedStream:
             recorder.model(present_label)
 
     def _end_recording(self) -> None:
-        """End the present recording, and close its recorder unless the caller has opened it."""
+        """End the present recording, and close its recorder unless the caller has opened the recorder."""
         recorder = self.recorder
         self.recorder = None
         if recorder is not None and recorder is not self._caller_recorder:
@@ -177,9 +177,10 @@ class RecordedStream:
             self.recorder.mark(marker)
 
     def _continue_loading(self) -> None:
-        """Begin to use the requested model if it has been loaded, and begin to load the next requested model.
+        """Use a requested model if it has been loaded, and begin to load the next requested model.
 
-        A model is loaded in a separate thread, so that the stream does not wait. Only one model is loaded at a time.
+        Each model is loaded in a separate thread, so that the stream does not have to wait. Only one model is loaded at
+        a time.
         """
         if self._loading_model is not None and self._loading_model.done():
             self._use_loaded_model(self._loading_model)
@@ -194,7 +195,8 @@ class RecordedStream:
     def _use_loaded_model(self, loaded: "Future[Predictor]") -> None:
         """Use a newly loaded model for all later chunks.
 
-        If the new model could not be loaded or cannot be used, log an error and continue with the present model.
+        If the new model could not be loaded or cannot be used, an error is logged, and the present model remains in
+        use.
 
         Args:
             loaded: Completed future, which contains the new model or the error that occurred while it was loaded.
@@ -235,9 +237,9 @@ def replay(
     load: Callable[[str], Predictor] | None = None,
     on_marker: Callable[[Marker], object] = lambda _: None,
 ) -> Iterator[PredictionRecord]:
-    """Compute the records of a recording again from its chunks, and yield these records.
+    """Compute the records of a recording again from its chunks, and yield the records.
 
-    For each chunk, the replay yields as many records as were yielded when the recording was made.
+    For each chunk, the replay yields the same number of records as the recorded stream.
 
     Args:
         recording: Recording whose chunks are processed.

@@ -1,10 +1,9 @@
-"""Detection of presses that are held still, and measurement of their charges.
+"""Detection and measurement of presses that are held still.
 
 The charges of a press are examined in a time window. The press is steady if the scatter and the drift of each charge in
 the window are small. The charge of a press is the mean charge in the window minus the mean charge at rest just before
-the touch. The measured charge is therefore not affected by a slow drift of the amplifiers or of the temperature of the
-film. A press is refused if it saturates an amplifier, moves, creeps or ends too early. The reason for the refusal is
-returned.
+the touch. A slow drift of the amplifiers or of the film's temperature therefore does not affect the measured charge. A
+press is refused if it saturates an amplifier, moves, creeps or ends too early. The reason for the refusal is returned.
 """
 
 from collections import deque
@@ -107,7 +106,7 @@ class Phase(StrEnum):
 
 
 class SteadyPress(NamedTuple):
-    """Charges of a press that was held still, measured in a window of time.
+    """Charges of a press that was held still, which were measured in a time window.
 
     Attributes:
         charge_pC: Mean touch charges over the window, shape (n_electrode,), pC.
@@ -164,7 +163,7 @@ class WindowFrame(NamedTuple):
 
 
 class PressWatch:
-    """Finds one steady press in each touch. An object may only be used by one thread."""
+    """Finds one steady press in each touch. Each object may be used by only one thread."""
 
     def __init__(self, electrodes: tuple[str, ...], rule: SteadyRule | None = None) -> None:
         """Create a watch that waits for the tare, which is the charge of the untouched film.
@@ -196,11 +195,11 @@ class PressWatch:
             self._phase = Phase.lift
 
     def feed(self, timed: TimedReading) -> WatchResult:
-        """Process the next reading, and return the phase of the press.
+        """Process the next reading, and return the phase of the watch.
 
-        The phase is `taring` until the charge of the untouched film has been measured. The next phase is `waiting`
-        until a touch begins. It is followed by `settling` until the press is accepted or refused, and by `lift` until
-        the finger leaves the film.
+        The first phase is `taring`, which ends when the charge of the untouched film has been measured. The phase
+        `waiting` follows until a touch begins. The phase `settling` follows until the press is accepted or refused. The
+        phase `lift` follows until the finger leaves the film.
 
         Args:
             timed: The touch charges of a frame, with their time.
@@ -232,7 +231,7 @@ class PressWatch:
         return result._replace(charge_pC=charge_pC, held_s=held_s)
 
     def _process_rest(self, charge_pC: Array, t_s: float) -> WatchResult:
-        """Store a frame in which nothing touches the film, and refuse a press that has ended before it was steady.
+        """Store a frame in which nothing touches the film. Refuse a press that has ended without becoming steady.
 
         Args:
             charge_pC: Touch charges of the frame, shape (n_electrode,), pC.
@@ -261,7 +260,8 @@ class PressWatch:
     def _begin_press(self, t_s: float) -> None:
         """Begin a press, and measure the charges at rest just before the press.
 
-        The latest frames before the press are left out, because the finger may already have touched the film.
+        The last frames before the press are excluded, because the finger may have touched the film before the touch was
+        detected.
 
         Args:
             t_s: Time of the first frame of the press, s.
@@ -320,12 +320,12 @@ class PressWatch:
         return WatchResult(Phase.settling, reason=self._reason)
 
     def _steady_press(self, reading: Reading) -> SteadyPress | None:
-        """Return the press in the window if the press is steady, and otherwise store the reason and return None.
+        """Return the press in the window if the press is steady. Otherwise store the reason and return None.
 
-        A window is calm if its scatter is not much larger than the smallest scatter in a window of the present press. A
-        window with a sudden movement is therefore not calm. The mean magnitude of the charges in each calm window is
-        stored. The law of a slow decrease is later determined from these values. If a window is not calm, neither its
-        mean magnitude nor its reason is stored.
+        A window is calm if its scatter is at most `MAX_SCATTER_RATIO` times the smallest scatter in any window of the
+        present press. A window with a sudden movement is therefore not calm. The mean magnitude of the charges in each
+        calm window is stored, because the cause of a slow decrease is determined from the stored magnitudes. If a
+        window is not calm, neither its mean magnitude nor its reason is stored.
 
         Args:
             reading: The latest frame. Its tare contains the noise of the charges at rest.
@@ -352,10 +352,10 @@ class PressWatch:
         return None
 
     def _measure_window(self) -> SteadyPress:
-        """Fit a straight line to each charge in the window, and return the results.
+        """Fit a straight line to each charge in the window, and return the means, the scatter and the drift.
 
-        The scatter of a charge is the standard deviation of the residuals of its line. The drift of a charge is the
-        difference between the values of its line at the end and at the beginning of the window.
+        The scatter of a charge is the standard deviation of its residuals from the line. The drift of a charge is the
+        change of its line from the beginning to the end of the window.
         """
         begin_s = self._window[0].t_s
         end_s = self._end_s
@@ -402,8 +402,8 @@ def unsteadiness(
 ) -> str:
     """Return the reason why a press is not steady, or an empty text if the press is steady.
 
-    A straight line is fitted to each charge in the window. The press is steady if the scatter of each charge about its
-    line is small, and if the change of each line over the window is small. The limits include the scatter and the
+    A straight line is fitted to each charge in the window. The press is steady if each charge scatters only little
+    about its line, and if each line changes only little over the window. The limits allow for the scatter and the
     change that noise alone causes.
 
     Args:
@@ -436,10 +436,10 @@ def unsteadiness(
 
 
 def _drift_reason(press: SteadyPress, mean_magnitudes: Sequence[tuple[float, float]]) -> str:
-    """Return the probable reason for a drift of the charges, as a part of a sentence.
+    """Return a part of a sentence that states the probable reason for a drift of the charges.
 
-    If all charges change in proportion, their relative slopes are equal. In this case, the force changes and the
-    position does not. If the relative slopes differ, the position changes.
+    If only the force changes, all charges change in proportion, and their relative slopes are equal. If the relative
+    slopes differ, the position of the press changes.
 
     Args:
         press: A window of the press. `drift_pC` is the change of each charge over the window.

@@ -39,7 +39,7 @@ LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
 class Policy(StrEnum):
     """Rule that decides which frames have a record: all frames, or only the latest frame of each chunk.
 
-    With both policies, the signal chain processes all frames.
+    Whichever rule is chosen, the signal chain processes all frames.
     """
 
     every = "every"
@@ -48,7 +48,7 @@ class Policy(StrEnum):
 
 @dataclass(slots=True)
 class StreamCounts:
-    """Further counts of a stream, in addition to those of its parser and of its counter of missing frame numbers.
+    """Counts of a stream that neither its parser nor its counter of missing frame numbers contains.
 
     Attributes:
         records: Number of records that the stream has yielded.
@@ -111,9 +111,9 @@ def stream(
 
 
 class TouchStream:
-    """Computes prediction records from the chunks of a stream, and stores the state of this computation.
+    """Stream that computes prediction records from chunks of bytes, and stores the state of the computation.
 
-    An object may only be used by one thread.
+    Each object may be used by only one thread.
 
     Attributes:
         parser: Parser that finds the frames in the bytes and counts them.
@@ -183,8 +183,8 @@ class TouchStream:
     def _set_model(self, predictor: Predictor) -> None:
         """Create the stages that the device file requires, and use them from the next frame on.
 
-        All stages are created before the first attribute is changed. If a stage cannot be created, the stream is
-        therefore unchanged.
+        All stages are created before the first attribute is changed. If a stage cannot be created, the stream therefore
+        remains unchanged.
 
         Args:
             predictor: Model with which the stages begin. If the film is followed, the stages change their model later.
@@ -233,20 +233,20 @@ class TouchStream:
 
     @property
     def has_tracking(self) -> bool:
-        """Whether contacts are tracked. The records then contain the fields of a `Tracking`."""
+        """Whether contacts are tracked. If contacts are tracked, the records contain the fields of `Tracking`."""
         return self._tracker is not None
 
     @property
     def has_film(self) -> bool:
-        """Whether the film is followed. The records then contain the field `film`."""
+        """Whether the film is followed. If the film is followed, the records contain the field `film`."""
         return self._follow_rule is not None
 
     @property
     def answering_predictor(self) -> Predictor:
         """Model with which the contacts are predicted at present.
 
-        If the film is followed, this is the model of the film at its estimated pretension. Otherwise it is the loaded
-        model.
+        If the film is followed, the value is the model of the film at its estimated pretension. Otherwise, the value is
+        the loaded model.
         """
         return self._model.predictor
 
@@ -266,10 +266,9 @@ class TouchStream:
             stage.reset()
 
     def restart(self) -> None:
-        """Return to the state of a new stream.
+        """Return to the state of a new stream, so that all later records depend only on later bytes.
 
-        All later records therefore depend only on later bytes. Only the counts that `totals` returns include the time
-        before the restart.
+        Only the counts that `totals` returns include the time before the restart.
         """
         self._before_restart = self.totals()  # `totals` adds these counts to the counts of the new parser
         self._readings.restart()
@@ -379,7 +378,7 @@ class TouchStream:
         return charges
 
     def _misfit(self, charge_pC: Array) -> Reals:
-        """Return how badly the current model explains charges.
+        """Return the misfit of the current model for the charges of each frame.
 
         Args:
             charge_pC: Charges of n frames, shape (n, n_electrode), pC.
@@ -391,7 +390,7 @@ class TouchStream:
 
 
 def _contact_fields(frame: ContactFrame) -> Mapping[str, Any]:
-    """Return the names and values of the fields of a record that describe the contact.
+    """Return the names and values of those fields of a record that describe the contact.
 
     If the frame is invalid, all values are None. If nothing touches the film, the force is 0, and the position is None.
     """
@@ -403,10 +402,10 @@ def _contact_fields(frame: ContactFrame) -> Mapping[str, Any]:
 
 
 def _with_lasting_flags(reading: Reading, skipped_flags: set[str]) -> Reading:
-    """Return a reading to which flags of skipped frames have been added.
+    """Return a copy of a reading with additional flags of skipped frames.
 
-    Only the flags in `LASTING_FLAGS` are added. Such a flag describes an event before the reading, for example lost
-    frames.
+    Only the flags in `LASTING_FLAGS` are added. Each of these flags describes an event before the reading, for example
+    lost frames.
 
     Args:
         reading: Reading of the next frame that has a record.

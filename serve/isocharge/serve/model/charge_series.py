@@ -78,8 +78,8 @@ class ChargeSeries:
         """Compute the charges of contacts and their derivatives.
 
         The series gives ln Q, the logarithm of the charge, as a function of coordinates between -1 and 1. The contacts
-        are converted to these coordinates. Outside the range of forces, ln Q is extrapolated as a linear function of
-        the logarithm of the force, with the slope at the nearest end of the range.
+        are converted to these coordinates. Outside the range of forces, ln Q is extrapolated linearly in the logarithm
+        of the force. The slope is taken from the nearest end of the range.
 
         Args:
             contact: Contacts (x, y, ln F), shape (n, 3), with x and y in mm and F in N.
@@ -153,7 +153,7 @@ def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Charge
         ValueError: If an array is missing or not valid.
     """
     coefficients = finite_array(arrays, "series", (None, None, None, n_electrode))
-    x_count, y_count, force_count, _ = coefficients.shape
+    x_count, y_count, force_count, _electrode_count = coefficients.shape
     x_degree = x_count - 1
     y_degree = y_count - 1
     force_degree = force_count - 1
@@ -195,7 +195,7 @@ def read_contact_range(arrays: Mapping[str, np.ndarray]) -> tuple[float, tuple[f
 
 
 def _check_charges(charges: ChargeSeries) -> None:
-    """Check that the charges of some contacts are finite and positive, and change with the contact.
+    """For some contacts, check that the charges are finite and positive, and that they depend on the contact.
 
     The contacts lie on a circle with half of the radius of the series. Several forces are checked at each point of the
     circle.

@@ -1,4 +1,4 @@
-"""The file `film_directions.npz` of a calibrated model, which describes the unknowns of the film except its pretension.
+"""Unknowns of a calibrated film except its pretension, and the file `film_directions.npz` that describes them.
 
 After a calibration, several unknowns of the film remain uncertain: its parameters, its imperfections, its discrepancy
 and its gains. From the misfits of touches, only a few linear combinations of these unknowns can be estimated. These
@@ -8,8 +8,8 @@ amount that depends on the contact:
     ln Q_e = ln Q_e(calibrated film) + sum over k of z_k s_ke(x, y, F),
 
 where Q_e is the charge of electrode e, and z_k is the change along direction k. At a given pretension, the changes z_k
-are independent and have the standard deviation 1. Each s_ke is a Chebyshev series, as in the module `charge_series`.
-The file contains the following arrays:
+are independent and have the standard deviation 1. Each function s_ke is a Chebyshev series, as in the module
+`charge_series`. The file contains the following arrays:
 
     series             coefficients of s, shape (degree + 1, degree + 1, force_degree + 1, n_direction, n_electrode)
     radius_mm          largest distance of a contact from the centre, mm
@@ -118,7 +118,7 @@ class FilmDirections:
         Returns:
             Changes, shape (n, n_direction, n_electrode), dimensionless.
         """
-        *_, n_direction, n_electrode = self.coefficients.shape
+        *_coefficient_counts, n_direction, n_electrode = self.coefficients.shape
         if n_direction == 0:
             return np.zeros((len(contact), 0, n_electrode))
 
@@ -130,9 +130,9 @@ class FilmDirections:
         """Compute the derivatives of the misfit vectors of touches with respect to the logarithms of their charges.
 
         The misfit vector is the part of the charges, in units of their noise, that no contact explains. Let d be a
-        small change of ln Q, the logarithms of the charges. In units of their noise, the charges then change by the
-        vector D = Q d / sigma. A change of the contact explains the projection of D onto the subspace that the
-        derivatives of the charges with respect to the contact span. The misfit vector changes by the remaining part of
+        small change of ln Q, the logarithms of the charges. In units of the noise sigma, the charges change by the
+        vector D = Q d / sigma. The derivatives of the charges with respect to the contact span a subspace. A change of
+        the contact explains the projection of D onto this subspace. The misfit vector changes by the remaining part of
         D.
 
         Args:

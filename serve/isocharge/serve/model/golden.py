@@ -53,7 +53,7 @@ def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
     When two outputs are compared, the tolerance is proportional to the magnitude of the output. Below the floor, the
     tolerance is constant.
 
-    The floors have the values of `FLOORS` for a small film. The floors of x and y grow in proportion to the radius of
+    For a small film, the floors have the values in `FLOORS`. The floors of x and y grow in proportion to the radius of
     the working area above `REFERENCE_RADIUS_MM`, and are at least the rms position error of the model. The floor of the
     force grows in proportion to the largest force above `REFERENCE_FORCE_N`.
 
@@ -63,7 +63,7 @@ def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
     x_floor_mm, y_floor_mm, force_floor_N = FLOORS["contact"]
     radius_mm = max(math.hypot(x_mm, y_mm) for x_mm, y_mm in metadata.working_area_mm)
     position_rms_mm = metadata.errors.get("position_rms_mm", 0.0)
-    _, max_force_N = metadata.force_range_N
+    _min_force_N, max_force_N = metadata.force_range_N
     position_factor = max(1.0, radius_mm / REFERENCE_RADIUS_MM, position_rms_mm / x_floor_mm)
     force_factor = max(1.0, max_force_N / REFERENCE_FORCE_N)
     return x_floor_mm * position_factor, y_floor_mm * position_factor, force_floor_N * force_factor
@@ -110,7 +110,7 @@ class Golden:
 def make_golden(
     session: ort.InferenceSession, onnx_model: bytes, charge_pC: Singles, contact_floor: tuple[float, float, float]
 ) -> Golden:
-    """Compute the golden vectors of a new model, which are given charges and the outputs for these charges.
+    """Compute the golden vectors of a new model: the given charges, and the outputs for these charges.
 
     Args:
         session: Session of the model.

@@ -68,7 +68,9 @@ Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 class UnnoticedPresses(Struct, frozen=True, kw_only=True):
-    """Shares of presses outside the working area for which the model reports a wrong contact without a flag.
+    """Shares of unnoticed presses among the presses outside the working area.
+
+    A press is unnoticed if the model reports a wrong contact without a flag.
 
     The area between two circles about the origin is divided into rings of equal width. Each ring is divided into equal
     sectors. The first sector of a ring begins at the x axis, and the other sectors follow anticlockwise.

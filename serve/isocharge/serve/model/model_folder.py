@@ -82,7 +82,7 @@ def find_labelled_model(label: str, models: Path | None = None) -> Path:
     Raises:
         ModelError: If the text is not a label, or if no repository contains the model.
     """
-    name, _, version = label.partition("/")
+    name, _slash, version = label.partition("/")
     if not (NAME.fullmatch(name) and VERSION.fullmatch(version)):
         raise ModelError(f"model {shown(label)}: expected the label NAME/VERSION of a model; give the model by --model")
     roots = repositories(models)
@@ -130,7 +130,7 @@ def _released_models() -> Path:
 def _version_folder(path: Path) -> Path | None:
     """Return the version folder of the model at a path.
 
-    For the path of a model folder, the folder of the highest version is returned.
+    If the path is a model folder, the folder of the highest version is returned.
 
     Args:
         path: Path of a model folder, of a version folder, or of a `model.onnx`.
@@ -149,7 +149,7 @@ def _version_folder(path: Path) -> Path | None:
 
 
 def version_folders(folder: Path) -> dict[int, Path]:
-    """Return the version folders of a model, by their version numbers in ascending order.
+    """Return the version folders of a model in ascending order of their version numbers.
 
     A version folder is a subfolder of the model folder whose name is a whole number.
     """
@@ -359,7 +359,8 @@ def _write_triton_config(path: Path, metadata: ModelMetadata, *, has_correlation
     """Write the file `config.pbtxt`, with which Triton can serve all versions of a model.
 
     The file may list only outputs that every version computes. If an existing file does not list the correlations, an
-    older version does not compute the correlations. The new file then does not list the correlations either.
+    older version of the model does not compute the correlations. In this case, the new file does not list the
+    correlations either.
 
     Args:
         path: The file, which may exist already.

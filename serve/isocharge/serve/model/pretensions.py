@@ -1,4 +1,4 @@
-"""The file `pretensions.npz` of a calibrated model, which contains the weights of its network at several pretensions.
+"""Network weights of a calibrated model at several pretensions, and the file `pretensions.npz` with the weights.
 
     about                JSON: the numbers of `Pretensions`, and the names of the weights in the order of the layers
     node_MPa             pretensions at which the weights are given, including the pretension of the calibration
@@ -169,7 +169,11 @@ class Pretensions:
         return replace(self, node_MPa=node_MPa, weights=weights)
 
     def constants(self, pretension_MPa: float) -> dict[str, Singles]:
-        """Return the constants of the graph by their names, at one pretension within `range_MPa`."""
+        """Return the constants of the graph at one pretension, as a dictionary from names to arrays.
+
+        Args:
+            pretension_MPa: The pretension, MPa, within `range_MPa`.
+        """
         single_network = self.at(np.array([pretension_MPa]))
         return {name: node_weights[0] for name, node_weights in single_network.weights.items()}
 
@@ -209,13 +213,14 @@ class Pretensions:
         n_electrode = inputs.shape[1]
         node_vectors = outputs[..., -n_electrode:]  # shape (k, m, n_electrode)
 
-        # Find the two neighbouring pretensions of `node_MPa`, and the position between both from 0 to 1.
+        # Find the two neighbouring pretensions of `node_MPa`. The fraction is 0 at the lower and 1 at the upper one.
         upper = np.clip(np.searchsorted(self.node_MPa, pretension_MPa), 1, self.node_MPa.size - 1)
         lower = upper - 1
         gap_MPa = self.node_MPa[upper] - self.node_MPa[lower]
-        position = np.clip((pretension_MPa - self.node_MPa[lower]) / gap_MPa, 0.0, 1.0)  # shape (n,)
-        fraction = position[:, None, None]  # shape (n, 1, 1), the same for all presses and electrodes
-        interpolated = (1.0 - fraction) * node_vectors[lower] + fraction * node_vectors[upper]  # (n, m, n_electrode)
+        fraction = np.clip((pretension_MPa - self.node_MPa[lower]) / gap_MPa, 0.0, 1.0)  # shape (n,)
+        upper_weight = fraction[:, None, None]  # shape (n, 1, 1), the same for all presses and electrodes
+        lower_vectors = (1.0 - upper_weight) * node_vectors[lower]  # shape (n, m, n_electrode)
+        interpolated = lower_vectors + upper_weight * node_vectors[upper]
 
         # Change the length of each vector from |u| to the misfit. A smallest length prevents a division by 0.
         length = np.maximum(np.linalg.norm(interpolated, axis=2, keepdims=True), MIN_LENGTH)

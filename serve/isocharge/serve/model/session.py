@@ -83,7 +83,7 @@ def open_session(
 def _decode_texts(session: ort.InferenceSession) -> None:
     """Check that the metadata and the names of the tensors of a session are valid UTF-8.
 
-    The texts are only read, because onnxruntime raises an exception when it reads a text that is not valid.
+    The function only reads the texts, because onnxruntime raises an exception when it reads a text that is not valid.
     """
     _ = session.get_modelmeta().custom_metadata_map
     _ = [tensor.name for tensor in (*session.get_inputs(), *session.get_outputs())]
@@ -189,7 +189,7 @@ def _check_tensors(kind: str, tensors: list[ort.NodeArg], widths: dict[str, int]
 def _row_width(shape: list[int | str | None]) -> object:
     """Return the width of a tensor of shape [n, width] with a variable n.
 
-    For any other shape, return the whole shape. A shape differs from every expected width, so the comparison fails.
+    For any other shape, return the whole shape. A shape never equals an expected width, so the comparison fails.
     """
     is_batch = len(shape) == 2 and not isinstance(shape[0], int)  # a variable size is a name or None
     return shape[1] if is_batch else shape
@@ -288,19 +288,19 @@ def _columns(widths: Mapping[str, int]) -> dict[str, slice]:
 def _bind(
     session: ort.InferenceSession, charges: Singles, outputs: Singles, columns: Mapping[str, slice]
 ) -> ort.IOBinding:
-    """Bind arrays to the input and the outputs of a session, which then reads and writes the arrays without copies.
+    """Bind arrays to the input and the outputs of a session, so that the session needs no copies of the arrays.
 
     Args:
         session: Session of the model.
         charges: Array from which the charges are read, shape (1, electrodes).
         outputs: Array into which all outputs are written, shape (size,).
-        columns: Position of each output in `outputs` by its name.
+        columns: Columns of each output in `outputs`, by the name of the output.
     """
     binding = session.io_binding()
     binding.bind_input(INPUT, "cpu", 0, np.float32, charges.shape, charges.ctypes.data)
-    for name, position in columns.items():
-        width = position.stop - position.start
-        binding.bind_output(name, "cpu", 0, np.float32, (1, width), outputs[position].ctypes.data)
+    for name, output_columns in columns.items():
+        width = output_columns.stop - output_columns.start
+        binding.bind_output(name, "cpu", 0, np.float32, (1, width), outputs[output_columns].ctypes.data)
     return binding
 
 

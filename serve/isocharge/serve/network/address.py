@@ -1,6 +1,6 @@
-"""Settings of the HTTP server and of the gRPC server, namely address, TLS certificate, token and limits.
+"""Addresses, TLS certificates, tokens and limits of the HTTP server and the gRPC server.
 
-By default, a server listens on the loopback address. Only programs on the same machine can then connect to the server.
+By default, a server listens on the loopback address, to which only programs on the same machine can connect.
 """
 
 import contextlib
@@ -42,7 +42,7 @@ class Address:
 
     @property
     def is_private(self) -> bool:
-        """Whether only programs on this machine can connect."""
+        """Whether only programs on this machine can connect to the address."""
         address = ip_address(self.host)
         return self.uds is not None or self.host == "localhost" or (address is not None and address.is_loopback)
 
@@ -72,7 +72,7 @@ class Address:
             raise ListenError(f"cannot listen on {place}: {reason}") from error
 
     def release(self) -> None:
-        """Remove the file of the closed Unix socket, unless another server listens on this socket."""
+        """Remove the file of a closed Unix socket, unless another server listens on the same path."""
         if self.uds:
             with contextlib.suppress(ListenError):
                 _remove_stale(self.uds)
@@ -94,7 +94,7 @@ class Address:
 
 
 def ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """Parse an IP address, or return None if the text is not an IP address but a host name."""
+    """Parse the text of an IP address, and return None if the text is not an IP address."""
     try:
         return ipaddress.ip_address(host)
     except ValueError:
@@ -116,7 +116,7 @@ def check_exposure(address: Address, *, has_token: bool) -> None:
 
 
 def _listen_unix(path: Path, backlog: int) -> socket.socket:
-    """Open a Unix socket that listens and that only its owner can use, and return the socket.
+    """Open a listening Unix socket that only its owner can use, and return the socket.
 
     Args:
         path: Path of the socket. If an earlier server has left a file there, this file is removed first.
@@ -137,7 +137,9 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove the file of a Unix socket on which no server listens any more. If there is no such file, do nothing.
+    """Remove the file of a Unix socket if no server listens on the socket any more.
+
+    If the file does not exist, the function does nothing.
 
     Raises:
         ListenError: If the file is not a socket, or if a server listens on the socket.
@@ -155,7 +157,7 @@ def _remove_stale(path: Path) -> None:
 
 @dataclass(frozen=True)
 class Tls:
-    """Files with the certificate chain and the private key of a server, in the format PEM.
+    """PEM files that contain the certificate chain and the private key of a server.
 
     Attributes:
         certificate: File with the certificate chain.
@@ -166,7 +168,7 @@ class Tls:
     key: Path | None = None
 
     def context(self) -> ssl.SSLContext:
-        """Create the TLS context of a server from the files.
+        """Create the TLS context of a server from its certificate and its private key.
 
         Raises:
             InputError: If a file cannot be read, or if the certificate and the key do not belong together.
@@ -188,7 +190,7 @@ class Tls:
         return context
 
     def key_and_certificate(self) -> tuple[bytes, bytes]:
-        """Read the files, and return the private key and the certificate chain, in this order.
+        """Read the private key and the certificate chain, and return both in this order.
 
         The function `grpc.ssl_server_credentials` requires this order.
 
@@ -202,12 +204,12 @@ class Tls:
 class Token:
     """Secret text that clients must send.
 
-    The time that a comparison takes does not depend on how many characters of a wrong token are correct. A client
-    therefore cannot guess the token character by character.
+    The duration of a comparison does not depend on how many characters of a wrong token are correct. A client therefore
+    cannot use the duration to guess the token character by character.
     """
 
     def __init__(self, token: str) -> None:
-        """Check the characters of the token, and store the value of the header that clients must send.
+        """Check that the token contains only valid characters, and store the header value that clients must send.
 
         Args:
             token: The secret text.
@@ -250,8 +252,8 @@ class Token:
 class ServerLimits:
     """Limits of one server.
 
-    With the default values, a server accepts the largest batch of presses with four electrodes, even if it is sent as
-    JSON with all digits.
+    With the default limits, a server accepts the largest batch of presses of a film with four electrodes, even if the
+    batch is sent as JSON and each number has all its digits.
 
     Attributes:
         batch: Largest number of presses in one request.
@@ -275,7 +277,7 @@ class ServerLimits:
     connections: int = 1024
 
     def check_body(self, size: int) -> None:
-        """Check the size of a body, or the size of the part of a body that has arrived so far.
+        """Check that the size of a body, or of the part that has arrived so far, does not exceed `body_bytes`.
 
         Args:
             size: The size, bytes.

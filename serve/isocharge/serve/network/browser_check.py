@@ -2,20 +2,20 @@
 
 A page in a browser can send requests to every address that the browser can reach, including the loopback address. If
 the page sends a form, or a `fetch` with `mode: "no-cors"`, it cannot read the response, but the server executes the
-request. An attacker can also use DNS rebinding. After the page was loaded, the attacker changes the address of the host
-name of the page to the address of this machine. The browser then treats the page as a page of this server, so that the
-page can also read the responses.
+request. An attacker can also use DNS rebinding. After the browser has loaded the attacker's page, the attacker changes
+the DNS entry of the page's host name to the address of this machine. The browser then treats the attacker's page as a
+page of this server, and the page can also read the responses.
 
-The server recognises such requests by the following headers, which pages cannot change.
+The server recognises requests from pages of other sites by the following headers, which pages cannot change.
 
-- The header `Host` contains the host name that the browser has requested. After DNS rebinding, this name is neither an
-  IP address nor a name of this server.
+- The header `Host` contains the host name that the browser has requested. After DNS rebinding, `Host` contains neither
+  an IP address nor a name of this server.
 - The header `Origin` contains the site of the page that has sent the request.
-- The header `Sec-Fetch-Site` states whether the page belongs to the same site. Browsers send this header even with
+- The header `Sec-Fetch-Site` states whether the page belongs to the same site. Browsers send `Sec-Fetch-Site` even with
   requests that have no header `Origin`.
 
-Programs other than browsers send neither `Origin` nor `Sec-Fetch-Site`. The server therefore checks only the header
-`Host` of their requests.
+Programs other than browsers send neither `Origin` nor `Sec-Fetch-Site`. In the requests of such programs, the server
+therefore checks only the header `Host`.
 """
 
 from collections.abc import Iterable, Mapping
@@ -41,7 +41,7 @@ Browsers send `same-origin` if a page of this server sends the request, and `non
 
 
 class BrowserCheck:
-    """Check that refuses requests from web pages of other sites.
+    """Filter that refuses requests from web pages of other sites.
 
     Args:
         host: Host name or address on which the server listens.
@@ -92,9 +92,9 @@ class BrowserCheck:
         """Return the reason why a request is refused, or None if the request is accepted.
 
         The header `Host` must contain a name or an address of this server, unless every host is accepted. If the
-        request has a header `Origin`, the page with this origin must belong to this server. If the request has no
-        header `Origin`, the header `Sec-Fetch-Site` must not state that another site has sent the request. However, the
-        request is accepted if the user has followed a link from another site to a page of this server.
+        request has a header `Origin`, the header must contain the origin of a page of this server. If the request has
+        no header `Origin`, the header `Sec-Fetch-Site` must not state that another site has sent the request. As an
+        exception, a request is accepted if the user has followed a link on another site to a page of this server.
 
         Args:
             method: Method in capitals.
@@ -141,9 +141,9 @@ class BrowserCheck:
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
         """Return whether the page that has sent a request belongs to this server.
 
-        The page belongs to this server if the page has the host and the port to which the request was sent. A reverse
-        proxy may have replaced the header `Host`. The page therefore also belongs to this server if its host name is
-        one of the allowed names. However, a page with the requested host name and another port belongs to another
+        A page belongs to this server if its origin contains the same host and the same port as the header `Host`. A
+        page also belongs to this server if its host name is one of the allowed names, because a reverse proxy may have
+        replaced the header `Host`. However, a page with the requested host name and a different port belongs to another
         server.
 
         Args:

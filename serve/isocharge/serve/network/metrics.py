@@ -1,8 +1,8 @@
-"""Counters of the models and of the traffic in the text format of Prometheus, which the path `/metrics` returns.
+"""Metrics in the text format of Prometheus, which the server returns under the path `/metrics`.
 
 While a request is answered, only plain integers are incremented, which takes a fraction of a microsecond. Updating a
-histogram of the package `prometheus_client` would take several microseconds. The metrics are computed from the integers
-when Prometheus requests them.
+histogram of the package `prometheus_client` would take several microseconds. The metrics are computed from these
+integers only when Prometheus requests the metrics.
 """
 
 from collections.abc import Iterable
@@ -70,8 +70,8 @@ class Metrics(Collector):
 def _model_families(store: ModelStore) -> Iterable[Metric]:
     """Return the metrics `isocharge_model` and `isocharge_model_ready`.
 
-    The first metric contains the sensor and the checksum of each loaded version. The second metric contains the state
-    of every version.
+    The metric `isocharge_model` contains the sensor and the checksum of each loaded version. The metric
+    `isocharge_model_ready` states whether each version is loaded.
     """
     info = InfoMetricFamily("isocharge_model", "Loaded versions of the models.", labels=VERSION_LABELS)
     for loaded in store.loaded_versions():
@@ -87,7 +87,7 @@ def _model_families(store: ModelStore) -> Iterable[Metric]:
 
 
 def _traffic_families(traffic: Traffic) -> Iterable[Metric]:
-    """Return the metrics with the numbers of requests, of open connections and of lost log lines."""
+    """Return the metrics that count requests, open connections and lost log lines."""
     requests = CounterMetricFamily(
         "isocharge_requests", "Requests that were answered or refused.", labels=("transport", "route", "status")
     )
@@ -127,7 +127,7 @@ def _inference_families(counters: _Counters) -> Iterable[Metric]:
 
 
 def _latency_families(counters: _Counters) -> Iterable[Metric]:
-    """Return the latency histogram, and the total time of each stage of an inference.
+    """Return the metrics with the latency histogram and with the total time of each stage of an inference.
 
     Both metrics have values for each version of a model.
 

@@ -1,10 +1,11 @@
 """Store of the models that a server uses. The store contains all versions of all models in one or more folders.
 
-When a version is loaded, the store checks its checksum, its metadata and its shapes, and computes its golden vectors
-again. If a check fails, the version is refused, and the reason is stored. All other versions remain available.
+When the store loads a version of a model, it checks the checksum, the metadata and the shapes of the tensors, and
+computes the golden vectors again. If a check fails, the version is refused, and the reason is stored. All other
+versions remain available.
 
 When a model is loaded again, its files are read into new sessions. The new sessions then replace the old sessions in a
-single assignment. Requests that have already begun are finished with the old sessions. If the new files of a version
+single assignment. Requests that have already begun are answered with the old sessions. If the new files of a version
 are refused, the old version remains available.
 """
 
@@ -54,7 +55,7 @@ class LoadedVersion:
 
     @cached_property
     def validity(self) -> Validity:
-        """Limits of the contacts for which the model is valid."""
+        """Limits within which the contacts that the model estimates are valid."""
         return Validity.of(self.metadata)
 
     @cached_property
@@ -63,7 +64,7 @@ class LoadedVersion:
         return tuple(output_widths(self.model.session))
 
     def press_of_thread(self) -> BoundPress:
-        """Return an object that runs the model for a single press, and that reuses its memory.
+        """Return an object that runs the model for single presses and reuses the memory of earlier presses.
 
         Each thread has its own object, which is created when the thread calls this method for the first time.
         """
@@ -186,8 +187,8 @@ class ModelStore:
     def version_states(self) -> list[dict[str, str]]:
         """Return one row for every version that is loaded, was refused or was unloaded.
 
-        A row contains the name of the model, the number of the version, the state of the version, and, if it is not
-        loaded, the reason.
+        A row contains the name of the model, and the number and the state of the version. If the version was refused or
+        unloaded, the row also contains the reason.
         """
         reasons = self._refused
         loaded_keys = {(loaded.metadata.name, loaded.metadata.version) for loaded in self.loaded_versions()}
@@ -203,7 +204,7 @@ class ModelStore:
         ]
 
     def index(self) -> list[dict[str, str]]:
-        """Return the rows of `version_states`, followed by one row for each further model in the folders."""
+        """Return the rows of `version_states`, followed by one row for each model that has no version among them."""
         rows = self.version_states()
         listed_names = {row["name"] for row in rows}
         for name in self._folders():
@@ -212,7 +213,7 @@ class ModelStore:
         return rows
 
     def counters(self) -> dict[tuple[str, str], Statistics]:
-        """Return copies of the counters of every version, by name and version.
+        """Return a copy of the counters of every version, by model name and version number.
 
         The result also contains versions that are no longer loaded.
         """
@@ -248,7 +249,7 @@ class ModelStore:
             )
 
     def unload(self, name: str) -> None:
-        """Remove all versions of a model. Requests that have already begun are still finished.
+        """Remove all versions of a model. Requests that have already begun are still answered.
 
         Raises:
             ModelNotFound: If no version of the model is loaded.
@@ -258,10 +259,9 @@ class ModelStore:
             self._replace(name, [], reasons)
 
     def _load_versions(self, name: str, folder: Path) -> dict[tuple[str, int], str]:
-        """Load every version of a model from its folder, and replace the versions that were loaded before.
+        """Load every version in the folder of a model, and replace the versions that were loaded before.
 
-        If a version is refused, or if no version is found, versions that were loaded before and were not replaced
-        remain loaded.
+        If a version is refused, or if no version is found, every earlier version that was not replaced remains loaded.
 
         Args:
             name: Name of the model.
@@ -355,8 +355,7 @@ def _find_model_folders(roots: Sequence[Path]) -> Mapping[str, Path]:
 def _refusal_reason(folder: Path, error: Exception) -> str:
     """Return the reason why a version is refused.
 
-    An error that is not a ModelError is unexpected. Such an error is therefore also written to the log with its
-    traceback.
+    Every error other than a ModelError is unexpected, and is therefore also written to the log with its traceback.
 
     Args:
         folder: Folder of the version.

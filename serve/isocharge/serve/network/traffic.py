@@ -1,12 +1,13 @@
 """Counters and log of the HTTP server and of the gRPC server.
 
 The class `Traffic` counts requests by route and status. The class `Statistics` counts the requests to one version of a
-model, their duration, and the presses with a large misfit. The statistics of Triton's protocol and the path `/metrics`
-return these counts. The class `RequestLog` writes one line of JSON for each request.
+model, their duration, and the presses with a large misfit. Clients can read the counts of both classes in the
+statistics of Triton's protocol and under the path `/metrics`. The class `RequestLog` writes one line of JSON for each
+request.
 
-The line of a request contains no text that a client has sent. The names of routes, models, statuses and errors are
+The log line of a request contains no text that a client has sent. The names of routes, models, statuses and errors are
 defined by this server, and the address of the client comes from the operating system. A client therefore cannot forge a
-line, fill the disk with long lines, write a secret into the log, or create new counters.
+log line, fill the disk with long lines, write a secret into the log, or create new counters.
 """
 
 import logging
@@ -55,7 +56,7 @@ class Exchange(NamedTuple):
 
 
 class RequestLog(logging.Handler):
-    """Log with one line of JSON for each request, and for each message of the module `logging`.
+    """Log that contains one line of JSON for each request and for each message of the module `logging`.
 
     Args:
         write: Function that writes a line, which is given without a line feed. The function is called by several
@@ -93,7 +94,7 @@ class RequestLog(logging.Handler):
         self._write_line(level, event=event, message=self._clean(message))
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a line with a message of the module `logging`, and with its traceback if there is one."""
+        """Write a line with a message of the module `logging`, and with the traceback of the message if it has one."""
         fields = {"event": "message", "logger": record.name, "message": self._clean(record.getMessage())}
         if record.exc_info and record.exc_info[0] is not None:
             fields["traceback"] = self._clean("".join(traceback.format_exception(*record.exc_info)))
@@ -103,10 +104,10 @@ class RequestLog(logging.Handler):
         self._write(orjson.dumps({"time": datetime.now(UTC), "level": level} | fields).decode())
 
     def _clean(self, text: str) -> str:
-        """Prepare a text for the log, and return the result.
+        """Replace characters that the log must not contain, and shorten a long text.
 
-        Characters that UTF-8 cannot encode are replaced by "?", and the secret is replaced by "[secret]". If the text
-        is then longer than `MAX_TEXT_CHARACTERS` characters, its middle is replaced by " [...] ".
+        Characters that UTF-8 cannot encode are replaced by "?", and the secret is replaced by "[secret]". If the
+        resulting text is longer than `MAX_TEXT_CHARACTERS` characters, its middle is replaced by " [...] ".
         """
         cleaned = text.encode("utf-8", "replace").decode()  # lone surrogates become "?"
         if self._secret:
@@ -140,7 +141,7 @@ class Traffic:
             self._requests[key] = self._requests.get(key, 0) + 1
 
     def count_and_log(self, exchange: Exchange) -> None:
-        """Count a request that was answered, and write a line about the request to the log if there is a log."""
+        """Count a request that was answered, and log the request if there is a log."""
         self.count(exchange.transport, exchange.route, exchange.status)
         if self.log is not None:
             self.log.write_exchange(exchange)
@@ -247,7 +248,7 @@ class Statistics:
         return self.presses - self.unchecked
 
     def snapshot(self) -> "Statistics":
-        """Return a copy of all counters. No other thread can change a counter while they are copied."""
+        """Return a copy of all counters. No other thread can change a counter while the counters are copied."""
         with self._lock:
             return replace(self, latency=[*self.latency], stages_ns=[*self.stages_ns], _lock=threading.Lock())
 

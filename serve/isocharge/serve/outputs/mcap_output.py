@@ -14,10 +14,10 @@ ROS2_SUFFIX = ".ros2.mcap"
 
 
 class McapOutput:
-    """Writes records into a new MCAP file.
+    """Output that writes records to a new MCAP file.
 
-    If the records come from a sensor, the file is created under its final name. In a replay, the file has a temporary
-    name until it is complete.
+    If the records come from a sensor, the file has its final name from the beginning. In a replay, the file has a
+    temporary name until the file is complete.
     """
 
     def __init__(self, path: Path, electrodes: tuple[str, ...], encoding: RecordEncoding, *, is_live: bool) -> None:

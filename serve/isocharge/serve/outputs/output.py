@@ -1,7 +1,7 @@
-"""Interface of an output, and description of a kind of output.
+"""Interface that every output implements, and description of a kind of output.
 
-Another package can add a kind of output. The package must declare an entry point in the group "isocharge.outputs" that
-refers to an `OutputKind`.
+Other packages can add kinds of outputs. Such a package must declare an entry point in the group "isocharge.outputs".
+The entry point must refer to an `OutputKind`.
 
 Example of such an entry point in pyproject.toml:
 
@@ -22,8 +22,8 @@ class Output(Protocol):
     """A destination of prediction records.
 
     An output may also have a method `discard()`. If the records are incomplete because of an error, or because a replay
-    was stopped, `discard` is called instead of `close`. In its method `discard`, an output can remove a file that
-    contains only some of the records.
+    was stopped, `discard` is called instead of `close`. The method `discard` can remove a file that contains only some
+    of the records.
     """
 
     def write(self, record: PredictionRecord, /) -> None:
@@ -38,7 +38,7 @@ class Output(Protocol):
 
 
 def discard(output: Output) -> None:
-    """Call the method `discard` of an output whose records are incomplete, or `close` if it has no such method."""
+    """Call the method `discard` of an output. If the output has no such method, call `close` instead."""
     discard_or_close = getattr(output, "discard", output.close)
     discard_or_close()
 
@@ -48,9 +48,9 @@ class _Incomplete(Exception):
 
 
 def exit_with_error(contexts: ExitStack) -> None:
-    """Leave contexts as if their block had raised an error.
+    """Leave contexts in the same way as after an error in their block.
 
-    A context that creates a file then removes the incomplete file.
+    If a context has created a file, the context therefore removes the incomplete file.
 
     Args:
         contexts: The contexts that were entered.
@@ -61,7 +61,7 @@ def exit_with_error(contexts: ExitStack) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class OutputContext:
-    """Properties of the stream of records that an output may need.
+    """Properties of a stream of records, which are passed to the outputs.
 
     Attributes:
         electrodes: Names of the electrodes, in the order of the charges.
@@ -83,7 +83,7 @@ class OutputContext:
 
 @dataclass(frozen=True, kw_only=True)
 class OutputKind:
-    """A kind of output, such as CSV files. The form of a target decides which kind is used.
+    """A kind of output, such as CSV files. The form of a target decides which kind of output is used.
 
     Attributes:
         form: Form of the targets, for help and messages, such as `FILE.csv`.

@@ -1,4 +1,4 @@
-"""Output with its own queue and thread. A live stream therefore never waits for a slow consumer."""
+"""Output with its own queue and thread, so that a live stream never waits for a slow consumer."""
 
 import logging
 from collections.abc import Callable
@@ -41,7 +41,7 @@ class QueuedOutput:
         return self._queue.lost
 
     def write(self, record: PredictionRecord) -> None:
-        """Append a record to the queue. The thread later writes the record to the other output.
+        """Append a record to the queue, from which the thread writes the record to the other output.
 
         Raises:
             Exception: The error of the other output, if its errors end the stream.
@@ -52,7 +52,7 @@ class QueuedOutput:
         """Write the records that are still in the queue, and close the other output.
 
         If the consumer no longer accepts records, the remaining records are dropped. If the other output has raised an
-        error before, it is discarded instead of closed.
+        error before, the other output is discarded instead of closed.
         """
         self._queue.close()
         if self._queue.is_stuck:  # the thread is still in `write` of the other output, which therefore cannot be closed
@@ -68,7 +68,7 @@ class QueuedOutput:
     def _write(self, record: PredictionRecord) -> None:
         """Write a record to the other output, unless the other output has failed before.
 
-        The thread of the queue calls this method.
+        The method is called by the thread of the queue.
         """
         if self.has_failed:
             return
@@ -80,8 +80,8 @@ class QueuedOutput:
     def _handle_error(self, error: Exception) -> None:
         """Handle an error of the other output.
 
-        If errors of the other output end the stream, the error is raised. Otherwise the first error is written to the
-        log, and later errors are ignored.
+        If errors of the other output end the stream, the error is raised. Otherwise, the first error of the output is
+        written to the log, and its later errors are ignored.
 
         Raises:
             Exception: The given error, if errors of the other output end the stream.

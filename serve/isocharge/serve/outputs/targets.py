@@ -1,4 +1,4 @@
-"""List of the available kinds of outputs, and the class that writes records to all outputs of a command."""
+"""Available kinds of outputs, and the class that writes records to all outputs of a command."""
 
 from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint, entry_points
@@ -29,7 +29,7 @@ ENTRY_POINTS = "isocharge.outputs"
 
 
 def target_forms() -> str:
-    """Return the forms of all targets that this package accepts, separated by commas, for help texts and messages."""
+    """Return the forms of all targets that this package accepts, as a text with commas between the forms."""
     return ", ".join(kind.form for kind in OUTPUT_KINDS)
 
 
@@ -60,7 +60,7 @@ def kind_of(target: str) -> OutputKind:
 
 
 def _load_kind(entry_point: EntryPoint) -> OutputKind:
-    """Load and return the kind of output that another package adds.
+    """Load a kind of output that another package adds, and return it.
 
     Args:
         entry_point: Entry point of the package, which refers to an OutputKind.
@@ -86,13 +86,13 @@ def _load_kind(entry_point: EntryPoint) -> OutputKind:
 def _failure(target: str, error: Exception) -> OutputError:
     """Return an OutputError that tells the user which output raised an unexpected exception.
 
-    Such an exception may come from another package, which adds a kind of output.
+    The exception may come from another package that adds a kind of output.
     """
     return OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
 
 
 class Outputs:
-    """All outputs of a command. The object is a context manager that opens and closes the outputs.
+    """Context manager that opens and closes all outputs of a command.
 
     Attributes:
         not_written: For each target that did not receive all records, the number of missing records, or None if an
@@ -163,7 +163,7 @@ class Outputs:
     def __exit__(self, error: type[BaseException] | None, *_: Any) -> None:
         """Close the outputs.
 
-        If an exception has ended a replay, the outputs are discarded instead of closed. Their incomplete files are then
+        If an exception has ended a replay, the outputs are discarded instead of closed, and their incomplete files are
         removed.
         """
         if error is not None and not self._context.is_live:
@@ -173,9 +173,9 @@ class Outputs:
 
     @property
     def has_incomplete_file(self) -> bool:
-        """Whether an output other than standard output did not receive all records.
+        """Whether at least one output other than standard output has not received all records.
 
-        The value is only valid after the outputs were closed.
+        The value is valid only after the outputs were closed.
         """
         return any(not kind_of(target).is_standard_output for target in self.not_written)
 
@@ -194,7 +194,7 @@ class Outputs:
                 raise _failure(target, error) from error
 
     def close(self) -> None:
-        """Close all open outputs, and store in `not_written` how many records each output did not receive.
+        """Close all open outputs, and store the number of records that each output has not received in `not_written`.
 
         Raises:
             OSError, IsochargeError: The first error that occurred. All other outputs are closed before it is raised.
@@ -220,6 +220,6 @@ class Outputs:
             self.not_written[target] = None  # the number of missing records is unknown
 
     def _remove_each(self) -> Iterator[tuple[str, Output]]:
-        """Remove the open outputs one after the other, the last one first, and yield each output with its target."""
+        """Remove the open outputs one by one in reverse order, and yield each output with its target."""
         while self._outputs:
             yield self._outputs.popitem()

@@ -17,7 +17,7 @@ class StandardOutput:
     """Output that writes one line to standard output for each record."""
 
     def __init__(self, write: Callable[[str], object], line_of: LineOf, header: str | None = None) -> None:
-        """Write the header to standard output, if there is a header.
+        """Write the header to standard output if there is a header.
 
         Args:
             write: Function that writes a text to standard output.
@@ -40,8 +40,8 @@ class StandardOutput:
 class TextFile:
     """Output that writes one line to a new file for each record.
 
-    If the records come from a sensor, the file is created under its final name, and whole lines are appended to it. In
-    a replay, the file has a temporary name until it is complete.
+    If the records come from a sensor, the file has its final name from the beginning, and whole lines are appended to
+    the file. In a replay, the file has a temporary name until the file is complete.
     """
 
     def __init__(self, path: Path, line_of: LineOf, header: str | None = None, *, is_live: bool) -> None:
@@ -107,6 +107,9 @@ class _NoOutput:
 
     def close(self) -> None:
         pass
+
+
+# The functions below are the attribute `open` of an `OutputKind`. A parameter `_` is not needed by that kind.
 
 
 def _open_stdout_json(_: str, context: OutputContext) -> Output:

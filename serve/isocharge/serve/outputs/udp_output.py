@@ -1,9 +1,9 @@
-"""Output of records as UDP datagrams, each of which contains one record as a JSON object.
+"""Output that sends each record as a JSON object in its own UDP datagram.
 
-The UDP server of PlotJuggler can read the records if its protocol is set to JSON. PlotJuggler expects one JSON object
-in each datagram. PlotJuggler uses the number `timestamp` as the time, and ignores values that are null. Every other
-number is shown as a time series. The name of a time series is the path of the number in the object, such as
-`charge_pC/A`.
+The UDP server of PlotJuggler can receive the records if the protocol of the server is set to JSON. PlotJuggler expects
+one JSON object in each datagram. PlotJuggler uses the number `timestamp` as the time, ignores values that are null, and
+shows every other number as a time series. The name of a time series is the path of the number in the JSON object, such
+as `charge_pC/A`.
 """
 
 import socket
@@ -55,7 +55,7 @@ class UdpOutput:
         self._socket.close()
 
 
-def _open_udp(target: str, _: OutputContext) -> Output:
+def _open_udp(target: str, _: OutputContext) -> Output:  # the output does not depend on the stream
     return UdpOutput(target.removeprefix(SCHEME))
 
 

@@ -4,9 +4,9 @@ Many devices send a counter that wraps to 0 when it overflows. The wraps are rem
 
 The arrival times of readings at the host fluctuate with the delays of the kernel, the cable and the reading program.
 The clock of the device does not fluctuate, but it runs at a slightly different rate than the clock of the host. A
-delay-locked loop of second order (Adriaensen, "Using a DLL to filter time", 2005) fits the clock of the device to the
+second-order delay-locked loop (Adriaensen, "Using a DLL to filter time", 2005) fits the clock of the device to the
 arrival times, and computes a smooth host time for each reading. The bandwidth of the loop is small, so that the loop
-averages over many arrivals. In the first seconds the bandwidth is larger, so that the fit converges quickly.
+averages over many arrivals. In the first seconds, the bandwidth is larger, so that the fit converges quickly.
 """
 
 import math
@@ -84,7 +84,7 @@ class DeviceClock:
         """Return the time at which the next reading was taken, and the time since the previous reading.
 
         If the device sends a clock, the fit converts the clock to host time. If the device sends no clock, the host
-        time is the arrival of the chunk.
+        time is the arrival time of the chunk.
 
         Args:
             t_us: Clock as the device sent it, us; None if the device sends no clock.
@@ -111,7 +111,7 @@ class DeviceClock:
         return ReadingTime(self._latest_host_s, self._device_us, step_us * 1e-6)
 
     def _time_without_clock(self, arrived_s: float) -> ReadingTime:
-        """Return the arrival of the chunk as the time of the reading, because the device sends no clock.
+        """Return the arrival time of the chunk as the time of the reading, because the device sends no clock.
 
         Args:
             arrived_s: Arrival of the chunk that contains the reading, unix seconds.
@@ -123,7 +123,7 @@ class DeviceClock:
         return ReadingTime(arrived_s, None, step_s)
 
     def _is_ahead_of(self, arrived_s: float) -> bool:
-        """Return whether the predicted host time is so far ahead of an arrival that a clock must have been set.
+        """Return whether the predicted host time is so far ahead of an arrival time that a clock must have been set.
 
         All chunks of a file have the same arrival time, which contains no information about the clock. If the arrival
         time equals the arrival time of the previous chunk, the result is therefore False.
@@ -137,7 +137,9 @@ class DeviceClock:
         return self._predict(self._device_us) - arrived_s > MAX_DEVIATION_s
 
     def arrived(self, arrival_s: float) -> None:
-        """Fit the clock to the arrival of a chunk. Call this method after the last reading of the chunk.
+        """Fit the clock of the device to the arrival time of a chunk.
+
+        Call this method after the last reading of the chunk.
 
         If the readings come from a file, all chunks have the same arrival time. An arrival time is therefore used only
         if it differs from the previous arrival time.
@@ -175,7 +177,7 @@ class DeviceClock:
         self._is_fit_provisional = False
 
     def _continue_fit(self, delay_s: float, step_s: float) -> None:
-        """Correct the fit by one step of a delay-locked loop of second order (Adriaensen 2005).
+        """Correct the fit with one step of a second-order delay-locked loop (Adriaensen 2005).
 
         The gain of the loop is w = 2 pi * bandwidth * step_s. The correction adds sqrt(2) w delay_s to the predicted
         host time, and w^2 delay_s / step_s to the rate of the clock. The bandwidth decreases with the age of the fit.
@@ -197,7 +199,7 @@ class DeviceClock:
         return self._fitted_host_s + self.rate * (device_us - (self._fitted_us or 0)) * 1e-6
 
     def _advance(self, t_us: int, modulus: int) -> int:
-        """Remove the wraps from the clock of the next reading, and store the result.
+        """Remove the wraps from the clock value of the next reading, and store the resulting value.
 
         If the clock jumped back, or jumped ahead by more than half of its range, the device has restarted. The fit then
         starts again.

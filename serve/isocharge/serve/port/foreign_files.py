@@ -52,7 +52,7 @@ def _kind_and_advice(name: str, head: bytes) -> tuple[str, str] | None:
     """
     quoted_name = shlex.quote(name)  # for the commands in the advice
     text = head.removeprefix(codecs.BOM_UTF8).lstrip()
-    first_line, _, _ = text.partition(b"\n")
+    first_line, _line_feed, _next_lines = text.partition(b"\n")
     if first_line.startswith(RECORDING_START):
         return "a recording", f"play it with: isocharge serve replay {quoted_name}"
     if first_line.startswith(b"{") and all(key in first_line for key in RECORD_KEYS):
@@ -82,7 +82,7 @@ def _is_table_of_presses(name: str, first_line: bytes) -> bool:
     """Return whether a file is a CSV table of presses or of records.
 
     The file is a table if its header contains a column that only presses or records have. A file whose name ends in
-    `.csv` is also a table if its header consists of names, and boards send no column with one of these names.
+    `.csv` is also a table if its header consists of column names that boards do not send.
 
     Args:
         name: Path of the file, or - for the standard input.

@@ -1,4 +1,4 @@
-"""Recordings: files that contain the bytes from a port and the records that were computed from these bytes.
+"""Recordings, which are files with the bytes from a port and the records computed from these bytes.
 
 The bytes are stored in chunks. A chunk consists of the bytes that arrived together. Each line of the file is a JSON
 object:
@@ -12,8 +12,8 @@ object:
     {"marker": [timestamp, "text"]}               a moment that the user has marked
 
 A replay computes all fields of the records again, except `latency_us`, which is copied from the recording. With the
-same model, the records of the replay are bitwise equal to the recorded records. Each write appends complete lines. If a
-full disk or a power failure leaves an incomplete last line, the incomplete line is ignored.
+same model, the records of the replay are bitwise equal to the recorded records. Each write appends complete lines. A
+full disk or a power failure may leave an incomplete last line, which the reader of the file ignores.
 """
 
 import base64
@@ -57,7 +57,7 @@ Line = TypeVar("Line")
 
 
 class Marker(NamedTuple):
-    """A moment that the user has marked, with a note.
+    """A moment that the user has marked, and the note of the user about this moment.
 
     Attributes:
         timestamp: Time of the marker, unix seconds.
@@ -119,8 +119,8 @@ class Recorder:
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
         """Write a chunk and the records that were computed from it.
 
-        If Ctrl-C interrupts a call, the caller passes the same chunk again. The second call writes nothing if the file
-        has grown since the first call, because the first call has then written the chunk.
+        If Ctrl-C interrupts a call, the caller passes the same chunk again. If the file has grown since the first call,
+        the first call has written the chunk, and the second call writes nothing.
 
         Args:
             chunk: The chunk.
@@ -140,7 +140,7 @@ class Recorder:
         self._write('{"tare": true}')
 
     def back(self) -> None:
-        """Write a request to reset the followed film to its calibration."""
+        """Record a request to reset the estimate of the film to its calibration."""
         self._write('{"back": true}')
 
     def model(self, label: str) -> None:
@@ -182,7 +182,7 @@ class Event(NamedTuple):
 
 
 class Back(NamedTuple):
-    """A recorded request to reset the followed film to its calibration."""
+    """A recorded request to reset the estimate of the film to its calibration."""
 
 
 class NewModel(NamedTuple):
@@ -259,7 +259,7 @@ class Recording:
             yield Event(chunk, tuple(latencies_us))
 
     def records(self, kind: type[Line]) -> Iterator[Line]:
-        """Yield the records that were written, in their order.
+        """Yield the prediction records of the recording in their order.
 
         Args:
             kind: Struct type whose fields are read from each record.
@@ -338,7 +338,7 @@ class _Entry(Struct):
 
     @property
     def recorded_chunk(self) -> Chunk | None:
-        """The chunk of this line; None if the line is not a chunk."""
+        """The chunk that this line contains, or None if the line contains no chunk."""
         if self.chunk is None:
             return None
         timestamp, clock_ns, outage_s, data = self.chunk

@@ -4,13 +4,13 @@ A connection is called a line. A line is either a serial port, which pyserial op
 file descriptors for serial ports, each read from a serial port needs only two system calls. Each datagram of a socket
 is one chunk.
 
-Some boards send one line of text in each datagram, without a line feed at the end. A line feed is then added to the
-datagram, because parsers of text need it. If a datagram of the board has ended with a line feed, nothing is added to
-later datagrams.
+Some boards send one line of text in each datagram, without a line feed at the end. In this case, a line feed is added
+to each datagram, because text parsers need the line feed. If a datagram of the board has ended with a line feed,
+nothing is added to later datagrams.
 
-On a connection with only two wires, each end also receives the bytes that it sends itself. The received bytes then
-begin with an echo of the request, and the echo must be removed. The next request is sent only after the answer has
-arrived and the connection is quiet.
+On a connection with only two wires, each end also receives the bytes that it sends itself. On such a connection, the
+received bytes begin with an echo of the request, and the echo must be removed. The next request is sent only after the
+answer has arrived and the connection is quiet.
 """
 
 import importlib
@@ -52,7 +52,7 @@ class Requester:
     """Scheduler of the requests to a board, which also removes the echoes of the requests from received bytes."""
 
     def __init__(self, request: Request, now_s: Callable[[], float] = time.monotonic) -> None:
-        """Start in a state in which the first request is due at once.
+        """Store the settings, and make the first request due at once.
 
         Args:
             request: The request that the board needs for each frame.
@@ -76,7 +76,7 @@ class Requester:
         self._expected_echo = b""  # bytes of the echo that have not been received yet
 
     def wait_s(self) -> float:
-        """Return the time until the next request is due, s; 0 if a request is due now.
+        """Return the time until the next request is due, s, or 0 if a request is due now.
 
         At least 1 / `rate_Hz` must pass between two requests. After a request without an answer, at least
         `REPEAT_TIME_s` must pass. After the latest received byte, at least `QUIET_TIME_s` must pass.
@@ -153,7 +153,7 @@ class SerialLine:
     """An open connection to a board through a serial port or another port that pyserial supports."""
 
     def __init__(self, url: str, baud: int) -> None:
-        """Open the line, and request from the system that it delivers received bytes without a delay.
+        """Open the line, and configure the system to deliver received bytes without a delay.
 
         Args:
             url: Device path, or a URL that pyserial accepts.
@@ -256,7 +256,7 @@ class UdpSocket:
         addresses = socket.getaddrinfo(
             parts.hostname or "", parts.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
         )
-        family, kind, protocol, _, address = addresses[0]  # the address that the system prefers
+        family, kind, protocol, _canonical_name, address = addresses[0]  # the address that the system prefers
         self._socket = socket.socket(family, kind, protocol)
         try:
             self._socket.bind(address)

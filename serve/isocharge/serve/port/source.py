@@ -60,7 +60,7 @@ class Chunk(NamedTuple):
 
 
 class Port:
-    """Context manager that opens a port, and iterator that yields a `Chunk` whenever bytes arrive.
+    """A port as a context manager and as an iterator, which yields a `Chunk` whenever bytes arrive.
 
     The port is opened when the context is entered. The iterator does not end by itself.
 
@@ -179,7 +179,7 @@ class Port:
 
     @property
     def echo_share(self) -> float:
-        """Fraction of the requests that came back as an echo; 0 for a board that sends frames by itself."""
+        """Fraction of the requests that came back as an echo, or 0 if the board sends frames without requests."""
         return self._requester.echo_share if self._requester else 0.0
 
     def __iter__(self) -> Iterator[Chunk]:
@@ -343,8 +343,8 @@ class FileSource:
     def __iter__(self) -> Iterator[Chunk]:
         """Yield chunks until the file ends.
 
-        All chunks of a file on a disk have the time at which reading began. The chunks of a pipe have the time at which
-        they were read.
+        For a file on a disk, the arrival time of all chunks is the time at which reading began. For a pipe, the arrival
+        time of a chunk is the time at which the chunk was read.
 
         Raises:
             InputError: If the file is a recording, a table or another file that does not come from a board.

@@ -80,7 +80,7 @@ class Contact(NamedTuple):
         )
 
     def fields(self) -> dict[str, Any]:
-        """Return the values of the contact by the names of the fields of a prediction record.
+        """Return the values of the contact as a dictionary with the field names of a prediction record.
 
         If the model computes no correlations, the correlations are None instead of NaN.
         """
@@ -140,11 +140,11 @@ class Sensitivity:
     def shift(
         self, contact: Contact, parameter_change: float, predict_after_step: Callable[[], Contact]
     ) -> tuple[float, float, float]:
-        """Compute by how much a change of the parameter changes the position and the force of a contact.
+        """Compute how a change of the parameter shifts the position and the force of a contact.
 
         The contact is assumed to change in proportion to the parameter. A second prediction gives the change of the
-        contact for one step of the parameter. This change is stored. No second prediction is made for later contacts
-        that are close to the contact for which the change was stored.
+        contact for one step of the parameter. This change is stored. If a later contact is close to the contact for
+        which the change was stored, no second prediction is made.
 
         Args:
             contact: The contact at the present value of the parameter.
@@ -287,7 +287,7 @@ class Validity:
         The first limit is a squared distance from `centre_mm`, mm^2. The second limit is a force, N.
         """
         circumscribed_radius_mm = np.linalg.norm(self.corners_mm - self.centre_mm, axis=1).max()
-        _, max_force_N = self.force_range_N
+        _min_force_N, max_force_N = self.force_range_N
         return float(IMPLAUSIBLE_FACTOR * circumscribed_radius_mm) ** 2, IMPLAUSIBLE_FACTOR * max_force_N
 
     def is_touch(self, charge_pC: Array) -> Booleans:

@@ -80,7 +80,7 @@ class Predictor:
         _check_bound_memory(self._press, loaded)
 
     def with_constants(self, constants: Mapping[str, Singles]) -> "Predictor":
-        """Return a predictor with the same ONNX graph in which the values of some constants are replaced.
+        """Return a predictor with the same ONNX graph, but with new values of some constants.
 
         The call takes about a millisecond.
 
@@ -218,7 +218,7 @@ class Predictor:
 
 
 def _describe(value: object) -> str:
-    """Describe a value for an error message: number type and shape of an array, or type of any other object."""
+    """For an error message, describe an array by its number type and shape, and any other object by its type."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype} of shape {value.shape}"
     return type(value).__name__

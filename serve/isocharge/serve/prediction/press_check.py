@@ -1,7 +1,8 @@
 """Comparison of a model with measured presses.
 
 The rig is the machine that sets the position and the force of each press. The result of the comparison contains the
-errors of the model, the part of the errors that the noise and the uncertainty of the rig explain, and a verdict.
+errors of the model and a verdict. The result also states which part of the errors is explained by the noise and by the
+uncertainty of the rig.
 
 If the noise of the charges and the uncertainty of the rig do not explain the errors, the model does not describe the
 film. Either the film was never calibrated, or the film has aged or crept since its calibration. A drift of the film
@@ -124,9 +125,9 @@ class PressCheck:
 def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     """Compare a model with measured presses.
 
-    A press is compared if all charges of the press are known, and if the position, the force or both are known. A known
-    position must lie in the working area of the model, and a known force must lie in the range of forces of the model.
-    A few bad presses are reported and excluded if all other presses agree with the model.
+    A press is compared if all charges of the press are known, and if the position, the force or both are known. If the
+    position is known, it must lie in the working area of the model. If the force is known, it must lie in the range of
+    forces of the model. A few bad presses are reported and excluded if all other presses agree with the model.
 
     Args:
         predictor: The model.
@@ -173,7 +174,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
 
 
 def _bad_presses(errors: PressErrors) -> Booleans:
-    """Find bad presses, which have improbable errors although all other presses agree with the model.
+    """Find bad presses. A bad press has an improbable error, although all other presses agree with the model.
 
     No press is considered bad in three cases: if all presses together agree with the model, if too many presses have
     improbable errors, or if the other presses do not agree with the model either. One bad press is never too many, even
@@ -204,7 +205,7 @@ def _bad_presses(errors: PressErrors) -> Booleans:
 
 
 def _improbable_presses(errors: PressErrors, is_compared: Booleans) -> Booleans:
-    """Find the compared presses with errors that noise and rig are very unlikely to cause.
+    """Find the compared presses whose errors are very unlikely to be caused by noise and rig.
 
     The limit of the probability is divided by the number of compared presses (Bonferroni correction). If all presses
     are good, the probability that at least one press exceeds the limit is therefore about `BAD_PRESS_PROBABILITY`.
@@ -264,7 +265,7 @@ def _force_summary(errors: PressErrors, is_selected: Booleans) -> ErrorSummary |
 
 
 def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: ModelMetadata) -> str:
-    """Return a statement if so many presses have a large misfit that the number cannot be attributed to chance.
+    """Return a statement if chance cannot explain the number of presses with a large misfit.
 
     The misfit is the distance between the measured charges and the nearest charges of a single contact. A misfit is
     large if it is above the limit of the model, which 1 % of good presses exceed.
@@ -310,7 +311,7 @@ def _probability_of_fewer(misfit_count: int, count: int) -> float:
 def _verdict(
     fits: bool | None, count: int, position: ErrorSummary | None, force: ErrorSummary | None, misfit_text: str
 ) -> str:
-    """Return the result of the comparison in words.
+    """Return a sentence that states the result of the comparison.
 
     Args:
         fits: Whether noise and rig explain the errors; None if there are too few presses.
@@ -369,10 +370,13 @@ def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: Err
 
 
 def _explaining_rig_std(errors: ErrorSummary) -> float:
-    """Return the standard deviation of the rig that would explain the errors, in the unit of the errors.
+    """Return how uncertain the rig would have to be to explain the errors, as a standard deviation.
 
     Args:
         errors: Errors of the positions or of the forces.
+
+    Returns:
+        Standard deviation of the rig, in the unit of the errors.
     """
     return math.sqrt(max(errors.rms**2 - errors.noise**2, 0.0))
 
@@ -416,7 +420,7 @@ def _explain_exclusion(reason: str, metadata: ModelMetadata) -> str:
 
 
 def _bad_press_notes(errors: PressErrors, is_bad: Booleans) -> Iterator[str]:
-    """Yield a note that lists the bad presses; yield nothing if there are no bad presses.
+    """If there are bad presses, yield a note that lists these presses.
 
     Args:
         errors: Errors of all presses.
@@ -429,7 +433,7 @@ def _bad_press_notes(errors: PressErrors, is_bad: Booleans) -> Iterator[str]:
 
 
 def _misfit_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]:
-    """Yield a note if too many presses have a misfit above the limit of the model.
+    """If too many presses have a misfit above the limit of the model, yield a note.
 
     Presses that are excluded from the comparison are also counted.
 
@@ -449,7 +453,7 @@ def _misfit_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]
 def _common_notes(agreement: Agreement) -> Iterator[str]:
     """Yield a note about a common shift of all positions and a note about a common scale factor of all forces.
 
-    Each note is only yielded if the common error is significant.
+    A note about a common error is only yielded if the error is significant.
 
     Args:
         agreement: Tests of the errors, which contain the common errors of x, y and the force.

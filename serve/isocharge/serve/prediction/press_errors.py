@@ -85,7 +85,7 @@ class PressErrors:
 
     @property
     def position_error_mm(self) -> Array:
-        """Distance between predicted and measured position, shape (n,), mm; NaN where the position is unknown."""
+        """Distances between predicted and measured positions, shape (n,), mm; NaN if a position is unknown."""
         return np.hypot(self.error[:, X], self.error[:, Y])
 
     def row(self, press: int) -> dict[str, Any]:
@@ -159,7 +159,7 @@ def misfit_limit(metadata: ModelMetadata) -> float:
 
 
 def _predicted_contacts(predictor: Predictor, charge_pC: Array) -> Array:
-    """Predict the contacts of presses of which some charges may be unknown.
+    """Predict contacts from the charges of presses. Some charges may be unknown.
 
     Args:
         predictor: The model.
@@ -202,7 +202,7 @@ def _flags(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], 
 
 
 def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tuple[str, ...]:
-    """Return the reason why each press is excluded from the comparison; empty if the press is compared.
+    """For each press, return why the press is excluded from the comparison, or an empty text if it is compared.
 
     The measured position and the measured force determine whether a press lies in the domain of the model.
 
@@ -343,7 +343,7 @@ class CommonError:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Results of two statistical tests whether noise and rig explain the errors of the selected presses.
+    """Results of two statistical tests of whether noise and rig explain the errors of the selected presses.
 
     Attributes:
         chi_squared: Sum of the squared errors divided by their expected variances.
@@ -398,8 +398,8 @@ class Agreement:
     def acceptable(self) -> bool:
         """Whether noise and rig explain the errors.
 
-        Each of the two tests rejects good presses with half of the probability `SIGNIFICANCE`. The probability that one
-        of the tests rejects good presses is therefore at most `SIGNIFICANCE`. The expected variances are not known
+        Each of the two tests rejects good presses with a probability of `SIGNIFICANCE` / 2. The probability that one of
+        the tests rejects good presses is therefore at most `SIGNIFICANCE`. The expected variances are not known
         exactly, and for many presses even a small error of these variances would be significant. The scatter is
         therefore also accepted if `chi_squared` exceeds its expected value `degrees` by only a few percent.
         """
@@ -411,7 +411,7 @@ class Agreement:
 
 
 def _p_value(chi_squared: float, degrees: int) -> float:
-    """Return the probability that a chi-squared variable exceeds a value; NaN without degrees of freedom.
+    """Return the probability that a chi-squared variable exceeds a value, or NaN if it has no degrees of freedom.
 
     Args:
         chi_squared: The value, not negative.
@@ -429,27 +429,27 @@ def chi_squared_survival(statistic: float, degrees: int) -> float:
         statistic: The value, not negative. If it is infinite, the probability is 0.
         degrees: Degrees of freedom of the variable, 1 or more.
     """
-    x = 0.5 * statistic
-    if x == 0.0:
+    half_statistic = 0.5 * statistic
+    if half_statistic == 0.0:
         return 1.0
-    if math.isinf(x):
+    if math.isinf(half_statistic):
         return 0.0
 
-    # With x = statistic / 2, the probability is the sum of x^s exp(-x) / Gamma(s + 1) over s = degrees / 2 - 1,
-    # degrees / 2 - 2, ... down to 0 or 1/2, plus erfc(sqrt(x)) if the number of degrees is odd. The term with the
-    # smallest s is computed first: exp(-x) for s = 0, and sqrt(4 x / pi) exp(-x) for s = 1/2.
+    # With x = statistic / 2, the probability is the sum of x^s exp(-x) / Gamma(s + 1) over the exponents
+    # s = degrees / 2 - 1, degrees / 2 - 2, ... down to 0 or 1/2, plus erfc(sqrt(x)) if the number of degrees is odd.
+    # The term with the smallest exponent is computed first: exp(-x) for s = 0, and sqrt(4 x / pi) exp(-x) for s = 1/2.
     is_odd = degrees % 2 == 1
-    smallest_s = 0.5 if is_odd else 0.0
-    smallest_log_term = -x
+    smallest_exponent = 0.5 if is_odd else 0.0
+    smallest_log_term = -half_statistic
     if is_odd:
-        smallest_log_term += 0.5 * math.log(4.0 * x / math.pi)
+        smallest_log_term += 0.5 * math.log(4.0 * half_statistic / math.pi)
 
     # Each term is the previous term times x / s. Logarithms are added, because products of the factors may overflow.
     term_count = degrees // 2
-    s = smallest_s + np.arange(1, term_count)
-    log_ratio_to_smallest = np.concatenate([[0.0], np.cumsum(np.log(x / s))])
+    exponents = smallest_exponent + np.arange(1, term_count)
+    log_ratio_to_smallest = np.concatenate([[0.0], np.cumsum(np.log(half_statistic / exponents))])
     log_terms = smallest_log_term + log_ratio_to_smallest[:term_count]  # no term for one degree of freedom
     probability = float(np.exp(log_terms).sum())
     if is_odd:
-        probability += math.erfc(math.sqrt(x))
+        probability += math.erfc(math.sqrt(half_statistic))
     return min(1.0, probability)

@@ -132,7 +132,7 @@ def write_contacts(
 
 
 def _contact_rows(contact_values: Singles, is_touch: Booleans, validity: Validity | None) -> Iterator[tuple[str, ...]]:
-    """Yield the cells of a CSV row for each press.
+    """For each press, yield the cells of its row in the CSV text.
 
     If a press is not a touch, its force is 0, and its other cells are empty.
 

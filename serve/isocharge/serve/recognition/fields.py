@@ -1,9 +1,9 @@
 """Recognition of the fields of a frame: sync bytes, frame counter, clock and channels.
 
 Every division of the bytes of a frame into fields has a score in bits. The score is the sum of two numbers. The first
-number is the number of bits that are needed to encode the values of a frame if the previous frame is known. The second
-number is the sum of the `Weights` of the fields. The division with the lowest score is chosen. Because of the weights,
-simple divisions have lower scores than complicated divisions. For example, a division is simple if all channels are
+number states how many bits are needed to encode the values of a frame if the previous frame is known. The second number
+is the sum of the `Weights` of the fields. The division with the lowest score is chosen. Because of the weights, a
+simple division has a lower score than a complicated division. A division is simple, for example, if all channels are
 adjacent and have the same type. The script `tests/benchmarks/fit_recognition.py` fits the weights to random boards.
 """
 
@@ -44,7 +44,7 @@ TYPES = ("u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "f32", "f64")
 
 
 def steady_step(steps: Array) -> float:
-    """Return the mean of the regular steps of a counter or clock; 0 if too few steps are regular.
+    """Return the mean of the regular steps of a counter or clock, or 0 if too few steps are regular.
 
     A step is regular if it is close to the median step. For example, a step across a lost frame is not regular.
 
@@ -60,7 +60,7 @@ def steady_step(steps: Array) -> float:
 
 
 def clock_of(steps: Array, frame_rate_Hz: float) -> tuple[str, float] | None:
-    """Identify a clock by its tick rate, which must be close to one of the usual tick rates of boards.
+    """Identify a clock by comparing its tick rate with the usual tick rates of boards.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
@@ -80,7 +80,7 @@ def clock_of(steps: Array, frame_rate_Hz: float) -> tuple[str, float] | None:
 
 @dataclass(frozen=True)
 class Weights:
-    """Contributions of the parts of a frame to the score of a division, in bits.
+    """Contribution that each kind of part of a frame makes to the score of a division, in bits.
 
     Attributes:
         row: Contribution of a row of adjacent channels of one type.
@@ -123,11 +123,11 @@ class Part(NamedTuple):
 
 @np.errstate(all="ignore")
 def parts_of(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights: Weights) -> list[list[Part]]:
-    """List the parts of a frame that may begin at each byte.
+    """List the possible parts of a frame that begin at each byte.
 
-    For each byte, the first entry is padding, which is a single byte without a meaning. The other entries are numbers
-    of the types `TYPES` that may begin at this byte. A number may extend into the second frame of a row, because it is
-    not yet known at which byte the frames begin.
+    For each byte, the first entry is padding, namely a single byte without a meaning. The other entries are the numbers
+    of the types `TYPES` that can begin at the same byte. A number may extend into the second frame of a row, because
+    the first byte of the frames is not yet known.
 
     Args:
         rows: Bytes of each frame and of the next frame, shape (n, 2 * length). The frames may begin at any position of
@@ -163,7 +163,7 @@ def parts_of(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights: Weigh
 def _number_parts(
     number_bytes: Bytes, is_constant: Booleans, is_zero: Booleans, kind: str, frame_rate_Hz: float, weights: Weights
 ) -> Iterator[Part]:
-    """Yield the parts of a frame that some bytes may be if they contain a number of a given type.
+    """Yield the possible parts of a frame for bytes that contain a number of a given type.
 
     Every number may be a channel. A number may also be the frame counter or a clock if its steps are regular. Nothing
     is yielded for floating-point numbers that are implausibly small or large.
@@ -221,7 +221,7 @@ def _number_parts(
 def split_frame(
     parts_at: Sequence[Sequence[Part]], sync_lengths: Iterable[int], weights: Weights
 ) -> tuple[float, int, tuple[Part, ...]]:
-    """Divide a frame into parts such that the sum of the scores of the parts is as low as possible.
+    """Divide a frame into parts so that the score of the division is as low as possible.
 
     The division is found by dynamic programming, from the last byte to the first.
 
@@ -237,7 +237,7 @@ def split_frame(
 
     @cache
     def best_division(position: int, row: str) -> tuple[float, tuple[Part, ...]]:
-        """Find the division with the lowest score for the bytes from a position to the end.
+        """Find the division with the lowest score for the bytes from a given position to the end.
 
         Adjacent channels of one type form a row. A channel that begins a row adds `weights.row` to the score. A channel
         with a constant value cannot begin a row.
@@ -310,7 +310,7 @@ def _values(number_bytes: Bytes, kind: str) -> Array:
 def _bits(steps: Array, unit: float, size: int) -> float:
     """Return the mean number of bits that are needed to encode one step of a number.
 
-    The number of bits of each step is limited to the number of bits of the number itself.
+    No step is counted with more bits than the number itself has.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).

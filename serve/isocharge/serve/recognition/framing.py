@@ -1,13 +1,14 @@
 """Recognition of where the frames in a stream begin, how long they are, and which checksum they have.
 
 A stream with byte stuffing is split at its delimiters. In a stream without byte stuffing, some bytes are usually the
-same in every frame. These bytes repeat at a distance of one frame length. For each pair of bytes, the frames that would
-begin at its repetitions cover a part of the stream. The pair of bytes that covers the largest part is chosen. The
-position of the chosen pair within a frame is determined later.
+same in every frame, and repeat at a distance of one frame length. For each repeated pair of bytes, frames are assumed
+to begin at every repetition. The pair is chosen whose frames would cover the largest part of the stream. The position
+of the chosen pair within a frame is determined later.
 
-Checksums with a name are tried with every possible first byte. For cyclic redundancy checks without a name, only the
-polynomials have to be tried. The reason is that the initial value, the final value and all constant bytes change the
-check by the same constant in all frames of one length.
+Checksums with a name are tried for every possible position of the first byte that they cover. For cyclic redundancy
+checks without a name, only the polynomials have to be tried, because the effect of all other parameters is a constant.
+The initial value, the final value and all constant bytes change the check of every frame by the same constant if the
+frames have the same length.
 """
 
 from collections import Counter
@@ -62,9 +63,10 @@ The share is less than 1, because some frames may be damaged.
 
 
 class Windows(NamedTuple):
-    """Frames of one length in a stream, each as a window of bytes.
+    """Windows of bytes in a stream whose frames all have the same length.
 
-    A window has the length of a frame. All windows begin at the same byte of their frames, which need not be the first.
+    A window has the length of a frame. All windows begin at the same position within a frame, but this position need
+    not be the first byte of the frame.
 
     Attributes:
         framing: Kind of framing, one of `isocharge.serve.frames.frame_layout.Framing`.
@@ -79,10 +81,10 @@ class Windows(NamedTuple):
     length: int
 
     def rows(self) -> Bytes:
-        """Return the bytes of each window and as many bytes after it, shape (frames, 2 * length).
+        """Return the bytes of each window and the same number of bytes after it, shape (frames, 2 * length).
 
-        The position at which a frame begins is unknown, but it is the same in every window. Windows near the end of the
-        stream are left out.
+        Two lengths are needed, because the position in a window at which the next frame begins is unknown. Windows that
+        are too close to the end of the stream are excluded.
         """
         row_length = 2 * self.length
         starts = self.starts[self.starts + row_length <= len(self.stream)]
@@ -105,7 +107,7 @@ def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
 
 
 def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Windows]:
-    """Yield all possible divisions of a stream into frames, beginning with the most certain division.
+    """Yield all possible divisions of a stream into frames, from the most certain to the least certain division.
 
     Args:
         chunks: The bytes of the stream.
@@ -125,14 +127,14 @@ def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Window
 
 
 def _adjacent_frames(framing: str, data: bytes, length: int) -> Windows:
-    """Return the division of a stream that consists of whole frames of one length."""
+    """Divide a stream that consists of whole frames of one length into its frames."""
     stream = np.frombuffer(data, np.uint8)
     starts = np.arange(0, len(data), length)
     return Windows(framing, stream, starts, length)
 
 
 def _stuffed_frames(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Windows]:
-    """Yield the division of a stream at the delimiters of a byte stuffing, if most pieces are frames of one length.
+    """If most pieces between the delimiters of a byte stuffing are frames of one length, yield these frames.
 
     Args:
         name: Name of the byte stuffing.
@@ -168,11 +170,12 @@ def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
 def _synchronised_frames(stream: Bytes) -> Iterator[Windows]:
     """Yield divisions of a stream into frames that begin at a repeated byte or a repeated pair of bytes.
 
-    A byte or a pair of bytes that is the same in every frame repeats at a distance of one frame length. The frames that
-    would begin at its repetitions cover a share of the stream. For each length of a frame, the pair or the single byte
-    that covers the largest share is chosen. The share of a single byte is reduced by a penalty, because single bytes
-    often repeat by chance. Only the `MAX_FRAME_LENGTHS` lengths with the largest shares are used. If the shares of two
-    lengths are about equal, the shorter length comes first.
+    If a byte or a pair of bytes is the same in every frame, it repeats at a distance of one frame length. For each
+    repeated byte or pair, frames are assumed to begin at every repetition. The share of the stream that these frames
+    would cover is computed. For each frame length, the byte or pair with the largest share is chosen. The share of a
+    single byte is reduced by a penalty, because single bytes often repeat by chance. Only the `MAX_FRAME_LENGTHS` frame
+    lengths with the largest shares are used. If two frame lengths have about equal shares, the shorter length comes
+    first.
 
     Args:
         stream: Bytes of the stream, shape (n,).
@@ -203,8 +206,8 @@ def _synchronised_frames(stream: Bytes) -> Iterator[Windows]:
 def _frequent_distances(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
     """Yield each frequent distance between successive occurrences of a code, with the positions of these occurrences.
 
-    A distance is frequent if frames of this length at these positions would cover a large share of the stream. Only
-    distances that can be the length of a frame are yielded.
+    A distance is frequent if frames of this length at the yielded positions would cover a large share of the stream.
+    Only distances that can be the length of a frame are yielded.
 
     Args:
         codes: Code at each position of the stream, shape (n,). A code is a byte, or a pair of bytes as a number.
@@ -238,7 +241,7 @@ CRC_POLYNOMIALS = {
 
 
 def _crcs_of_size(size: int) -> list[Crc]:
-    """Return the cyclic redundancy checks of a given size in bytes that are tried without a name.
+    """Return all cyclic redundancy checks without a name that have a given size in bytes.
 
     Each check is returned with both bit orders. The initial value and the final value of all checks are 0.
     """
@@ -290,8 +293,8 @@ class Check(NamedTuple):
 def find_checks(rows: Bytes) -> Iterator[Check]:
     """Yield the checksums that fit the frames, from the widest to the narrowest checksum.
 
-    The checksum is at the end of each frame. The checksum covers the other bytes of the frame, except that it may leave
-    out constant bytes at the beginning, such as a sync pattern. For each size and byte order, at most one checksum is
+    The checksum is at the end of each frame. The checksum covers the other bytes of the frame. Constant bytes at the
+    beginning, such as a sync pattern, need not be covered. For each size and byte order, at most one checksum is
     yielded.
 
     Args:
@@ -326,7 +329,8 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
 def _named_checks(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> Iterator[Check]:
     """Yield the checksums with a name that fit most of the frames.
 
-    If a checksum fits with several positions of its first covered byte, it is yielded once for each of these positions.
+    Different positions are tried for the first byte that a checksum covers. A checksum is yielded once for each
+    position with which it fits.
 
     Args:
         frames: The frames, which are of one length.
@@ -345,9 +349,9 @@ def _named_checks(frames: list[bytes], size: int, order: ByteOrder, begins: rang
 
 
 def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size: int, order: ByteOrder) -> bool:
-    """Return whether most frames end with the checksum of their other bytes.
+    """Return whether most frames end with the checksum of the covered bytes.
 
-    To save time, only the first frames are examined if the checksum fits too few of them.
+    To save time, the remaining frames are not examined if the checksum fits too few of the first frames.
 
     Args:
         compute: Function that computes the checksum of bytes.
@@ -358,7 +362,7 @@ def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size
     """
 
     def count_fitting(some_frames: list[bytes]) -> int:
-        """Return the number of frames whose computed checksum is equal to the checksum at their end."""
+        """Return the number of frames that end with the computed checksum."""
         count = 0
         for frame in some_frames:
             computed_checksum = compute(frame[begin:-size])
@@ -375,10 +379,10 @@ def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size
 def _unnamed_checks(frames: list[bytes], size: int, order: ByteOrder) -> Iterator[Check]:
     """Yield the cyclic redundancy checks without a name that fit most of the frames.
 
-    All checks are computed with the initial value 0 and the final value 0. For frames of one length, any other initial
-    and final values change the check only by an exclusive or with a constant. With the right polynomial, the computed
-    check and the sent check therefore differ by the same constant in all frames. This constant is stored as the final
-    value of the check.
+    All checks are computed with the initial value 0 and the final value 0. If all frames have the same length, other
+    initial and final values change every check by an exclusive or with the same constant. With the right polynomial,
+    the computed check and the sent check therefore differ by the same constant in all frames. The final value of the
+    yielded check is set to this constant.
 
     Args:
         frames: The frames, which are of one length.

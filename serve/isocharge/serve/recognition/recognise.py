@@ -1,4 +1,7 @@
-"""Recognition of whether a board sends the binary frames of isocharge, lines of text or frames of fixed length."""
+"""Functions that recognise the format in which a board sends frames.
+
+The format is the binary frames of isocharge, lines of text, or frames of fixed length.
+"""
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
@@ -41,11 +44,11 @@ WEIGHTS = Weights()
 def described_frames(
     chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False, weights: Weights = WEIGHTS
 ) -> dict[str, Any] | None:
-    """Return the section `[frames]` that describes frames of fixed length; None if no such frames are recognised.
+    """Return the section `[frames]` that describes frames of fixed length, or None if no such frames are recognised.
 
-    All kinds of framing are tried, beginning with the most certain kind. The first kind of framing with which the
-    frames can be described is used. If several descriptions have this framing, the description with the lowest score is
-    returned.
+    The kinds of framing are tried from the most certain to the least certain kind, until the frames can be described
+    with one of them. If several descriptions with the same kind of framing are possible, the description with the
+    lowest score is returned.
 
     Args:
         chunks: Received bytes, divided as they arrived.
@@ -80,11 +83,12 @@ def _sync_lengths(may_be_sync: Booleans, start: int) -> Sequence[int]:
 
 
 def _scored_sections(windows: Windows, seconds: float, weights: Weights) -> Iterator[tuple[float, dict[str, Any]]]:
-    """Yield all descriptions of the frames, each as a score and a section `[frames]` of a device file.
+    """Yield the score of each possible description of the frames, together with its section `[frames]`.
 
     At most one description is yielded for each combination of a first byte, a checksum and a byte order. Descriptions
     without a checksum are tried only if no checksum fits. The score is the number of bits per byte of the stream,
-    including the bytes outside of all frames. Scores of frames with different lengths can therefore be compared.
+    including the bytes outside of all frames. The scores of descriptions with different frame lengths can therefore be
+    compared.
 
     Args:
         windows: Frames of one length in the stream.
@@ -192,7 +196,7 @@ The share is much less than 1, because the other bytes may be echoes of requests
 
 
 def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False) -> dict[str, Any] | None:
-    """Recognise the format of a board, and return the section `[frames]` of a device file that describes it.
+    """Recognise the format of a board, and return the section `[frames]` that describes this format in a device file.
 
     The binary frames of isocharge, lines of text, and frames of fixed length are tried in this order.
 
@@ -235,8 +239,8 @@ def _parse_all(parser: Parser, chunks: Sequence[bytes]) -> tuple[list[Frame], fl
 def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) -> dict[str, Any]:
     """Return the keys that a device file for lines of text needs.
 
-    The key `columns` lists the names of all columns. The keys `seq`, `t_us`, `t_ms` and `t_s` state the name that the
-    board uses for its counter or its clock.
+    The key `columns` lists the names of all columns. The keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the
+    board uses for its counter and its clock.
 
     Args:
         layout: Layout of the lines.
@@ -276,9 +280,10 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
 
 @np.errstate(over="ignore", invalid="ignore")
 def _meanings(frames: Sequence[Frame], frame_rate_Hz: float) -> dict[int, str]:
-    """Find out which values of the frames are a frame counter and a clock.
+    """Determine which values of the frames are the frame counter and the clock.
 
-    If the parser has already recognised a counter, no other counter is searched for. The same applies to the clock.
+    If the parser has already recognised a counter, the function does not search for another counter. The same applies
+    to the clock.
 
     Args:
         frames: Frames with the same number of values.

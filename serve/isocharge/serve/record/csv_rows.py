@@ -1,4 +1,4 @@
-"""Conversion of records to CSV, with one column for each number, such as `charge_pC.A` or `tracked.vx_mm_s`."""
+"""Conversion of records to CSV, with a separate column for each number."""
 
 import csv
 import io
@@ -10,7 +10,7 @@ from isocharge.serve.record.record import DECIMALS, PredictionRecord, selected_f
 
 
 def csv_header(electrodes: Sequence[str], *, with_tracking: bool = False, with_film: bool = False) -> str:
-    """Return the header that belongs to the rows of `csv_row`.
+    """Return the header for the rows that `csv_row` returns.
 
     A field with several numbers has one column for each number, such as `charge_pC.A` for the electrode A.
 
@@ -55,7 +55,7 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
 
 
 def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str] | None:
-    """Return the names of the parts of a field, if the field has several columns.
+    """Return the names of the parts of a field that has several columns.
 
     The parts are the charges of the electrodes, or the fields of an object.
 
@@ -83,8 +83,8 @@ def _line(cells: Iterable[str]) -> str:
 def _cell(value: Any) -> str:
     """Convert a value to the text of a cell.
 
-    None becomes an empty text, a tuple of words becomes the words separated by blanks, and a number that is not an
-    integer gets six decimals.
+    The value None becomes an empty text. The words of a tuple are joined with blanks. A floating-point number gets six
+    decimals.
     """
     if value is None:
         return ""

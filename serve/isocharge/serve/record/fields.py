@@ -1,4 +1,4 @@
-"""Descriptions of the fields of a record, which are read from the annotations of the class that declares them."""
+"""Descriptions of the fields of a record, which are read from the annotations of the record class."""
 
 from collections.abc import Iterator
 from types import NoneType, UnionType
@@ -57,10 +57,10 @@ def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
 def _flat_fields(struct: type[Struct]) -> Iterator[Field]:
     """Yield the fields of a struct, in the order of their declaration.
 
-    If a nested struct is marked as `is_flattened`, its fields are yielded instead of the struct. Any other nested
-    struct is yielded as one field of the kind `object`, whose parts are the fields of the struct. In both cases, the
-    name of the attribute with the nested struct becomes the group of the yielded fields. A record has the fields of a
-    group only if it has the nested struct.
+    If a nested struct is marked as `is_flattened`, the fields of the nested struct are yielded instead of the struct
+    itself. Every other nested struct is yielded as a single field of the kind `object`, whose parts are the fields of
+    the struct. In both cases, the attribute that contains the nested struct gives its name to the group of the yielded
+    fields. A record has the fields of a group only if it has the nested struct.
     """
     annotations = get_type_hints(struct, include_extras=True)  # with the metadata of `Annotated`
     for name in struct.__struct_fields__:
@@ -77,7 +77,7 @@ def _flat_fields(struct: type[Struct]) -> Iterator[Field]:
 
 
 def _type_and_meaning(annotation: Any, where: str) -> tuple[Any, Meaning]:
-    """Return the type and the meaning in an annotation of the form `Annotated[type, Meaning(...)]`.
+    """Return the type and the meaning that an annotation `Annotated[type, Meaning(...)]` contains.
 
     Args:
         annotation: Annotation of a field.
@@ -95,9 +95,9 @@ def _type_and_meaning(annotation: Any, where: str) -> tuple[Any, Meaning]:
 
 
 def _without_none(declared_type: Any) -> tuple[Any, bool]:
-    """Remove the alternative None from a type, and return whether the type had this alternative.
+    """Remove the alternative None from a type. Return the resulting type, and whether None was removed.
 
-    For example, the results for the type `float | None` are `float` and True.
+    For example, the type `float | None` gives the results `float` and True.
     """
     is_union = get_origin(declared_type) in (Union, UnionType)  # either class, depending on how the type is written
     if not is_union:

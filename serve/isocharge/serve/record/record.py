@@ -1,8 +1,9 @@
-"""The prediction record, which contains a reading of a sensor and the contact that a model computed from this reading.
+"""The prediction record, which contains a reading of a sensor and the contact that a model computed from the reading.
 
-The fields are declared only here. JSON, CSV, the JSON Schema, the samples of the live page and the table in the
-documentation are derived from this declaration. An unknown value is None in Python and `null` in JSON. For example, the
-position is unknown if nothing touches the film, and the device clock is unknown if the charges come from a CSV file.
+The fields are declared only here. The layouts of JSON and CSV, the JSON Schema, the samples of the live page and the
+table in the documentation are derived from the declaration. An unknown value is None in Python and `null` in JSON. For
+example, the position is unknown while nothing touches the film. The device clock is unknown if the charges come from a
+CSV file.
 """
 
 import json
@@ -38,7 +39,7 @@ class TrackedContact(Struct, frozen=True):
     moving: Annotated[float, Meaning("Probability that the contact moves, 0 to 1.")]
 
     def widened(self, shift: tuple[float, float, float]) -> "TrackedContact":
-        """Return the contact with larger standard deviations, which include an error that all frames have in common.
+        """Return a copy of the contact whose standard deviations include an error that all frames have in common.
 
         Args:
             shift: Changes of x and y, mm, and of the force, N, by one standard deviation of the error.
@@ -53,7 +54,7 @@ class TrackedContact(Struct, frozen=True):
 
 
 class OtherContact(Struct, frozen=True):
-    """Another contact that has the same charges as the tracked contact.
+    """A second possible contact, which has the same charges as the tracked contact.
 
     The charges alone do not show which of the two contacts is real.
     """
@@ -165,17 +166,17 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
 
     @property
     def other(self) -> OtherContact | None:
-        """Another contact with the same charges; None if no such contact is known."""
+        """Another contact with the same charges. None if no other contact with the same charges is known."""
         return None if self.tracking is None else self.tracking.other
 
     @property
     def field_names(self) -> tuple[str, ...]:
-        """Names of the fields that are written for this record, in their order."""
+        """Names of the fields that the record contains, in the order in which they are written."""
         return field_names(with_tracking=self.tracking is not None, with_film=self.film is not None)
 
     @property
     def json_values(self) -> dict[str, Any]:
-        """Values of the fields by name, as they are written to JSON. Numbers are rounded to six decimals."""
+        """Values of the fields by name, as JSON contains them. Numbers are rounded to six decimals."""
         values = structs.asdict(self)
         if self.tracking is not None:
             values |= structs.asdict(self.tracking)
@@ -184,7 +185,7 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     def to_json(self) -> str:
         """Return the record as one line of strictly valid JSON, in which numbers are rounded to six decimals.
 
-        The text is computed only once and then stored in the record.
+        The line is computed only once, and is then stored in the record.
 
         Raises:
             ValueError: If a number is not finite.
@@ -265,8 +266,8 @@ _ENCODE = json.JSONEncoder(allow_nan=False).encode
 def _json_value(value: Any) -> Any:
     """Convert the value of a field for JSON. Numbers are rounded to six decimals, and a struct becomes a dictionary.
 
-    The function compares the class of the value, which is faster than calling `isinstance`. The speed matters, because
-    the function is called for every field of every record.
+    The function compares the class of the value, because this comparison is faster than a call of `isinstance`. The
+    speed matters, because the function is called for every field of every record.
 
     Args:
         value: A number, text, boolean, tuple of texts, None, dictionary of charges by electrode, or struct.

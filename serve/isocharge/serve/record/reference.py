@@ -1,4 +1,4 @@
-"""Table of the fields of a record for the documentation, in Markdown.
+"""Markdown table of the fields of a record for the documentation.
 
 The command `python -m isocharge.serve.record.reference` prints the table.
 """
@@ -24,16 +24,18 @@ GROUPS = {"tracking": "with `[track]`", "film": "with `[follow]`"}
 
 
 def record_table() -> str:
-    """Return a table of all fields of a record in Markdown.
+    """Return a Markdown table of all fields of a record.
 
-    The row of a field that is an object is followed by the rows of the fields of this object.
+    If a field is an object, the rows of the object's fields follow the row of the field.
     """
     header = ["| field | type | unit | meaning | present |", "|---|---|---|---|---|"]
     return "\n".join([*header, *_rows(RECORD_FIELDS)]) + "\n"
 
 
 def _rows(fields: Iterable[Field], prefix: str = "", group: str = "") -> Iterator[str]:
-    """Yield a row of the table for each field. If a field is an object, the rows of its fields follow its own row.
+    """Yield a row of the table for each field.
+
+    If a field is an object, the rows of the object's fields follow the row of the field.
 
     Args:
         fields: Fields of the record or of an object.

@@ -1,10 +1,10 @@
 """JSON Schema of the records of a sensor.
 
 The schema describes the fields twice, once for viewers and once for validators. The viewers Foxglove and Lichtblick
-read the top-level key `properties`, and expect a single `type` for each field. A number that may be null is therefore
-declared as "number" in `properties`. Validators of draft 7 of JSON Schema follow the top-level `$ref` to
-`definitions/record` and ignore all other top-level keys. The definition `record` allows null for every field that may
-be null. With both descriptions, viewers list all fields, and validators accept all records.
+read the top-level key `properties`, and expect a single `type` for each field. In `properties`, a number that may be
+null is therefore declared with the type "number" alone. Validators of draft 7 of JSON Schema follow the top-level
+`$ref` to `definitions/record` and ignore all other top-level keys. The definition `record` allows null for every field
+that may be null. Because of the two descriptions, viewers can list all fields, and validators accept all records.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,9 @@ def record_schema(electrodes: Sequence[str]) -> dict[str, Any]:
 
 
 def _object(electrodes: Sequence[str], *, allows_null: bool) -> dict[str, Any]:
-    """Return the schema of a record as an object. The schema requires the fields that every record has.
+    """Return the schema of a JSON object that contains a record.
+
+    The schema requires the fields that every record has.
 
     Args:
         electrodes: Names of the electrodes.

@@ -13,8 +13,8 @@
 - `PressFlags` sets the flags for saturated presses and for charges below zero.
 - `Warming` estimates the charge that a warming of the film adds to all electrodes, and subtracts this charge.
 
-If a value of a frame cannot be a charge, the stages skip the frame. The time step of the next frame then begins at the
-last valid frame.
+If a value of a frame cannot be a charge, the stages skip the frame. After skipped frames, the time step of the next
+frame begins at the last valid frame.
 """
 
 import math
@@ -110,7 +110,7 @@ class Reading(NamedTuple):
 class SignalChain:
     """The stages of one sensor with their state.
 
-    An object must be used in one thread only. The same sequence of frames always gives the same readings.
+    A signal chain must be used in one thread only. The same sequence of frames always gives the same readings.
 
     Attributes:
         stages: The stages that the settings request, in their order.

@@ -67,8 +67,8 @@ def update_contact(
 
     A touch begins when the total charge exceeds the base by the touch threshold. The base is the smallest total charge
     since the last release. A touch ends when the total charge falls below the release threshold. The release threshold
-    is a share of the peak of the press plus the uncertainty of the total charge, but at least half of the touch
-    threshold.
+    is a share of the peak of the press, increased by the uncertainty of the total charge. If this sum is less than half
+    of the touch threshold, the release threshold is half of the touch threshold.
 
     Args:
         rule: The thresholds.

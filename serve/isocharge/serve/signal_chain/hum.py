@@ -1,9 +1,9 @@
 """Removal of mains hum by an adaptive notch filter.
 
 A fixed notch filter rings after every touch. For example, the output of a notch filter with a width of 1 Hz takes a
-second to settle after a step of 850 pC. This filter therefore estimates the hum itself, and subtracts it (Widrow et
-al., "Adaptive noise cancelling", 1975; normalised least mean squares). The hum in each channel is a sine wave of known
-frequency, whose amplitude and phase change slowly.
+second to settle after a step of 850 pC. Instead, this module estimates the hum itself, and subtracts the estimated hum
+(Widrow and others, "Adaptive noise cancelling", 1975; normalised least mean squares). The hum in each channel is a sine
+wave of known frequency, whose amplitude and phase change slowly.
 
 The estimate of the hum is updated with the differences of consecutive frames, because a touch changes these differences
 only briefly. Each difference is clipped. The filter does not delay the signal.
@@ -59,12 +59,12 @@ def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) 
     """Subtract the hum from a frame, and update the estimate of the hum.
 
     The hum of a channel is the real part of a product of two complex numbers. The first number is the phasor of the
-    channel, whose magnitude and angle are the amplitude and the phase of the hum. The second number is a unit phasor,
-    exp(2 pi i f t), that turns with the mains frequency f. The phasor of the channel is estimated from the differences
-    between consecutive frames, which contain little of the touch charge.
+    channel. The magnitude of the phasor is the amplitude of the hum, and its angle is the phase of the hum. The second
+    number is a unit phasor, exp(2 pi i f t), that turns with the mains frequency f. The phasor of the channel is
+    estimated from the differences between consecutive frames, which contain little of the touch charge.
 
-    The estimate follows the method of normalised least mean squares (Widrow et al. 1975). Let z be the change of the
-    unit phasor between two frames. The phasor of the channel is then changed by
+    The estimate follows the method of normalised least mean squares (Widrow and others 1975). Let z be the change of
+    the unit phasor between two frames. In each frame, the phasor of the channel is changed by
 
         gain * error * conjugate(z) / |z|^2,
 

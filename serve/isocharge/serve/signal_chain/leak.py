@@ -7,8 +7,8 @@ frame by frame,
 
 where i is the innovation and b is the inflow (pC/s), the current that flows in because of offset, bias and slow
 warming. The inflow is estimated from the innovation, because an estimate from the output v would diverge. The inflow is
-estimated only while nothing touches the film. The innovation then consists of noise and of b dt, the contribution of
-the inflow.
+estimated only while nothing touches the film. Without new touch charge, the innovation consists of noise and of b dt,
+the contribution of the inflow.
 
 Frames of a touch must not change the estimated inflow. Therefore, three rules are applied. Each innovation is clipped.
 During a touch, the correction uses the inflow that was estimated `look_back_s` before the touch. After a release, the
@@ -28,7 +28,7 @@ from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
 
 
 class LeakRule(Rule, frozen=True, kw_only=True):
-    """Settings for the estimate of the inflow, which are a part of the section `[leak]` of a device file.
+    """Settings for the estimate of the inflow, from the section `[leak]` of a device file.
 
     Attributes:
         learn: Whether the inflow b is estimated.
@@ -110,13 +110,13 @@ def undo_leak(
 
     # Out of contact, any charge is an error. The charge therefore decays to zero.
     decayed_charge_pC = charge_pC * math.exp(-dt_s / rule.relax_s)
-    after = leak._replace(charge_pC=decayed_charge_pC, output_pC=output_pC)
+    relaxed_leak = leak._replace(charge_pC=decayed_charge_pC, output_pC=output_pC)
 
     # The estimate of the inflow pauses for some time after a release.
-    is_paused = after.hold_s > 0.0
+    is_paused = relaxed_leak.hold_s > 0.0
     if is_paused or not rule.learn:
-        return after._replace(hold_s=after.hold_s - dt_s)
-    return learn_inflow(rule, after, surplus_pC, noise_pC, dt_s)
+        return relaxed_leak._replace(hold_s=relaxed_leak.hold_s - dt_s)
+    return learn_inflow(rule, relaxed_leak, surplus_pC, noise_pC, dt_s)
 
 
 def in_touch(leak: Leak, charge_pC: Array, output_pC: Array, hold_off_s: float) -> Leak:
@@ -147,8 +147,8 @@ def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array,
     """Use a frame out of contact to update the estimated inflow, which is the slow current into each amplifier.
 
     The surplus is the part of the new charge that the estimated inflow does not explain. The surplus is divided by an
-    averaging time and added to the inflow, so the inflow follows the mean over this time. Large surpluses are clipped,
-    because touches cause large surpluses.
+    averaging time and added to the inflow, so that the inflow follows its mean over this time. Large surpluses are
+    clipped, because touches cause large surpluses.
 
     The beginning of an undetected touch may have changed the latest inflow. During a touch, the older trusted inflow is
     therefore used. After each time interval `look_back_s`, the inflow is stored as the candidate, and the previous

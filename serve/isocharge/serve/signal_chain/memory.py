@@ -20,7 +20,7 @@ advances the state from one frame to the next.
 
 While nothing touches the film, the touch charge q is 0, and the equation gives the warmth d. A fading-memory filter
 estimates the warmth and the slope of the warmth (Brookner 1998, chapter 1). During a touch, the warmth and its slope
-are predicted from the values that they had `look_back_s` before the touch.
+are predicted from their values at the time `look_back_s` before the touch.
 
 After a release, a charge remains if the settings `creep` and `thermoelastic` have errors. From the remaining charge, a
 Kalman filter estimates a scale factor for `creep` and a scale factor for `thermoelastic`. The variance of the remaining
@@ -86,7 +86,7 @@ MIN_CREEP_PC = 1e-9
 
 
 class MemoryRule(Rule, frozen=True, kw_only=True):
-    """Memory of the film, which changes the charge of a held press, from the section `[memory]` of a device file.
+    """Settings for the memory of the film, from the section `[memory]` of a device file.
 
     Attributes:
         creep: Share of a charge that is lost in each decade of time.
@@ -315,7 +315,8 @@ def _is_inflow_observable(rule: LeakRule, leak: Leak, rows_pC: Array) -> bool:
 def _replace_trusted_warmth(memory: Memory, look_back_s: float) -> Memory:
     """If the candidate for the trusted warmth is old enough, return a state in which it has become the trusted warmth.
 
-    The present warmth then becomes the next candidate. If the candidate is not old enough, return the state unchanged.
+    In this state, the present warmth is the next candidate. If the candidate is not old enough, return the state
+    unchanged.
 
     Args:
         memory: State of this frame.
@@ -353,7 +354,7 @@ class RemainingCharge(NamedTuple):
 
 
 def _remaining_charge(memory: Memory, creep_pC: Array, step_pC: Array) -> RemainingCharge | None:
-    """Project the charge that remains after a release onto the direction of the predicted charges.
+    """After a release, project the remaining charges onto the direction of the predicted charges.
 
     After a release, a part of the charge of the film remains because of creep and the thermoelastic step. The charges
     of all electrodes form a vector. The sum of the predicted charges of creep and thermoelastic step defines the
@@ -378,13 +379,13 @@ def _remaining_charge(memory: Memory, creep_pC: Array, step_pC: Array) -> Remain
 
     # The warmth may have changed during the touch, when it could not be observed. Its variance grows with this time.
     electrode_count = len(predicted_pC)
-    warmth_pC2 = WARMTH_CHANGE_PC**2 * electrode_count * memory.unseen_s
-    creep_law_pC2 = (CREEP_LAW_DEVIATION * norm_pC) ** 2
+    warmth_variance_pC2 = WARMTH_CHANGE_PC**2 * electrode_count * memory.unseen_s
+    creep_law_variance_pC2 = (CREEP_LAW_DEVIATION * norm_pC) ** 2
     return RemainingCharge(
         creep_pC=float(creep_pC @ predicted_pC) / norm_pC,
         step_pC=float(step_pC @ predicted_pC) / norm_pC,
         charge_pC=float(remaining_pC @ predicted_pC) / norm_pC,
-        variance_pC2=warmth_pC2 + creep_law_pC2,
+        variance_pC2=warmth_variance_pC2 + creep_law_variance_pC2,
     )
 
 
@@ -410,28 +411,28 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
     unit_creep_pC, unit_step_pC = SCALE_RESPONSE.dot(memory.rows_pC)  # charges of a film with creep = 1 and step = 1
     creep_pC = film.creep * unit_creep_pC
     step_pC = film.thermoelastic * unit_step_pC
-    measured = _remaining_charge(memory, creep_pC, step_pC)
-    if measured is None:
+    measurement = _remaining_charge(memory, creep_pC, step_pC)
+    if measurement is None:
         return memory
 
     # Covariance of each scale factor with the measurement, and variance of the measurement due to both scale factors.
     variances = film.variances
-    creep_covariance = variances.creep * measured.creep_pC + variances.covariance * measured.step_pC
-    step_covariance = variances.covariance * measured.creep_pC + variances.step * measured.step_pC
-    prior_pC2 = measured.creep_pC * creep_covariance + measured.step_pC * step_covariance
-    is_explained = measured.charge_pC**2 <= OUTLIER_SIGMAS**2 * (prior_pC2 + measured.variance_pC2)
+    creep_covariance = variances.creep * measurement.creep_pC + variances.covariance * measurement.step_pC
+    step_covariance = variances.covariance * measurement.creep_pC + variances.step * measurement.step_pC
+    prior_variance_pC2 = measurement.creep_pC * creep_covariance + measurement.step_pC * step_covariance
+    is_explained = measurement.charge_pC**2 <= OUTLIER_SIGMAS**2 * (prior_variance_pC2 + measurement.variance_pC2)
     if not is_explained:
         return memory._replace(learn_s=0.0)  # no further update after this release
 
     # Kalman update of the scale factors and of their variances. The scale factors are relative to the present
     # properties of the film, so they are 1 before the update.
-    total_pC2 = prior_pC2 + measured.variance_pC2 * LEARN_S / max(dt_s, MIN_STEP_S)
-    creep_scale = 1.0 + creep_covariance / total_pC2 * measured.charge_pC
-    step_scale = 1.0 + step_covariance / total_pC2 * measured.charge_pC
+    total_variance_pC2 = prior_variance_pC2 + measurement.variance_pC2 * LEARN_S / max(dt_s, MIN_STEP_S)
+    creep_scale = 1.0 + creep_covariance / total_variance_pC2 * measurement.charge_pC
+    step_scale = 1.0 + step_covariance / total_variance_pC2 * measurement.charge_pC
     updated_variances = ScaleVariances(
-        creep=variances.creep - creep_covariance**2 / total_pC2,
-        step=variances.step - step_covariance**2 / total_pC2,
-        covariance=variances.covariance - creep_covariance * step_covariance / total_pC2,
+        creep=variances.creep - creep_covariance**2 / total_variance_pC2,
+        step=variances.step - step_covariance**2 / total_variance_pC2,
+        covariance=variances.covariance - creep_covariance * step_covariance / total_variance_pC2,
     )
 
     # The updated scale factors explain a part of the charge that was attributed to the warmth.
@@ -480,15 +481,15 @@ def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
 def add_warmth(
     memory: Memory, change_pC: Array | float, rate_pC_per_s: Array | float, *, is_learned: bool = True
 ) -> Memory:
-    """Return the state after a part of the touch charge has been assigned to the warmth.
+    """Assign a part of the touch charge to the warmth, and return the resulting state.
 
     The charge of the film is h q + d, where h is the response to a step, q is the touch charge and d is the warmth, the
     charge due to a change of temperature. The charge of the film stays the same if the touch charge is decreased by c
     and the warmth is increased by h c.
 
     If the scale factors of creep and thermoelastic step must not be updated after this touch, the time for which the
-    warmth could not be observed is set to infinity. The measurement after the release then has an infinite variance and
-    no influence.
+    warmth could not be observed is set to infinity. With an infinite time, the measurement after the release has an
+    infinite variance and no influence.
 
     Args:
         memory: The state.
@@ -508,13 +509,11 @@ def add_warmth(
 
 
 def charge_scale_std(memory: Memory) -> float:
-    """Return the relative standard deviation that all touch charges have in common, dimensionless.
+    """Return the relative standard deviation that is common to all touch charges, dimensionless.
 
-    Errors of the scale factors of creep and of the thermoelastic step change the touch charge in proportion to the
-    charges of creep and step. Let c and s be the charges of creep and of the thermoelastic step, relative to the touch
-    charge. The relative variance of the touch charge is then
-
-        c^2 var(creep) + s^2 var(step) + 2 c s cov(creep, step).
+    Errors of the two scale factors change the touch charge in proportion to the charges of creep and of the
+    thermoelastic step. Let c and s be the charges of creep and of the thermoelastic step, relative to the touch charge.
+    The relative variance of the touch charge is c^2 var(creep) + s^2 var(step) + 2 c s cov(creep, step).
 
     Without a touch, the result is 0.
 

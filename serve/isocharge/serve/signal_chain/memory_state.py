@@ -1,4 +1,4 @@
-"""State that describes the memory of a film, which is used by the module `memory`.
+"""State that the module `memory` uses to describe the memory of a film.
 
 This module defines the rows of the state, the properties of a film, and the propagation of the state in time.
 """
@@ -110,12 +110,10 @@ def _relaxation(warmth_s: float) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=256)
 def state_propagation(warmth_s: float, dt_s: float) -> Array:
-    """Return the matrix that advances the state by a time, shape (rows, rows).
+    """Return the matrix that advances the state by a given time, shape (rows, rows).
 
     Let I be the matrix for the time 0, S the matrix for a very long time, and tau the time constant of a row. The
-    matrix for the time dt is then
-
-        S + exp(-dt / tau) (I - S).
+    matrix for the time dt is S + exp(-dt / tau) (I - S).
 
     Args:
         warmth_s: Time constant with which the film follows the temperature of the air, s.

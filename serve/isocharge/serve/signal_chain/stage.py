@@ -76,7 +76,7 @@ class Stage(ABC):
 
 
 class OffsetStage(Stage):
-    """A stage that stores the charge at rest. The touch charge is measured relative to this charge."""
+    """A stage that stores the charge at rest. The touch charge is measured relative to the charge at rest."""
 
     @abstractmethod
     def add_warming(self, change: "WarmingChange") -> None:

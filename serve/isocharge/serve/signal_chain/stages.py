@@ -68,7 +68,7 @@ class Limit(Stage):
         self._limit_pC = limit_pC
 
     def step(self, frame: ChainFrame) -> None:
-        """Mark the frame if the magnitude of one of its charges is at the limit of the converter or above."""
+        """Mark the frame if the magnitude of one of its charges reaches or exceeds the limit of the converter."""
         if bool((np.abs(frame.raw_pC) >= self._limit_pC).any()):
             frame.is_at_limit = True
 
@@ -91,7 +91,7 @@ class HumStage(Stage):
         self._hum, frame.charge_pC = remove_hum(self._rule, self._hum, frame.charge_pC, frame.t_s, frame.dt_s)
 
     def reset(self) -> None:
-        """Keep the estimate of the hum, but compute no difference between the next frame and the latest frame."""
+        """Keep the estimate of the hum, but do not compare the next frame with the latest frame."""
         self._hum = self._hum._replace(raw_pC=None)
 
 
@@ -113,7 +113,7 @@ class TareStage(OffsetStage):
 
     @property
     def tare(self) -> Tare | None:
-        """The tare that is subtracted from each frame; None before a tare has been measured."""
+        """The tare that is subtracted from each frame, or None if no tare has been measured yet."""
         return self._tare
 
     def step(self, frame: ChainFrame) -> None:
@@ -279,7 +279,7 @@ class MemoryStage(OffsetStage):
         self._memory = add_warmth(self._memory, change.charge_pC, change.rate_pC_per_s, is_learned=change.is_learned)
 
     def _report(self, frame: ChainFrame) -> None:
-        """Write the touch charge and its common standard deviation into a frame."""
+        """Write the touch charge and the relative standard deviation of its scale into a frame."""
         assert self._memory is not None
         frame.charge_pC = self._memory.leak.charge_pC
         frame.charge_scale_std = charge_scale_std(self._memory)
@@ -307,7 +307,7 @@ class TouchStage(Stage):
     def step(self, frame: ChainFrame) -> None:
         """Determine whether something touches the film in this frame, and notify the earlier stages if a touch begins.
 
-        The earlier stages may then change the charges of the frame, because the touch began before it was detected.
+        The notified stages may change the charges of the frame, because the touch began before it was detected.
 
         Args:
             frame: The frame, after the earlier stages.

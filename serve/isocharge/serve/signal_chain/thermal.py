@@ -2,7 +2,7 @@
 
 A change of the temperature adds a charge to every electrode (pyroelectricity). The pyroelectric charges are equal on
 all electrodes, or the ratios of these charges are known. During a touch, the charge at rest cannot be measured. A
-contact has three unknowns, so four electrodes give one charge more than is needed for the contact.
+contact has three unknowns, so four electrodes provide one charge more than is needed to compute the contact.
 
 A trial value of the common charge p is subtracted from all charges. The estimate is the trial value with which the
 remaining charges fit a single contact best. As a function of the trial value, the squared misfit is a parabola. The
@@ -12,8 +12,8 @@ p as a random walk instead.
 
 If warming cannot be distinguished from a change of the force, the curvature vanishes. With three electrodes, the
 curvature vanishes at every position. With four electrodes, the curvature vanishes where a press increases all charges
-equally, for example near the centre of a biaxial film. At such a position, the common charge p is not changed, and the
-record has the flag `blind`.
+equally, for example near the centre of a biaxial film. If the curvature vanishes, the common charge p is not changed,
+and the record has the flag `blind`.
 """
 
 import math
@@ -36,7 +36,7 @@ Misfit = Callable[[Array], Reals]
 
 
 class ThermalRule(Rule, frozen=True, kw_only=True):
-    """Settings for the estimate of the warming, which are a part of the section `[common_mode]` of a device file.
+    """Settings for the estimate of the warming, from the section `[common_mode]` of a device file.
 
     Attributes:
         every_s: Time between two estimates, s.
@@ -113,7 +113,9 @@ def track_thermal_drift(
     waited_s = state.waited_s + dt_s
     if waited_s < rule.every_s:
         return state._replace(waited_s=waited_s, rate_pC_per_s=0.0)
-    predicted_pC2, predicted_covariance, predicted_rate_variance = _predicted_variances(rule, state, waited_s, warmth_s)
+    predicted_variance_pC2, predicted_covariance, predicted_rate_variance = _predicted_variances(
+        rule, state, waited_s, warmth_s
+    )
 
     # Fit: squared misfit = constant + slope * c + curvature * c^2, where c is the trial value of the change.
     trial_charges_pC = charge_pC - TRIED_PC[:, np.newaxis] * ratios  # shape (trials, electrodes)
@@ -122,8 +124,8 @@ def track_thermal_drift(
 
     # The variance of the estimate is the inverse of the curvature, because the misfit is in standard deviations. Errors
     # of the model increase it by `noise` squared. If the parabola is flat, warming cannot be distinguished from force.
-    estimate_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
-    if estimate_pC2 > rule.blind_pC**2:
+    estimate_variance_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
+    if estimate_variance_pC2 > rule.blind_pC**2:
         return state._replace(waited_s=0.0, blind=True, rate_pC_per_s=0.0)
 
     # The estimate is the minimum of the parabola, limited to the range of the trial values.
@@ -131,12 +133,12 @@ def track_thermal_drift(
     change_pC = min(max(minimum_pC, float(TRIED_PC[0])), float(TRIED_PC[-1]))
 
     # Kalman update of p and of its slope, with their variances and their covariance
-    innovation_pC2 = predicted_pC2 + estimate_pC2
-    charge_gain = predicted_pC2 / innovation_pC2
-    rate_gain = predicted_covariance / innovation_pC2
+    innovation_variance_pC2 = predicted_variance_pC2 + estimate_variance_pC2
+    charge_gain = predicted_variance_pC2 / innovation_variance_pC2
+    rate_gain = predicted_covariance / innovation_variance_pC2
     return ThermalDrift(
         charge_pC=state.charge_pC + charge_gain * change_pC,
-        variance_pC2=(1.0 - charge_gain) * predicted_pC2,
+        variance_pC2=(1.0 - charge_gain) * predicted_variance_pC2,
         rate_pC_per_s=rate_gain * change_pC,
         covariance=(1.0 - charge_gain) * predicted_covariance,
         rate_variance=predicted_rate_variance - rate_gain * predicted_covariance,
@@ -146,7 +148,7 @@ def track_thermal_drift(
 def _predicted_variances(
     rule: ThermalRule, state: ThermalDrift, waited_s: float, warmth_s: float | None
 ) -> tuple[float, float, float]:
-    """Predict the uncertainty of the common charge p and of its rate of change, after a time without an estimate.
+    """After a time without an estimate, predict the uncertainty of the common charge p and of its rate of change.
 
     The rate decays with the time constant `warmth_s`, and random changes are added to the rate (white process noise).
     If this time constant is not known, p is a random walk without a rate.
@@ -169,8 +171,8 @@ def _predicted_variances(
         Variance of p, pC^2; covariance of p and its rate, pC^2/s; and variance of the rate, pC^2/s^2.
     """
     if warmth_s is None:
-        random_walk_pC2 = state.variance_pC2 + rule.wander_pC**2 * waited_s
-        return random_walk_pC2, 0.0, 0.0
+        random_walk_variance_pC2 = state.variance_pC2 + rule.wander_pC**2 * waited_s
+        return random_walk_variance_pC2, 0.0, 0.0
 
     # In one second, r t^2 / 3 is the square of `wander_pC`, so p changes by `wander_pC` (standard deviation).
     added_rate_variance = 3.0 * rule.wander_pC**2 * waited_s
@@ -178,11 +180,11 @@ def _predicted_variances(
     rate_effect_s = warmth_s * (1.0 - decay)
     covariance = state.covariance
     rate_variance = state.rate_variance
-    predicted_pC2 = (
+    predicted_variance_pC2 = (
         state.variance_pC2
         + rate_effect_s * (2.0 * covariance + rate_effect_s * rate_variance)
         + added_rate_variance * waited_s**2 / 3.0
     )
     predicted_covariance = decay * (covariance + rate_effect_s * rate_variance) + 0.5 * added_rate_variance * waited_s
     predicted_rate_variance = decay * decay * rate_variance + added_rate_variance
-    return predicted_pC2, predicted_covariance, predicted_rate_variance
+    return predicted_variance_pC2, predicted_covariance, predicted_rate_variance

@@ -1,4 +1,4 @@
-"""Filter that smooths the contacts that a model predicts for successive frames.
+"""Filter that smooths the predicted contacts of successive frames.
 
 One `TwoModeFilter` estimates the position, and another `TwoModeFilter` estimates the logarithm of the force.
 
@@ -77,13 +77,13 @@ class ContactFilter:
     def step(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> TrackedContact:
         """Process the next frame, and smooth its position and the logarithm of its force with two filters.
 
-        Both filters are restarted after a gap in time, and when the position filter rejects the measured position. If
-        only the force filter rejects its measured value, only the force filter is restarted. A rejected position is an
-        outlier if the contact would have to move at `MAX_SPEED_mm_per_s` or faster to reach this position. Up to
+        Both filters are restarted after a gap in time, and also when the position filter rejects the measured position.
+        If only the force filter rejects its measured value, only the force filter is restarted. A rejected position is
+        an outlier if the contact would have to move at `MAX_SPEED_mm_per_s` or faster to reach this position. Up to
         `MAX_OUTLIERS` outliers in succession are ignored.
 
-        The filters use only the variance of the noise that is independent from frame to frame, because smoothing does
-        not reduce errors that are the same in all frames.
+        The filters use only the variance of the noise that changes from frame to frame. Smoothing does not reduce
+        errors that are the same in all frames.
 
         Args:
             contact: Contact predicted by the model.
@@ -156,7 +156,8 @@ class ContactFilter:
         """Return the smoothed contact with standard deviations that include the constant errors of the model.
 
         The filters smooth only the errors that change from frame to frame. The variance of the constant errors is a
-        fixed fraction of the variance that the model states, and is added to the variance of the smoothed values.
+        fixed fraction of the variance that the model states. The variance of the constant errors is added to the
+        variance of the smoothed values.
 
         Args:
             contact: Contact predicted by the model.

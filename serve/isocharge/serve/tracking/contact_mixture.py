@@ -1,13 +1,13 @@
-"""Gaussian mixture that follows a contact on a film whose map from contacts to charges has a fold.
+"""Gaussian mixture that follows a contact if the map from contacts to charges has a fold.
 
 Near a fold of the map from contacts to charges, two different contacts produce the same charges. A single frame cannot
 distinguish these two contacts. A sequence of frames can distinguish the two contacts, because one contact crosses the
 fold while the other contact turns back at the fold.
 
 The state of a component consists of x, y and the logarithm of the force, the rates of change of these three values, and
-the logarithms of the electrode gains. The distribution of the state is a sum of Gaussians (Alspach and Sorenson 1972).
-Each Gaussian component is updated with the measured charges by an iterated extended Kalman filter (Bell and Cathey
-1993).
+the logarithms of the electrode gains. The probability distribution of the state is a weighted sum of Gaussian
+distributions (Alspach and Sorenson 1972). Each Gaussian component is updated with the measured charges by an iterated
+extended Kalman filter (Bell and Cathey 1993).
 
 Components are added in four cases.
 
@@ -148,7 +148,7 @@ class ContactMixture:
         self.reset()
 
     def reset(self) -> None:
-        """Discard the contact and all frames that were received."""
+        """Discard the contact and all received frames."""
         self._components: Components | None = None
         self._hypotheses: list[ContactHypothesis] = []
         self._step_frames: list[tuple[Array, float]] = []  # charges and time of each frame of the present step
@@ -160,7 +160,7 @@ class ContactMixture:
         """Process the next frame, and return the contacts that explain the charges.
 
         The mixture is updated only once in each step, which is a time interval of length `STEP_s`. Between two updates,
-        the contacts are extrapolated to the time of the frame with constant velocities.
+        the contacts are extrapolated with constant velocities to the time of the frame.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
@@ -219,9 +219,9 @@ class ContactMixture:
     def _search(self, measurement: Measurement) -> Components | None:
         """Search the whole film for contacts that explain the charges.
 
-        Components with large variances are placed on a spiral that covers the film, and are then updated with the
-        charges. The state of a component consists of x, y and the logarithm of the force, the rates of change of these
-        three values, and the logarithm of the gain of each electrode.
+        Components with large variances are placed on a spiral that covers the film. The charges update these
+        components. The state of a component consists of x, y and the logarithm of the force, the rates of change of
+        these three values, and the logarithm of the gain of each electrode.
 
         Args:
             measurement: Charges of this step.
@@ -247,11 +247,12 @@ class ContactMixture:
         return self._update(components, measurement, INITIAL_ITERATIONS)
 
     def _advance(self, components: Components, measurement: Measurement, dt_s: float) -> Components | None:
-        """Predict the components at the time of this step, and update them with the measured charges.
+        """Predict the components at the time of this step, and update the components with the measured charges.
 
-        A component with another velocity is added before the update if the most probable component is fast, or if its
-        innovation is large. The innovation is the difference between the measured and the predicted charges. The update
-        then changes the weight of each component according to how well the component explains the charges.
+        A component with another velocity is added before the update if the most probable component is fast, or if the
+        innovation of this component is large. The innovation is the difference between the measured and the predicted
+        charges. The update increases the weights of components that explain the charges well, relative to the weights
+        of other components.
 
         Args:
             components: Components after the previous step.
@@ -304,11 +305,11 @@ class ContactMixture:
     def _most_probable_states(
         self, prior: Components, measurement: Measurement, iterations: int
     ) -> tuple[Array, LinearisedUpdate]:
-        """Find the state of each component that is most probable given the measured charges.
+        """For each component, find the most probable state for the measured charges.
 
         Each iteration linearises the charges about the present state, and computes the Kalman update of the prior mean
-        with the linearised charges. The state then moves towards the updated mean. The change of the state in one
-        iteration is limited, because the linearisation is only accurate near the present state.
+        with the linearised charges. Each iteration moves the state towards the updated mean. The change of the state in
+        one iteration is limited, because the linearisation is only accurate near the present state.
 
         Args:
             prior: Predicted components.
@@ -366,14 +367,15 @@ class ContactMixture:
         covariance = updated_covariance(prior, linearised)
         misfit = math.sqrt(squared_misfit[best])
         relative_log_weight = log_weight - log_weight[best]  # the largest logarithm becomes 0
-        updated = Components(states, covariance, relative_log_weight, misfit)
-        return self._split_at_fold(prune_components(updated))
+        updated_components = Components(states, covariance, relative_log_weight, misfit)
+        return self._split_at_fold(prune_components(updated_components))
 
     def _split_at_fold(self, components: Components) -> Components:
         """Add one component on each side of a fold if the most probable component extends across the fold.
 
         Near a fold of the map from contacts to charges, a contact on one side of the fold has the same charges as a
-        contact on the other side. A single Gaussian component describes the contacts on only one side well.
+        contact on the other side. A single Gaussian component describes only the contacts on one side of the fold
+        accurately.
 
         Args:
             components: Components after the update with the charges of this step.
@@ -411,10 +413,12 @@ class ContactMixture:
         return components
 
     def _is_across_fold(self, state: Array, other_states: Array) -> Booleans:
-        """Compute whether a fold of the map from contacts to charges lies between one state and several other states.
+        """Determine between which pairs of states a fold of the map from contacts to charges lies.
+
+        Each pair consists of the reference state and one of the other states.
 
         At a fold, the orientation of the map changes, and the determinant of the Jacobian of the map changes its sign.
-        If two folds lie between two states, the method finds no fold.
+        If two folds lie between the states of a pair, the method finds no fold.
 
         Args:
             state: The reference state, shape (6 + n_electrode,).
@@ -434,7 +438,7 @@ class ContactMixture:
         return np.asarray(relative_orientation < 0.0)
 
     def _group(self, components: Components) -> list[ContactHypothesis]:
-        """Combine the components that describe the same contact into one hypothesis for each contact.
+        """For each contact, combine all components that describe the contact into one hypothesis.
 
         The most probable component and all components that describe the same contact form the first group. The
         remaining components are grouped in the same way, until no component remains.
@@ -458,7 +462,7 @@ class ContactMixture:
         return sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)
 
     def _is_same_contact(self, components: Components, rows: Integers) -> Booleans:
-        """Compute which of the selected components describe the same contact as the first selected component.
+        """Determine which of the selected components describe the same contact as the first selected component.
 
         Two components describe the same contact if they are near each other, and no fold of the map from contacts to
         charges lies between them. Two components are near each other if x and y both differ by less than
@@ -485,8 +489,9 @@ class ContactMixture:
 def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:
     """Return contacts (x, y, ln F) that are evenly distributed over the film on a spiral (Vogel 1979).
 
-    The radius of a contact grows with the square root of its number, and the angle between successive contacts is the
-    golden angle. Every contact then represents the same area of the film. All contacts have the same medium force.
+    The squared distances of the contacts from the centre are evenly spaced, and the angle between successive contacts
+    is the golden angle. Every contact therefore represents the same area of the film. All contacts have the same medium
+    force.
 
     Args:
         charges: Charges of every contact on the film, with the radius of the film and its range of forces.
@@ -494,9 +499,9 @@ def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:
     Returns:
         Contacts, shape (`N_INITIAL_COMPONENTS`, 3), mm and the logarithm of N.
     """
-    number = np.arange(N_INITIAL_COMPONENTS)
-    angle = GOLDEN_ANGLE * number
-    radius_mm = charges.radius_mm * np.sqrt((number + 0.5) / N_INITIAL_COMPONENTS)
+    contact_number = np.arange(N_INITIAL_COMPONENTS)
+    angle = GOLDEN_ANGLE * contact_number
+    radius_mm = charges.radius_mm * np.sqrt((contact_number + 0.5) / N_INITIAL_COMPONENTS)
     x_mm = radius_mm * np.cos(angle)
     y_mm = radius_mm * np.sin(angle)
     medium_log_force = np.log(charges.force_N).mean()  # of the smallest and the largest force
@@ -505,7 +510,7 @@ def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:
 
 
 def contact_mixture(predictor: Predictor) -> ContactMixture | None:
-    """Create the mixture that follows contacts on the film of a model.
+    """Create a mixture that follows contacts on the film for which a model was trained.
 
     Args:
         predictor: The model.

@@ -1,17 +1,17 @@
-"""Bayesian filter that estimates the pretension of a film and other unknown parameters of the film from touches.
+"""Bayesian filter that uses touches to estimate the pretension and other unknown parameters of a film.
 
 The misfit vector of a touch is the part of the charges that no contact explains. The misfit vector depends on two kinds
 of unknowns.
 
 - The pretension of the film changes the misfit vector non-linearly. The pretension is therefore estimated on a grid.
-- The linear unknowns change the misfit vector approximately linearly. The linear unknowns are the directions in which
-  the calibration left the film uncertain (`FilmDirections`), the drift of the gain of each electrode, and a common
-  offset. The common offset is a charge that is added to all electrodes during a touch, such as the pyroelectric charge
-  that a warm finger produces.
+- The linear unknowns change the misfit vector approximately linearly. The linear unknowns are the combinations of film
+  parameters that remain uncertain after the calibration (`FilmDirections`), the drift of the gain of each electrode,
+  and a common offset. The common offset is a charge that is added to all electrodes during a touch, such as the
+  pyroelectric charge that a warm finger produces.
 
 At each pretension of the grid, a Kalman filter estimates the linear unknowns (a Rao-Blackwellised filter, Doucet and
-others 2000). If a gain, an offset or an error of the calibration explains a change of the misfit, the estimated
-pretension therefore hardly changes.
+others 2000). The estimated pretension therefore hardly changes if a gain, an offset or an error of the calibration
+explains a change of the misfit.
 
 The size of the offsets is unknown before the first touch. The filter therefore compares several offset levels. At the
 first level, touches have no offset. At the other levels, the offsets have standard deviations from small to large. Each
@@ -108,7 +108,7 @@ class FilmFilter:
         largest_offset_pC: float,
         offset_ratio: Array,
     ) -> None:
-        """Start with the distribution of the film after the calibration.
+        """Start with the probability distribution of the unknowns after the calibration.
 
         Args:
             pretensions: Weights of the network at any pretension.
@@ -136,7 +136,7 @@ class FilmFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all touches, and return to the distribution before the first touch."""
+        """Discard all touches, and restore the probability distribution that is assumed before the first touch."""
         # Joint probability of the offset level and the pretension, shape (n_level, n_pretension). Level 0 is the level
         # without offsets, and the other levels share the remaining probability equally.
         level_count = self._level_std_pC.size
@@ -176,13 +176,13 @@ class FilmFilter:
 
     @property
     def offset_correction_MPa(self) -> float:
-        """Mean of the pretension minus the mean of the pretension at the level without offsets, MPa."""
+        """Mean pretension minus the mean pretension at the level without offsets, MPa."""
         probability_without_offset = self._joint_probability[0] / self._joint_probability[0].sum()
         return self.mean_MPa - float(probability_without_offset @ self.grid_MPa)
 
     @property
     def nearest_index(self) -> int:
-        """Index of the pretension of the grid that is nearest to the mean."""
+        """Index of the grid pretension that is nearest to the mean pretension."""
         return int(np.abs(self.grid_MPa - self.mean_MPa).argmin())
 
     @property
@@ -201,7 +201,7 @@ class FilmFilter:
 
     @property
     def _mean_offset_pC(self) -> float:
-        """Mean of the common offset at the most likely level and the pretension nearest to the mean, pC."""
+        """Mean common offset at the most likely level and at the grid pretension nearest to the mean, pC."""
         return float(self._mean[self._likeliest_level, self.nearest_index, self._layout.offset])
 
     @property
@@ -210,7 +210,7 @@ class FilmFilter:
         return int(self.level_probability.argmax())
 
     def direction_means(self, pretension_MPa: float) -> Array:
-        """Return the means of the directions at one pretension, averaged over the offset levels.
+        """Return the mean coordinate along each direction at one pretension, averaged over the offset levels.
 
         Args:
             pretension_MPa: The pretension, MPa. The means are interpolated between the pretensions of the grid.
@@ -235,7 +235,7 @@ class FilmFilter:
         return covariance
 
     def predict(self, clock_s: float) -> None:
-        """Predict the distribution at the time of a touch from the distribution after the previous touch.
+        """Predict the probability distribution of the unknowns at the time of the next touch.
 
         Args:
             clock_s: Time of the touch on a clock that does not jump, s.
@@ -249,7 +249,8 @@ class FilmFilter:
     def _relax_unknowns(self, elapsed_s: float) -> None:
         """Move the distributions of the gains and of the offset towards their stationary distributions.
 
-        The means decay exponentially with the time constant of each unknown. The directions do not change with time.
+        The mean of each unknown decays exponentially with the time constant of the unknown. The directions do not
+        change with time.
 
         Args:
             elapsed_s: Time since the previous touch, s.
@@ -260,9 +261,9 @@ class FilmFilter:
         decay[layout.offset] = math.exp(-elapsed_s / OFFSET_TIME_CONSTANT_s)
         decay[layout.directions] = 1.0
         decay_of_products = np.outer(decay, decay)
-        stationary = self._stationary_covariance()[:, None]  # the same at every pretension
+        stationary_covariance = self._stationary_covariance()[:, None]  # the same at every pretension
         self._mean = decay * self._mean
-        self._covariance = decay_of_products * self._covariance + (1.0 - decay_of_products) * stationary
+        self._covariance = decay_of_products * self._covariance + (1.0 - decay_of_products) * stationary_covariance
 
     def _change_level(self) -> None:
         """Account for the small probability that the offset level has changed since the previous touch.
@@ -292,8 +293,8 @@ class FilmFilter:
     def _moments_after_level_change(self) -> tuple[Array, Array]:
         """Compute the mean and the covariance of the linear unknowns directly after a change of the offset level.
 
-        The offset then has the same distribution as before the first touch. The moments of the other unknowns are
-        averaged over the previous levels.
+        After the change, the offset has the same probability distribution as before the first touch. The moments of the
+        other unknowns are averaged over the previous levels.
 
         Returns:
             Mean, shape (n_pretension, n_unknown). The mean does not depend on the new level. Covariance at each new
@@ -340,8 +341,8 @@ class FilmFilter:
     def _weighted_moments(self) -> Array:
         """Return the probability, the mean and the covariance at each level and pretension in one array.
 
-        The mean and the covariance are multiplied by the probability. Adding the moments of several pretensions
-        therefore computes an average that is weighted by the probabilities.
+        The mean and the covariance are multiplied by the probability. The sum of the moments of several pretensions is
+        therefore weighted by the probabilities.
 
         Returns:
             Moments, shape (n_level, n_pretension, 1 + n_unknown + n_unknown^2). The last axis contains the probability,
@@ -363,16 +364,16 @@ class FilmFilter:
         level_count, grid_size = self._joint_probability.shape
         size = self._layout.size
         self._joint_probability = moments[..., PROBABILITY_COLUMN]
-        normalised = moments / self._joint_probability[..., None]
+        normalised_moments = moments / self._joint_probability[..., None]
         mean_columns = slice(1, 1 + size)
         covariance_columns = slice(1 + size, None)
-        self._mean = normalised[..., mean_columns]
-        self._covariance = normalised[..., covariance_columns].reshape(level_count, grid_size, size, size)
+        self._mean = normalised_moments[..., mean_columns]
+        self._covariance = normalised_moments[..., covariance_columns].reshape(level_count, grid_size, size, size)
 
     def update(self, charge_pC: Array, log_changes: Array, misfit_slopes: Array | None = None) -> TouchResiduals:
-        """Update the distribution with a touch.
+        """Update the probability distribution of the unknowns with a touch.
 
-        The touch may be an outlier with a small probability. The changes that the Kalman update computes are therefore
+        With a small probability, the touch is an outlier. The changes that the Kalman update computes are therefore
         multiplied by the probability that the touch is not an outlier.
 
         Args:
@@ -422,12 +423,14 @@ class FilmFilter:
         return np.asarray(np.eye(self._layout.electrodes) + scatter_covariance)
 
     def _linearise(self, charge_pC: Array, log_changes: Array, misfit_slopes: Array | None) -> tuple[Array, Array]:
-        """Compute the misfit vector of a touch at each pretension, and the Jacobian for the linear unknowns.
+        """Compute the misfit vectors of a touch, and their Jacobian with respect to the linear unknowns.
 
-        The derivative with respect to a gain or a direction is the product of the misfit slopes and the change of ln Q
-        that the gain or the direction causes. The derivative with respect to the offset is a finite difference, whose
-        step is the estimated mean offset of the offset level. The linearised misfit vector is therefore exact for
-        charges from which the mean offset is subtracted.
+        There is one misfit vector for each pretension.
+
+        A unit step of a gain or a direction changes the logarithms of the charges. The derivative with respect to the
+        gain or the direction is the product of the misfit slopes and this change. The derivative with respect to the
+        offset is a finite difference. The step of this difference is the estimated mean offset at the offset level. The
+        linearised misfit vector is therefore exact for charges from which the mean offset is subtracted.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
@@ -463,7 +466,7 @@ class FilmFilter:
         return misfit, jacobian
 
     def _misfit_vectors(self, charge_pC: Array) -> Array:
-        """Evaluate the network for charges at every pretension of the grid.
+        """Compute the misfit vectors of the given charges at every pretension of the grid.
 
         Args:
             charge_pC: Charges, shape (n, n_electrode), pC.
@@ -475,7 +478,7 @@ class FilmFilter:
         return self._network.vectors(charge_pC, self.grid_MPa) / self._pretensions.misfit_rms
 
     def _misfit_differences(self, charge_pC: Array, misfit: Array, log_changes: Array) -> Array:
-        """Compute the changes of the misfit vectors of a touch that given changes of its charges cause.
+        """Compute how given changes of the charges of a touch change the misfit vectors of the touch.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.

@@ -1,14 +1,14 @@
-"""Correction of contacts for changes of the film, which are estimated from ordinary touches.
+"""Correction of contacts for changes of the film. The changes are estimated from ordinary touches.
 
 The charges of four electrodes have one degree of freedom more than a contact (x, y, force). The misfit is the distance
-of the charges from the charges that a contact can produce. If the pretension of a film changes, for example because the
-room becomes warmer by 1 K, the misfits of all touches increase. The estimated pretension is the pretension for which
-the misfits of the touches are smallest.
+between the measured charges and the nearest charges that a contact can produce. If the pretension of a film changes,
+for example because the room becomes warmer by 1 K, the misfits of all touches increase. The estimated pretension is the
+pretension for which the misfits of the touches are smallest.
 
-The module `isocharge.serve.tracking.film_filter` estimates the pretension from one frame of each touch, namely the
-frame with the largest force. The filter also estimates the gains, a common offset, and the directions in which the film
-remained uncertain after the calibration (`FilmDirections`). Contacts are corrected for the estimated pretension and for
-the estimated directions.
+The module `isocharge.serve.tracking.film_filter` estimates the pretension. The estimate uses one frame of each touch,
+namely the frame with the largest force. The filter also estimates the gains, a common offset, and the changes of the
+film along directions that remained uncertain after the calibration (`FilmDirections`). Contacts are corrected for the
+estimated pretension and for the estimated changes along the directions.
 
 If no pretension explains a touch, for example a touch with two contacts, the touch hardly changes the estimate. The
 film is considered lost in three cases.
@@ -17,7 +17,7 @@ film is considered lost in three cases.
 - A wrong gain of one electrode explains the latest touches far better than any pretension.
 - The charges have a common offset, for example from a warm hand, that is larger than the settings allow.
 
-The contacts on a lost film are computed with the estimate before the latest touches.
+While the film is lost, contacts are computed with an earlier estimate that does not include the latest touches.
 """
 
 import math
@@ -90,7 +90,7 @@ SMALLEST_CHANGE_MPa = 0.01
 
 
 class FollowRule(Rule, frozen=True, kw_only=True):
-    """Settings of the correction for changes of the film; the section `[follow]` of a device file.
+    """Settings of the correction for changes of the film, from the section `[follow]` of a device file.
 
     Attributes:
         drift_MPa_per_root_hour: Standard deviation of the change of the pretension in an hour, MPa. The standard
@@ -106,7 +106,7 @@ class FollowRule(Rule, frozen=True, kw_only=True):
 
 
 class FollowedContact(NamedTuple):
-    """A contact that was corrected for the estimated changes of the film.
+    """A contact after the correction for the estimated changes of the film.
 
     Attributes:
         contact: The corrected contact.
@@ -224,7 +224,7 @@ class FilmFollower:
 
     @property
     def film(self) -> FollowedFilm:
-        """Present estimate of the film, in the form in which a prediction record contains it."""
+        """Present estimate of the film, in the format of a prediction record."""
         estimate = self._applied_estimate
         return FollowedFilm(estimate.pretension_MPa, estimate.std_MPa, self._touch_count)
 
@@ -267,11 +267,11 @@ class FilmFollower:
     def follow_contact(self, contact: Contact, charge_pC: Array) -> FollowedContact:
         """Correct a contact for the estimated changes of the film.
 
-        The present film produces different charges than the film that `predictor` describes. The measured charges are
-        therefore divided by the ratio of the charges of these two films, and the contact is computed again from the
-        result. The uncertainty of the pretension is added to the standard deviations of the contact. For this purpose,
-        the contact is also computed with a model at a neighbouring pretension. Before the first estimate of the film,
-        the contact is returned unchanged.
+        The charges of the present film differ from the charges of the film that `predictor` describes. The measured
+        charges are therefore divided by the ratio of the charges of these two films, and the contact is computed again
+        from the quotients. The uncertainty of the pretension is added to the standard deviations of the contact. The
+        effect of this uncertainty on the contact is computed with the model of a neighbouring pretension. Before the
+        first estimate of the film, the contact is returned unchanged.
 
         Args:
             contact: Contact that `predictor` computed from the charges.
@@ -294,8 +294,8 @@ class FilmFollower:
     def _charge_factors(self, contact: Contact) -> tuple[Array, Array]:
         """Return the factors by which charges are divided before a model computes a contact from them.
 
-        The factors depend on the contact and on the estimate of the film. The factors are computed again only after the
-        contact has moved or the estimate has changed.
+        The factors depend on the contact and on the estimate of the film. The factors are only computed again if the
+        contact has moved or the estimate of the film has changed.
 
         Args:
             contact: Contact for which the factors are needed.
@@ -317,8 +317,8 @@ class FilmFollower:
         """Update the estimate of the film with a touch, and decide whether the film is lost.
 
         The film is lost if no pretension explains the latest touches, if the gain of an electrode seems to be wrong, or
-        if the offsets are too large. When the film becomes lost, the estimate before the latest touches is used again.
-        No estimate is used before `FEWEST_TOUCHES` touches were observed.
+        if the offsets are too large. When the film becomes lost, the estimate from the time before the latest touches
+        is restored. No estimate is used before `FEWEST_TOUCHES` touches were observed.
 
         Args:
             peak: Frame with the largest force of the touch.
@@ -368,10 +368,10 @@ class FilmFollower:
         return self._recent_estimates[0] if is_long_enough else self._calibrated_estimate
 
     def _squared_misfits(self, charge_pC: Array, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
-        """Compute the squared misfits of a touch that are needed to decide whether the film is lost.
+        """Compute the squared misfits of a touch, which are needed to decide whether the film is lost.
 
-        The attribute `wrong_gain` of the result tests the hypothesis that the gain of one electrode is wrong. For this
-        test, the charges are corrected for the offset and the directions, and are then multiplied by each wrong gain.
+        The attribute `wrong_gain` of the result tests the hypothesis that the gain of one electrode is wrong. The
+        charges are corrected for the offset and the directions, and are multiplied by each assumed wrong gain.
 
         Args:
             charge_pC: Touch charges of the frame with the largest force, shape (n_electrode,), pC.
@@ -444,7 +444,7 @@ class FilmFollower:
         return float(self._filter.pretension_probability @ deviations_MPa**2)
 
     def _additional_variance(self) -> float:
-        """Return the variance of the pretension that is caused by errors outside the filter, MPa^2.
+        """Return the part of the pretension variance that is caused by errors outside the filter, MPa^2.
 
         These errors are the errors of the other parameters of the film, and the error of the correction for offsets.
         """
@@ -481,7 +481,7 @@ class FilmFollower:
             self._set_neighbouring_model(self._applied_estimate.pretension_MPa)
 
     def _set_neighbouring_model(self, pretension_MPa: float) -> None:
-        """Create the model at a neighbouring pretension, with which the sensitivity to the pretension is computed.
+        """Create the model of a neighbouring pretension, in order to compute the sensitivity to the pretension.
 
         The neighbouring pretension is larger than the estimated pretension by `SENSITIVITY_STEP_MPa`. If no weights are
         available for the larger pretension, the neighbouring pretension is smaller by the same amount.
@@ -490,7 +490,7 @@ class FilmFollower:
             pretension_MPa: The estimated pretension, MPa.
         """
         step_MPa = SENSITIVITY_STEP_MPa
-        _, largest_MPa = self._pretensions.range_MPa
+        _smallest_MPa, largest_MPa = self._pretensions.range_MPa
         if pretension_MPa + step_MPa > largest_MPa:
             step_MPa = -step_MPa
         self._neighbouring_step_MPa = step_MPa

@@ -8,7 +8,7 @@ from isocharge.common.arrays import Array
 
 
 class FilmStateEstimate(NamedTuple):
-    """Estimate of the pretension of the film and of the directions in which the film is uncertain.
+    """Estimate of the pretension of a film, and of the changes of the film along its uncertain directions.
 
     Attributes:
         pretension_MPa: Estimate of the pretension, MPa.

@@ -19,7 +19,7 @@ class UnknownsLayout:
 
     @property
     def gains(self) -> slice:
-        """Slice of the gains: the deviation of each gain from 1, in units of `GAIN_STD`, for each electrode."""
+        """Slice of the gains. Each gain is stored as its deviation from 1, in units of `GAIN_STD`."""
         return slice(0, self.electrodes)
 
     @property

@@ -11,7 +11,7 @@ from isocharge.common.arrays import Array
 
 
 class KalmanUpdate(NamedTuple):
-    """Changes of the estimated linear unknowns that a touch causes if it is not an outlier.
+    """Changes of the estimates of the linear unknowns after a touch that is not an outlier.
 
     The linear unknowns are estimated separately for each offset level and each pretension.
 

@@ -1,6 +1,6 @@
-"""Reading of the weights with which a model describes its film at other pretensions.
+"""Functions that read and check the network weights of a model for other pretensions of its film.
 
-The module also checks that the weights belong to the model.
+The module checks that the weights belong to the model.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Noise of the measured contacts, which is described by the shape of its covariance and by its estimated size.
+"""Noise of measured contacts, described by the shape of its covariance and by an estimate of its size.
 
 The standard deviations that a model reports apply to the noise with which the model was trained. The actual noise of a
 board may be smaller or larger. Noise changes randomly from frame to frame, whereas a contact moves smoothly. Each frame
@@ -50,9 +50,9 @@ class CovarianceShape(NamedTuple):
 
     @classmethod
     def of_position(cls, x_std_mm: float, y_std_mm: float, correlation: float) -> tuple["CovarianceShape", float]:
-        """Split the covariance of a position into a shape with the determinant 1 and a size.
+        """Split the covariance of a position into two factors: its shape, and its size.
 
-        The covariance is the product of the size and the shape.
+        The shape is a matrix with the determinant 1, and the size is a number.
 
         Args:
             x_std_mm: Standard deviation of x, mm.
@@ -64,15 +64,15 @@ class CovarianceShape(NamedTuple):
         """
         # The determinant of the covariance is (x_std * y_std)^2 * (1 - correlation^2).
         uncorrelated_share = 1.0 - correlation * correlation
-        root = math.sqrt(max(uncorrelated_share, MIN_UNCORRELATED_SHARE))
-        size_mm2 = x_std_mm * y_std_mm * root
+        root_of_uncorrelated_share = math.sqrt(max(uncorrelated_share, MIN_UNCORRELATED_SHARE))
+        size_mm2 = x_std_mm * y_std_mm * root_of_uncorrelated_share
 
         # Elements of the inverse of the shape, divided by the number of dimensions.
         dimensions = 2
-        scale = dimensions * root
-        inverse_xx = y_std_mm / (x_std_mm * scale)
-        inverse_yy = x_std_mm / (y_std_mm * scale)
-        inverse_xy = -correlation / scale
+        inverse_divisor = dimensions * root_of_uncorrelated_share
+        inverse_xx = y_std_mm / (x_std_mm * inverse_divisor)
+        inverse_yy = x_std_mm / (y_std_mm * inverse_divisor)
+        inverse_xy = -correlation / inverse_divisor
         return cls(inverse_xx, inverse_yy, inverse_xy, dimensions), size_mm2
 
     def mean_square(self, difference: complex) -> float:
@@ -105,7 +105,7 @@ class NoiseEstimate(NamedTuple):
 
     @classmethod
     def start(cls, measured: complex) -> "NoiseEstimate":
-        """Return the noise estimate after the first measured value: the variance that the model states.
+        """Return the noise estimate after the first measured value, which is the variance stated by the model.
 
         Args:
             measured: The measured value: a position x + iy, mm, or the logarithm of a force.
@@ -117,10 +117,10 @@ class NoiseEstimate(NamedTuple):
     ) -> "NoiseEstimate":
         """Return the estimate after the next measured value.
 
-        The measured value is compared with the linear extrapolation of the two previous values. The squared error of
-        the extrapolation is divided by the mean squared error that noise with the stated variance would cause. The
-        estimated relative variance is the mean of this quotient over the latest frames. The quotient of a single frame
-        is limited, because a sudden movement is not noise.
+        The measured value is compared with the linear extrapolation of the two previous values. The relative square of
+        a frame is the squared error of the extrapolation, divided by its mean for noise with the stated variance. The
+        estimated relative variance is the mean of the relative squares of the latest frames. The relative square of a
+        single frame is limited, because a sudden movement is not noise.
 
         Args:
             measured: The measured value: a position x + iy, mm, or the logarithm of a force.

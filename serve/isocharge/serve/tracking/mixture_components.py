@@ -1,4 +1,4 @@
-"""Components of the Gaussian mixture with which `contact_mixture` follows a contact.
+"""Components of the Gaussian mixture that the module `contact_mixture` uses to follow a contact.
 
 The functions predict, prune and combine components.
 """
@@ -95,7 +95,7 @@ class ContactHypothesis(NamedTuple):
 
     @property
     def contact(self) -> Contact:
-        """The hypothesis converted to a `Contact`, which is also the type of the predictions of a model.
+        """The hypothesis as a `Contact`, which is the type that models use for their predictions.
 
         The state contains the logarithm of the force. The standard deviation of the force is therefore the force
         multiplied by the standard deviation of the logarithm.
@@ -178,7 +178,7 @@ class Components(NamedTuple):
 
 
 def predict_components(components: Components, dt_s: float) -> Components:
-    """Predict the components at the next step for motion with constant velocity and white acceleration.
+    """Predict the components at the next step. A white acceleration disturbs their constant velocities.
 
     Args:
         components: Components after the update of the previous step.
@@ -222,9 +222,9 @@ def _add_process_noise(covariance: Array, value: int, rate: int, density: Array 
 def prune_components(components: Components) -> Components:
     """Remove improbable components, and merge components with a similar motion.
 
-    If the motion of a component is similar to the motion of a more probable component, the component is removed. The
-    weight of the removed component is added to the weight of the more probable component. Only the `MAX_COMPONENTS`
-    most probable components remain.
+    If the motions of two components are similar, the less probable component is removed. The weight of the removed
+    component is added to the weight of the more probable component. Only the `MAX_COMPONENTS` most probable components
+    remain.
 
     Args:
         components: Components after an update. The largest logarithm of the weights is 0.

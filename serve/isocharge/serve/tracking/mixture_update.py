@@ -50,7 +50,7 @@ class LinearisedUpdate(NamedTuple):
 
 
 def charges_and_jacobian(charges: ChargeSeries, states: Array) -> tuple[Array, Array]:
-    """Compute the measured charges that states produce, and the derivatives with respect to the states.
+    """Compute the expected measured charges for states, and their derivatives with respect to the states.
 
     The measured charge of an electrode is the charge that the film produces, multiplied by the gain of the electrode.
 
@@ -126,11 +126,11 @@ def updated_covariance(prior: Components, linearised: LinearisedUpdate) -> Array
 
 
 def limit_iteration_steps(steps: Array) -> Array:
-    """Shorten steps of the state that are too long for the linearisation to be accurate.
+    """Shorten steps of states if the steps are too long for an accurate linearisation.
 
     A step is too long if it changes the position by more than `MAX_ITERATION_STEP_mm`, or the logarithm of the force by
-    more than `MAX_ITERATION_LOG_STEP`. All entries of a step that is too long are divided by the same number, so that
-    the step reaches exactly the limit.
+    more than `MAX_ITERATION_LOG_STEP`. If a step is too long, all its entries are divided by the same number, so that
+    the step is exactly as long as the limit.
 
     Args:
         steps: Step of the state of each component, shape (n, 6 + n_electrode).

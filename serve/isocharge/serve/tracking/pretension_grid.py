@@ -11,9 +11,9 @@ GRID_STEP_MPa = 0.02
 
 
 def evenly_spaced(low: float, high: float, step: float) -> Array:
-    """Return evenly spaced numbers from `low` to `high`, both included.
+    """Return evenly spaced numbers from `low` to `high`, including both limits.
 
-    The range is divided into a whole number of intervals, whose length is as close to `step` as possible.
+    The range is divided into a whole number of equal intervals. Their length is as close to `step` as possible.
     """
     interval_count = max(round((high - low) / step), 1)
     return np.linspace(low, high, interval_count + 1)
@@ -36,9 +36,9 @@ def odds_of_no_change(change_MPa: Array, probability: Array, prior_std_MPa: floa
     """Compute the odds of the hypothesis that a pretension has not changed, against the hypothesis that it has changed.
 
     If the pretension has changed, the prior distribution of the change is a normal distribution with the mean zero.
-    Both hypotheses are assumed to have the same prior probability. The odds are then the posterior density of a zero
-    change divided by the prior density of a zero change (the Savage-Dickey density ratio, Dickey 1971). Both densities
-    belong to the hypothesis that the pretension has changed.
+    Both hypotheses are assumed to have the same prior probability. The odds are the posterior density of a zero change
+    divided by the prior density of a zero change (the Savage-Dickey density ratio, Dickey 1971). Both densities belong
+    to the hypothesis that the pretension has changed.
 
     Args:
         change_MPa: Changes on an evenly spaced grid, shape (n,), MPa.
@@ -55,7 +55,7 @@ def odds_of_no_change(change_MPa: Array, probability: Array, prior_std_MPa: floa
 
 
 def smooth_moments(moments: Array, std_MPa: float) -> Array:
-    """Smooth moments over the pretensions by convolution with a normal distribution.
+    """Smooth moments along the axis of the pretensions, by a convolution with a normal distribution.
 
     Args:
         moments: Moments at each pretension of the grid, shape (n_level, n_pretension, n_moment). Beyond the ends of the

@@ -19,7 +19,7 @@ REST_PROBABILITY = 0.5
 
 
 class TouchEvents:
-    """Detector of the events of a touch, which it derives from the tracked contact of each frame."""
+    """Detector that derives the events of a touch from the tracked contacts of its frames."""
 
     def __init__(self) -> None:
         """Start without a touch."""
@@ -43,7 +43,7 @@ class TouchEvents:
         return "press"
 
     def step(self, tracked: TrackedContact, t_s: float) -> str | None:
-        """Return the event that begins with the next frame of a touch; None if no event begins.
+        """Return the event that begins with the next frame of a touch, or None if no event begins.
 
         A slide begins when the contact moves and is away from the position at which it last rested. A hold begins when
         the contact has rested at one position for `HOLD_TIME_s`. The same event does not occur twice in succession. If

@@ -20,7 +20,7 @@ CERTAIN_PROBABILITY = 0.97
 
 
 class TrackRule(Rule, frozen=True, kw_only=True):
-    """Settings of the tracking; the section `[track]` of a device file.
+    """Settings of the tracking, from the section `[track]` of a device file.
 
     Attributes:
         lasting: Standard deviation of the errors that are the same in every frame of a held contact, divided by the
@@ -149,7 +149,7 @@ def _tracked_contact(hypothesis: ContactHypothesis, contact: Contact) -> Tracked
 
 
 def _other_contact(hypotheses: list[ContactHypothesis]) -> OtherContact | None:
-    """Return the second most probable contact; None if the most probable contact is nearly certain.
+    """Return the second most probable contact, or None if the most probable contact is nearly certain.
 
     Args:
         hypotheses: The contacts that explain the charges, at least one, in descending order of their probability.

@@ -1,13 +1,14 @@
 """Filter with two modes, held and moving, for the position of a contact or for the logarithm of its force.
 
 The filter is an interacting multiple model (Blom and Bar-Shalom 1988). Each mode has a Kalman filter. Before each
-frame, the estimates of the two modes are mixed, because the contact may have changed from one mode to the other. The
-innovation of each mode then determines the new probability of the mode. In the held mode, the velocity is zero. In the
-moving mode, the velocity is unknown when a movement begins, and is then changed by a white acceleration.
+frame, the estimates of the two modes are mixed, because the contact may have changed from one mode to the other. After
+each frame, the innovation of each mode determines the new probability of the mode. In the held mode, the velocity is
+zero. In the moving mode, the velocity is unknown when a movement begins. A white acceleration changes the velocity
+later.
 
 A position is represented by a complex number x + iy, and the logarithm of a force by a real number. All covariance
-matrices are assumed to be multiples of the covariance matrix of the measurement. A single number then represents each
-matrix, and a step takes only microseconds.
+matrices are assumed to be multiples of the covariance matrix of the measurement. A single number therefore represents
+each matrix, and a step takes only microseconds.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Live page: a web page that shows the contacts of a live stream or of a recording in a browser.
+"""Live page, which shows the contacts of a live stream or of a recording in a browser.
 
 Two processes work together. The reader is the process that reads a port. The reader writes samples of a fixed size into
 a pipe (module `link`). The reader of a live stream never waits for the page. A separate process receives the samples

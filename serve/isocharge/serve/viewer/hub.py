@@ -1,10 +1,10 @@
-"""Distribution of the samples of a stream to the viewers, which are the browsers that show the live page.
+"""Hub that distributes the samples of a stream to the viewers. A viewer is a browser that shows the live page.
 
 The class `Tape` stores samples under consecutive numbers. A tape contains the latest samples of a live stream, or all
 samples of a recording. A viewer confirms each message that it has drawn. While too many messages are unconfirmed, the
-viewer receives no further message. The next message then contains all samples that have arrived in the meantime. If
-there are too many samples for one message, neighbouring samples are coalesced. No messages are queued for a slow
-viewer.
+viewer receives no further message. The next message contains all samples that have arrived since the previous message.
+If there are too many samples for one message, neighbouring samples are coalesced. The hub therefore stores no queue of
+messages for a slow viewer.
 """
 
 import asyncio
@@ -86,31 +86,31 @@ class Tape:
         return self._ring[numbers % len(self._ring)]
 
     def timestamp(self, number: int) -> float:
-        """Return the Unix time of the stored sample with the given number, s."""
+        """Return the Unix time of the stored sample that has the given number, s."""
         return float(self._ring[number % len(self._ring)]["timestamp"])
 
     def first_number_after(self, time_s: float) -> int:
-        """Return the number of the first stored sample that is later than a Unix time, s.
+        """Return the number of the first stored sample after a given Unix time, s.
 
-        If there is no such sample, the result is the number of the next sample that will be appended.
+        If all stored samples are earlier, the result is the number of the next sample that will be appended.
         """
         numbers = range(self.total)
         return bisect_right(numbers, time_s, lo=self.oldest, key=self.timestamp)
 
     def span(self) -> tuple[float, float]:
-        """Return the Unix times of the oldest and the latest stored sample, s, or two zeros if there are no samples."""
+        """Return the Unix times of the oldest and the latest stored sample, s. Without samples, return two zeros."""
         if not self.total:
             return 0.0, 0.0
         return self.timestamp(self.oldest), self.timestamp(self.total - 1)
 
     def close(self) -> None:
-        """Close the file that contains the samples, if there is such a file."""
+        """Close the file of the samples if the tape has a file."""
 
 
 class RecordedTape(Tape):
     """Tape that stores all samples of a recording in a temporary file.
 
-    A time that is earlier than the time of the previous sample is replaced by the time of the previous sample.
+    If the time of a sample is earlier than the time of the previous sample, the time of the previous sample is stored.
     """
 
     def __init__(self, dtype: "np.dtype[Any]") -> None:
@@ -130,9 +130,9 @@ class RecordedTape(Tape):
     def append(self, samples: Samples) -> None:
         """Append samples, and update the overview.
 
-        A missing time, or a time before the previous sample, is replaced by the time of the previous sample. The stored
-        times therefore never decrease. If the samples do not fit into the mapped file, the capacity of the file is
-        doubled until they fit.
+        If a time is missing or is earlier than the previous time, the previous time is stored instead. The stored times
+        therefore never decrease. If the samples do not fit into the mapped file, the capacity of the file is doubled
+        until they fit.
 
         Args:
             samples: The samples, shape (n,).
@@ -150,7 +150,7 @@ class RecordedTape(Tape):
         self._update_overview(ordered)
 
     def close(self) -> None:
-        """Close the temporary file, which the operating system then removes."""
+        """Close the temporary file, so that the operating system removes it."""
         self._file.close()
 
     def _map_file(self, capacity: int) -> None:
@@ -164,8 +164,8 @@ class RecordedTape(Tape):
     def _update_overview(self, samples: Samples) -> None:
         """Update the largest force in each piece of the recording with the forces of new samples.
 
-        If the recording would have more than `MAX_PIECES` pieces, neighbouring pieces are joined in pairs, and the
-        duration of a piece is doubled.
+        The number of pieces is limited to `MAX_PIECES`. When a longer recording needs more pieces, neighbouring pieces
+        are joined in pairs, and the duration of a piece is doubled.
 
         Args:
             samples: New samples, shape (n,), whose times do not decrease.
@@ -249,12 +249,12 @@ class Playhead:
                     self._jump(0.0)
 
     def _jump(self, at_s: float) -> None:
-        """Set the position to `at_s`, which is a time since the start of the recording, s."""
+        """Set the position to a given time since the start of the recording, s."""
         self.at_s = at_s
         self.has_jumped = True
 
     def to_json(self) -> dict[str, float | bool]:
-        """Return the position, the speed and the state of playing as a JSON object for the page."""
+        """Return the position, the speed and whether the recording is being played, as a JSON object for the page."""
         return {"at_s": round(self.at_s, 3), "speed": self.speed, "is_playing": self.is_playing}
 
 
@@ -287,7 +287,7 @@ PROGRESS_INTERVAL_S = 0.5
 
 
 class Hub:
-    """Receives the samples of a stream, and manages the viewers of the stream.
+    """Hub that receives the samples of a stream and manages the viewers of the stream.
 
     All methods must be called in the same event loop.
 
@@ -305,8 +305,8 @@ class Hub:
     def __init__(self, link: PageEnd, description: dict[str, Any], *, is_recording: bool) -> None:
         """Create a hub without samples and without viewers.
 
-        All samples of a recording are stored, and each viewer may select a position in the recording. If the stream is
-        live, only the latest samples are stored.
+        For a recording, all samples are stored, and each viewer may select a position in the recording. For a live
+        stream, only the latest samples are stored.
 
         Args:
             link: Link to the process that reads the stream.
@@ -326,7 +326,7 @@ class Hub:
         self.tape: Tape = RecordedTape(self._dtype) if is_recording else Tape(self._dtype)
 
     def close(self) -> None:
-        """Close the link to the reader. If the stream is a recording, also close the file with its samples."""
+        """Close the link to the reader. For a recording, also close the file of the samples."""
         self._link.close_here()
         self.tape.close()
 
@@ -359,7 +359,7 @@ class Hub:
         self._wake_viewers()  # the tasks that send to the viewers then notice `has_ended`
 
     def _wake_viewers(self) -> None:
-        """Wake the tasks of all viewers. Each task then checks whether there are new samples to send."""
+        """Wake the tasks of all viewers, so that each task checks for new samples to send."""
         for viewer in self.viewers:
             viewer.wake.set()
 
@@ -374,14 +374,15 @@ class Hub:
             self._update_state({"has_ended": True})
 
     def _update_progress(self) -> None:
-        """If the stream is a recording, update the state with the part of the recording that was read so far."""
+        """For a recording, store in the state which part of the recording has been read so far."""
         if isinstance(self.tape, RecordedTape) and self.state.get("samples") != self.tape.total:
             self._update_state({"samples": self.tape.total, "span": self.tape.span(), "overview": self.tape.overview()})
 
     def _update_state(self, message: dict[str, Any]) -> None:
         """Update the state with the values of a message from the reader.
 
-        A marker is appended to the list of the latest markers. Every other value replaces the value with the same name.
+        A marker in the message is appended to the list of the latest markers. Every other value replaces the earlier
+        value of the same name.
         """
         values = dict(message)
         marker = values.pop("marker", None)
@@ -393,7 +394,7 @@ class Hub:
 
 
 class Viewer:
-    """One browser that shows the page. The object stores which part of the stream the browser has received.
+    """Browser that shows the page, with a record of the part of the stream that the browser has received.
 
     Args:
         hub: Hub of the stream that the browser shows.
@@ -429,13 +430,13 @@ class Viewer:
         self.wake.set()
 
     def apply(self, request: ReplayRequest) -> None:
-        """Carry out a request to change the position or the speed, to play, or to pause the recording."""
+        """Carry out a request to play or pause the recording, or to change the position or the speed."""
         if self._playhead is not None:
             self._playhead.apply(request, self._length_s())
             self._must_send_playhead = True
 
     def messages(self, now_s: float) -> list[bytes | str]:
-        """Return the messages to send now, or an empty list while too many messages are unconfirmed.
+        """Return the messages that are due now. While too many messages are unconfirmed, return an empty list.
 
         Args:
             now_s: Unix time, s.
@@ -486,9 +487,9 @@ class Viewer:
         return samples_message(self._sent_messages, now_s, samples, self._missed_samples, begin_anew=begins_anew)
 
     def _begin_anew_after_jump(self) -> None:
-        """If the viewer has selected another position, prepare a message that replaces everything that the page shows.
+        """After the viewer has selected another position, let the next message replace everything on the page.
 
-        The message begins with the samples of the last `HISTORY_S` seconds before the new position.
+        The next message begins with the samples of the last `HISTORY_S` seconds before the new position.
         """
         playhead = self._playhead
         tape = self._hub.tape

@@ -1,8 +1,8 @@
-"""Link between two processes: the reader, which reads a port, and the process that serves the live page.
+"""Link between the reader, which reads a port, and the process that serves the live page.
 
-Samples are sent through a pipe. A sample is so small that the operating system never writes only a part of it. Messages
-in both directions are JSON objects. Each message is sent as one datagram through a socket pair. The reader of a live
-stream never waits: if the pipe is full, it discards the sample and counts it.
+Samples are sent through a pipe. Each sample is so small that the operating system always writes the whole sample at
+once. Messages in both directions are JSON objects. Each message is sent as one datagram through a socket pair. The
+reader of a live stream never waits. If the pipe is full, the reader discards the sample and counts it.
 """
 
 import fcntl
@@ -80,7 +80,7 @@ class ReaderEnd(LinkEnd):
     def send_sample(self, sample: bytes) -> None:
         """Send a sample. If the pipe is full, the sample is discarded.
 
-        After `enable_waiting` was called, the method waits instead until the pipe has room for the sample.
+        However, after `enable_waiting` was called, the method waits until the pipe has room for the sample.
         """
         try:
             os.write(self.samples.fileno(), sample)
@@ -90,7 +90,7 @@ class ReaderEnd(LinkEnd):
             self.is_open = False
 
     def enable_waiting(self) -> None:
-        """From now on, let `send_sample` and `send_message` wait for the page instead of discarding data.
+        """Let all later calls of `send_sample` and `send_message` wait for the page instead of discarding data.
 
         This method must be called for a recording, because the page must show all samples of the recording.
         """
@@ -98,7 +98,7 @@ class ReaderEnd(LinkEnd):
         self.waits = True
 
     def send_message(self, **content: Any) -> bool:
-        """Send a message to the process of the page, and return whether it was sent.
+        """Send a message to the process of the page, and return whether the message was sent.
 
         Args:
             content: Names and values of the JSON object.
@@ -107,7 +107,7 @@ class ReaderEnd(LinkEnd):
         return self._send(json.dumps(content).encode(), flags)
 
     def wait_for_request(self) -> LiveRequest | None:
-        """Wait for a request of the page, and return the request, or None if the process of the page has ended."""
+        """Wait for a request of the page and return it. If the process of the page has ended, return None."""
         try:
             data = self.messages.recv(MAX_MESSAGE_BYTES)
         except OSError:
@@ -115,7 +115,7 @@ class ReaderEnd(LinkEnd):
         return REQUEST_DECODER.decode(data) if data else None
 
     def close(self) -> None:
-        """Close this end. A thread that waits in `wait_for_request` then receives None."""
+        """Close this end. If a thread is waiting in `wait_for_request`, the waiting call returns None."""
         self.is_open = False
         with suppress(OSError):
             self.messages.shutdown(socket.SHUT_RDWR)

@@ -1,9 +1,9 @@
-"""Messages between the server and the live page, namely the description of the film, samples and requests.
+"""Messages between the server and the live page: the description of the film, samples and requests.
 
 The page reads the description of the film before the first sample. The description contains the geometry of the film,
-the electrodes, the model and the deflection field. The geometry is a part of the metadata of the model. The page does
-not draw parts of the film that the metadata do not describe. The deflection field is stored in a file in the folder of
-the model. The files for the films of the released models are part of isocharge.
+the electrodes, the model and the deflection field. The geometry is a part of the metadata of the model. If the metadata
+do not describe a part of the film, the page does not draw this part. The deflection field is stored in a file in the
+folder of the model. The files for the released models are included in isocharge.
 
 Samples are sent to the page in binary messages with the following little-endian fields:
 
@@ -16,8 +16,8 @@ Samples are sent to the page in binary messages with the following little-endian
 - options (u32): if bit 0 is set, the page discards everything that it has shown before
 - the samples
 
-When the page has drawn a message, it sends a confirmation. The confirmation is a binary message with the number (u32)
-of the drawn message.
+When the page has drawn a message, it sends a confirmation. The confirmation is a binary message that contains the
+number (u32) of the drawn message.
 
 A sample is a prediction record in a binary form with a fixed size. If contacts are tracked, a sample contains the
 tracked contact instead of the contact of the frame. If there are more records than a browser can show, several records
@@ -34,7 +34,7 @@ are coalesced into one sample. A sample has the following little-endian fields:
 An unknown number is sent as NaN. The description of the film contains the offset of each field in a sample.
 
 A request of the page is a JSON object, such as {"do": "marker", "text": "here"}. Each kind of request is a class in
-this module. The value of `do` is the name of this class in lower case.
+this module. The value of `do` is the class name in lower case.
 """
 
 import math
@@ -76,7 +76,7 @@ OTHER_PREFIX = "other_"
 def _live_numbers() -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of the numbers in a sample.
 
-    The timestamp is not among these names, because it has another type than the other numbers of a sample.
+    The timestamp is not included, because its type differs from the type of all other numbers.
 
     Returns:
         The names of the numbers of the record itself, and the names of the numbers of its field `other`.
@@ -88,7 +88,7 @@ def _live_numbers() -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _live_names(fields: Sequence[Field]) -> tuple[str, ...]:
-    """Return the names of those fields that are numbers and that the live page shows."""
+    """Return the names of the numeric fields that the live page shows."""
     return tuple(field.name for field in fields if field.meaning.is_shown_live and field.kind == "number")
 
 
@@ -176,12 +176,12 @@ def _clip(values: Sequence[float]) -> list[float]:
 
 
 def coalesce(samples: Samples, max_samples: int) -> Samples:
-    """Reduce the number of samples by replacing each run of neighbouring samples by one sample of the run.
+    """Reduce the number of samples by replacing each run of neighbouring samples with one sample of the run.
 
-    The latest sample of a run is usually chosen. If this sample is not a contact, but the run contains contacts, the
-    contact with the largest force is chosen instead. Short taps are therefore not lost. The chosen sample then gets the
-    flags of all samples of the run, the largest of their latencies, and the sum of their numbers of records. The bit
-    `CONTACT_BIT` of the flags is not combined, but taken from the chosen sample alone.
+    By default, the latest sample of a run is chosen. If the latest sample is not a contact, but the run contains
+    contacts, the contact with the largest force is chosen instead, so that short taps are not lost. The chosen sample
+    gets the flags of all samples of the run, the largest latency in the run, and the total number of records in the
+    run. The bit `CONTACT_BIT` is an exception: it is taken from the chosen sample alone.
 
     Args:
         samples: The samples, shape (n,).
@@ -310,7 +310,7 @@ ReplayRequest = Play | Pause | Seek | Speed
 
 
 def samples_message(number: int, sent_s: float, samples: Samples, missed: int, *, begin_anew: bool = False) -> bytes:
-    """Return a binary message that sends samples to the page.
+    """Return a binary message that contains samples for the page.
 
     Args:
         number: Number of the message.
@@ -345,8 +345,9 @@ DEFLECTION_FILE = "deflection.json"
 def find_field(version_folder: Path, metadata: ModelMetadata) -> DeflectionField | None:
     """Return the deflection field of the film for which a model was trained, or None if no such field is available.
 
-    If the version folder of the model contains a field, this field is returned. Otherwise the function searches the
-    fields of the films of the released models, which are part of isocharge.
+    If the version folder of the model contains a deflection field, the function returns this field. Otherwise, the
+    function searches the deflection fields that are included in isocharge. The included deflection fields belong to the
+    films of the released models.
 
     Args:
         version_folder: Folder of the version of the model.
@@ -406,10 +407,10 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
 
 
 def _electrode_polygons(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[list[float]]]]:
-    """Return the polygons of each electrode at the position that a calibration of the film has found.
+    """Return the polygons of each electrode after a calibration has corrected their position.
 
-    The first polygon of an electrode is its pad. All further polygons describe other metal of the electrode, such as
-    leads.
+    The first polygon of an electrode is its pad. All further polygons describe additional metal that belongs to the
+    electrode, such as leads.
 
     Args:
         sensor: Description of the sensor in the metadata of the model, which may be incomplete.
@@ -448,7 +449,7 @@ class _Polygon(Struct):
 
 
 def _designed_polygons(parts: Mapping[str, Any], name: str) -> list[list[Point]]:
-    """Return the polygons of an electrode as they were designed, without the results of a calibration.
+    """Return the designed polygons of an electrode, which ignore the results of a calibration.
 
     If the design contains only a point for the electrode, the electrode is a square around this point.
 
@@ -473,9 +474,9 @@ def _designed_polygons(parts: Mapping[str, Any], name: str) -> list[list[Point]]
 
 
 def _calibrated_corners(corners: list[Point], calibration: Any) -> list[list[float]]:
-    """Apply the rotation and the shift that a calibration has found to the corners of a polygon.
+    """Rotate and shift the corners of a polygon by the results of a calibration.
 
-    The corners are first rotated about the centre of the film, and are then shifted.
+    The corners are first rotated about the centre of the film and then shifted.
 
     Args:
         corners: Corners (x, y) of the designed polygon, mm.

@@ -1,9 +1,9 @@
-"""Playground: an HTML page on which a visitor presses a simulated film and sees the contact that a network estimates.
+"""Playground, an HTML page on which a visitor can press a simulated film.
 
-The page is a single file, which loads no other files. The file contains the scripts, the networks as compressed ONNX
-files, and the stress of the film as a series. The charges are computed from this series (see
-`isocharge.common.stress_series`). The playground can therefore show every model of a biaxial film whose stress the
-series describes.
+The page shows the contact that a network estimates from the charges of the press. The page is a single file, which
+loads no other files. The file contains the scripts, the networks as compressed ONNX files, and the stress of the film
+as a series. The charges are computed from the series of the stress (see `isocharge.common.stress_series`). The
+playground can therefore show every model of a biaxial film whose stress the series describes.
 """
 
 import base64

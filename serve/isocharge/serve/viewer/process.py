@@ -61,7 +61,7 @@ class Page:
 
 @contextmanager
 def page_process(page: Page) -> Iterator[str]:
-    """Return a context manager that serves the page in a separate process while its block runs.
+    """Return a context manager that serves the page in a separate process until the `with` block ends.
 
     The calling process is the reader of the stream. The new process ends when the reader closes its end of the link.
 
@@ -134,8 +134,8 @@ async def _serve(server: PageServer, hub: Hub, listening: socket.socket, tls_con
 def _run(page: Page, url_sender: Connection) -> None:
     """Serve the page. This function is the target of the separate process of the page.
 
-    The function sends the URL of the page to the process that has started the page. If the page cannot be served, the
-    function sends the error instead.
+    The function sends the URL of the page to the process of the reader. If the page cannot be served, the function
+    sends the error instead.
 
     Args:
         page: Settings of the page.
@@ -174,11 +174,11 @@ def _receive_url(url_receiver: Connection) -> str:
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Return a context manager that ignores Ctrl-C while its block runs.
+    """Return a context manager that ignores Ctrl-C until the `with` block ends.
 
     A process that is started in the block also ignores Ctrl-C, and continues to ignore it after the block. The process
-    of the page therefore ends only when the reader ends. Python allows only the main thread to set signal handlers. If
-    the block runs in another thread, Ctrl-C is therefore not ignored.
+    of the page therefore ends only when the reader ends. If the block runs in another thread than the main thread,
+    Ctrl-C is not ignored, because Python allows only the main thread to set signal handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

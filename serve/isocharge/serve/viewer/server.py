@@ -2,13 +2,14 @@
 
 The server sends the files of the page and the description of the film over HTTP. It sends the samples over a WebSocket.
 
-The server is based on the package `websockets`, which answers one HTTP request on each connection. The package limits
-the size of the request line and headers (8 KiB for each line, 128 lines), the duration of a request, and the size of a
-message. The package also sends pings to each viewer. This module limits the number of viewers and the rate at which a
-viewer may send data. This module also disconnects viewers that do not read for too long.
+The server is based on the package `websockets`, which answers one HTTP request on each connection. The package
+`websockets` limits the size of each line of a request to 8 KiB, and the number of lines to 128. The package also limits
+the duration of a request and the size of a message. The package also sends pings to each viewer. This module limits the
+number of viewers and the rate at which a viewer may send data. This module also disconnects a viewer that has not read
+its messages for too long.
 
 A browser cannot send an Authorization header when it opens a WebSocket. The page therefore sends its token as a
-subprotocol, which is `bearer.` followed by the token in base64url. Other clients send the Authorization header. The
+subprotocol that consists of `bearer.` and the token in base64url. Other clients send the Authorization header. The
 module `isocharge.serve.network.browser_check` refuses requests from pages of other sites.
 """
 
@@ -52,7 +53,7 @@ BEARER = "bearer."
 
 
 class Access:
-    """Checks whether the server may answer a request for the description of the film or for samples.
+    """Check of requests for the description of the film and for samples.
 
     Args:
         token: Token that requests must contain, or None if requests need no token.
@@ -60,7 +61,10 @@ class Access:
     """
 
     def __init__(self, token: Token | None = None, host: str = "127.0.0.1") -> None:
-        """Store the token and create the check of browsers. The docstring of the class describes the arguments."""
+        """Store the token, and create the filter of requests from browsers.
+
+        The docstring of the class describes the arguments.
+        """
         self._token = token
         self._browser_check = BrowserCheck(host, any_host=token is not None)
 
@@ -81,7 +85,7 @@ class Access:
 
 
 def _authorization_from(subprotocols: Iterable[str]) -> bytes:
-    """Return the Authorization header that corresponds to the subprotocol with the token.
+    """Convert the subprotocol that contains the token to the value of an Authorization header.
 
     A browser cannot set headers when it opens a WebSocket. The page therefore sends the token as a subprotocol. The
     token is encoded in base64url, without padding characters.
@@ -188,21 +192,21 @@ class RateLimit:
 
 
 class PageConnection(ServerConnection):
-    """Connection that is ended if its client sends too much data.
+    """Connection of a client, which is ended if the client sends too much data.
 
     The limit counts all received data, including control frames such as pings.
     """
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Create the limit on received data when the connection begins."""
+        """Create the limit on received data, because the connection begins."""
         self._rate_limit = RateLimit(MAX_BURST_BYTES, MAX_BYTES_PER_S, time.monotonic())
         super().connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
         """Process received data, or end the connection if the client has sent too much data.
 
-        If the client does not read the responses, asyncio pauses writing. This method then also pauses reading, because
-        the responses to further data would fill the memory.
+        If the client does not read the responses, asyncio pauses writing. While writing is paused, the method also
+        pauses reading, because the responses to further data would fill the memory.
         """
         if not self._rate_limit.allows(len(data), time.monotonic()):
             self.transport.abort()
@@ -218,7 +222,7 @@ class PageConnection(ServerConnection):
 
 
 class PageServer:
-    """Server of the files of the page, the description of the film, and the samples.
+    """Server that sends the files of the page, the description of the film, and the samples.
 
     Args:
         hub: Hub of the stream that the page shows.
@@ -236,7 +240,7 @@ class PageServer:
     async def listening(
         self, listening: socket.socket, tls_context: ssl.SSLContext | None = None
     ) -> AsyncIterator[None]:
-        """Return an asynchronous context manager that answers requests on a socket while its block runs.
+        """Return an asynchronous context manager that answers requests on a socket until its block ends.
 
         Args:
             listening: Socket on which the server accepts connections.
@@ -264,8 +268,8 @@ class PageServer:
         """Return the response to an HTTP request, or None if the request opens a WebSocket.
 
         A request for a file of the page needs no token. A request for the description of the stream, or for a
-        WebSocket, must contain the token in its Authorization header. A browser that opens a WebSocket sends the token
-        in a subprotocol instead.
+        WebSocket, must contain the token in its Authorization header. When a browser opens a WebSocket, it sends the
+        token in a subprotocol instead.
 
         Args:
             _connection: Connection of the request, which is not used.
@@ -305,7 +309,7 @@ class PageServer:
         return response
 
     async def _serve_viewer(self, connection: ServerConnection) -> None:
-        """Send samples to a viewer, and carry out the requests of the viewer, until the viewer disconnects."""
+        """Send samples to a viewer and carry out requests of the viewer until the viewer disconnects."""
         viewer = Viewer(self._hub)
         self._hub.viewers.add(viewer)
         sender = asyncio.create_task(self._send(viewer, connection))
@@ -319,7 +323,7 @@ class PageServer:
             sender.cancel()
 
     async def _send(self, viewer: Viewer, connection: ServerConnection) -> None:
-        """Send messages to a viewer until the stream ends, and disconnect a viewer that does not read them.
+        """Send messages to a viewer until the stream ends, and disconnect a viewer that does not read the messages.
 
         Args:
             viewer: The viewer. Its event `wake` is set when there may be messages to send.
@@ -358,19 +362,22 @@ class PageServer:
 
 
 def _select_subprotocol(_connection: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
-    """Return the subprotocol of the page if the client offers this subprotocol, and otherwise None."""
+    """Return the subprotocol of the page if the client offers it, and None otherwise."""
     return Subprotocol(PROTOCOL) if PROTOCOL in offered else None
 
 
 def _last_response(response: Response) -> http11.Response:
-    """Convert a response to the type of the package `websockets`. The connection is closed after the response."""
+    """Convert a response to the response type of the package `websockets`.
+
+    The connection is closed after the response.
+    """
     headers = Headers([(name.decode(), value.decode()) for name, value in response.headers])
     headers["Connection"] = "close"
     return http11.Response(response.status, HTTPStatus(response.status).phrase, headers, response.body)
 
 
 def page_files() -> dict[str, Response]:
-    """Return a dictionary that contains the response to a request for each file of the page, by path.
+    """Return the response for each file of the page, by the path of the file.
 
     The path `/` is the HTML file.
     """

@@ -112,7 +112,7 @@ class Faults(Settings, frozen=True, kw_only=True):
 
 
 def _is_in_interval(t_s: float, period_s: float, length_s: float) -> bool:
-    """Return whether a time lies in one of the intervals that begin periodically.
+    """Return whether a time lies in one of several periodic intervals.
 
     Args:
         t_s: The time, s.
@@ -124,7 +124,7 @@ def _is_in_interval(t_s: float, period_s: float, length_s: float) -> bool:
 
 
 class VirtualScript(Settings, frozen=True):
-    """Content of a script file, which is given by `isocharge serve virtual --script`.
+    """Content of a script file for the command `isocharge serve virtual`.
 
     Attributes:
         presses: Rows (seconds, x_mm, y_mm, force_N), which are interpolated linearly. Nothing touches while the force
@@ -263,8 +263,8 @@ def _random_path(rng: np.random.Generator, t_s: Array) -> Complexes:
 
     # The path may leave the unit disk. The division changes a distance r from the centre into r / (1 + r^8)^(1/8),
     # which is less than 1, and nearly r if r is small.
-    divisor = (1.0 + np.abs(path) ** 8) ** (1 / 8)
-    return np.asarray(path / divisor)
+    distance_divisor = (1.0 + np.abs(path) ** 8) ** (1 / 8)
+    return np.asarray(path / distance_divisor)
 
 
 def _force_level(rng: np.random.Generator, t_s: Array, duration_s: float) -> Array:
@@ -283,17 +283,17 @@ def _force_level(rng: np.random.Generator, t_s: Array, duration_s: float) -> Arr
     mean_level = rng.uniform()
     frequency_Hz = rng.uniform(0.3, 1.0)
     phase_turns = rng.uniform()
-    level = mean_level + 0.15 * np.sin(2.0 * np.pi * (frequency_Hz * t_s + phase_turns))
+    unlimited_level = mean_level + 0.15 * np.sin(2.0 * np.pi * (frequency_Hz * t_s + phase_turns))
 
     # The ramp rises from 0 to 1 within `RAMP_S` after the beginning, and falls within `RAMP_S` before the end.
     time_to_edge_s = np.minimum(t_s, duration_s - t_s)  # time since the beginning or until the end
     ramp = np.clip(time_to_edge_s / RAMP_S, 0.0, 1.0)
     smooth_ramp = ramp * ramp * (3.0 - 2.0 * ramp)  # a cubic polynomial with the slope 0 at both ends
-    return np.clip(level, 0.0, 1.0) * smooth_ramp
+    return np.clip(unlimited_level, 0.0, 1.0) * smooth_ramp
 
 
 def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
-    """Damage a random fraction of the bytes, in the same way as a faulty cable.
+    """Damage a random fraction of the bytes, as a faulty cable would damage them.
 
     A damaged byte has one flipped bit, is dropped, or is followed by a random byte, each with the same probability.
 
@@ -307,15 +307,15 @@ def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
     """
     pieces = [bytes([byte]) for byte in data]
     is_damaged = rng.random(len(data)) < fraction
-    for position in np.flatnonzero(is_damaged).tolist():
-        byte = data[position]
+    for byte_index in np.flatnonzero(is_damaged).tolist():
+        byte = data[byte_index]
         kind_of_damage = int(rng.integers(3))
         random_byte = int(rng.integers(256))
         if kind_of_damage == 0:  # one bit is flipped
             flipped_bit = 1 << (random_byte % BITS_PER_BYTE)
-            pieces[position] = bytes([byte ^ flipped_bit])
+            pieces[byte_index] = bytes([byte ^ flipped_bit])
         elif kind_of_damage == 1:  # the byte is dropped
-            pieces[position] = b""
+            pieces[byte_index] = b""
         else:  # the byte is followed by a random byte
-            pieces[position] = bytes([byte, random_byte])
+            pieces[byte_index] = bytes([byte, random_byte])
     return b"".join(pieces)

@@ -1,13 +1,13 @@
 """Virtual sensor, which sends the frames of a simulated board through a pseudo-terminal.
 
-A forward map computes the touch charges of the whole script before the first frame is sent. The amplifier then
-processes these charges block by block in the order of time, because its output depends on earlier charges. Frames are
-written at absolute times, so the frame rate does not drift. If the computer is too busy to write a frame in time, all
-later frames are postponed, as if the board had paused. If the later frames were not postponed, the late frames would be
-sent in one burst, which would overflow the buffer of the port and look like a higher frame rate.
+A forward map computes the touch charges of the whole script before the first frame is sent. The amplifier processes the
+touch charges block by block in the order of time, because its output depends on earlier charges. Frames are written at
+absolute times, so the frame rate does not drift. If the computer is too busy to write a frame in time, all later frames
+are postponed, as if the board had paused. If the later frames were not postponed, the late frames would be sent in one
+burst. A burst would overflow the buffer of the port and look like a higher frame rate.
 
-The sensor never waits for a reader. A frame that does not fit into the buffer of the port is discarded and counted. The
-reader then receives frames with a gap in the frame numbers.
+The sensor never waits for a reader. A frame that does not fit into the buffer of the port is discarded and counted. In
+this case, the reader receives frames with a gap in the frame numbers.
 """
 
 import array
@@ -263,7 +263,7 @@ class VirtualSensor:
         return self._frame_count - self.withheld - self.lost
 
     def use(self, charges: Charges, script: Script, charges_per_K: Charges | None = None) -> None:
-        """Play another script of the same frame rate from its start. The amplifier keeps its state.
+        """From its start, play another script with the same frame rate. The amplifier keeps its state.
 
         The change takes effect within `BLOCK_S`.
 
@@ -350,7 +350,7 @@ class VirtualSensor:
         return (frame_number - self._first_frame_of_script) / self._script.rate_Hz
 
     def truth(self, seq: int) -> Truth:
-        """Return the true press in the latest frame with a given frame counter.
+        """Return the true press in the latest frame that has the given frame counter.
 
         Args:
             seq: The frame counter: number of the frame since the start, modulo `SEQ_MODULUS`.
@@ -444,7 +444,7 @@ class VirtualSensor:
 
     @property
     def _echo_of_request(self) -> bytes:
-        """The bytes that the line returns before a frame; empty if there is no echo."""
+        """Echo that the line returns before a frame; empty if the line returns no echo."""
         if self._request is None or not self._echo:
             return b""
         return self._request
@@ -452,8 +452,8 @@ class VirtualSensor:
     def _take_request(self, port: PseudoPort) -> bool:
         """Read the bytes that the reader has sent, and return whether they complete a request since the last call.
 
-        Several requests since the last call count as one request. For a sensor that sends all frames without requests,
-        the bytes are ignored, and the result is true.
+        Several requests since the last call count as one request. If the sensor sends all frames without requests, the
+        bytes are ignored, and the result is true.
 
         Args:
             port: The open port.
@@ -506,7 +506,7 @@ class VirtualSensor:
 
 
 def _clean_charges(forward: Charges, script: Script) -> Array:
-    """Compute the touch charges of a script without noise.
+    """Compute the touch charges of all frames of a script, without noise.
 
     Args:
         forward: Forward map: function from contacts (x, y, force), shape (k, 3), to charges, shape (k, electrodes), pC.

@@ -46,14 +46,14 @@ This value corresponds to an error of the solver of 0.05 % of the charge.
 
 
 class Orientation(StrEnum):
-    """Values of the option `--orientation`, for the orientation of the probe in the presses of a sweep."""
+    """Values of the option `--orientation`, which determines the orientation of the probe in a sweep."""
 
     fixed = "fixed"
     random = "random"
 
 
 class Sampling(StrEnum):
-    """Values of the option `--sampling`, for the sampling of the positions and forces of a sweep."""
+    """Values of the option `--sampling`, which determines how positions and forces of a sweep are chosen."""
 
     sobol = "sobol"
     random = "random"
@@ -122,12 +122,12 @@ def sweep_command(
         write_presses(table, _presses(read_dataset(folder)))
 
     manifest = json_module.loads((folder / "manifest.json").read_text())
-    written = f"{folder} and {table}" if table is not None else f"{folder}"
-    say(f"{manifest['samples']} presses in {written}")
+    written_paths = f"{folder} and {table}" if table is not None else f"{folder}"
+    say(f"{manifest['samples']} presses in {written_paths}")
 
 
 def _check_table(table: Path, folder: Path, samples: int, *, has_one_orientation: bool) -> None:
-    """Raise an error if the presses of a sweep cannot be written as a table, before the sweep starts.
+    """Before a sweep starts, raise an error if its presses cannot be written as a table.
 
     Args:
         table: Path of the table, a CSV or Parquet file.

@@ -1,1 +1,1 @@
-"""Writer of drawings of electrode layouts (DXF and SVG), and reader of electrodes from DXF drawings."""
+"""Writing of electrode layouts as drawings (DXF and SVG), and reading of electrodes from DXF drawings."""

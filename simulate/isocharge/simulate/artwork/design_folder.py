@@ -1,4 +1,4 @@
-"""Writer of the folder of a design, which contains the sensor file, the drawings, the results and pictures."""
+"""Functions that write a design as a folder with the sensor file, the drawings, the results and pictures."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ def write_design(design: Design, folder: Path) -> None:
     """Write a designed layout into a new folder.
 
     The files are `sensor.toml`, `layout.svg`, `layout.dxf`, `design.json`, and the picture `design.png` of the position
-    errors. Equal designs result in files with equal bytes.
+    errors. Equal designs result in identical files.
 
     Args:
         design: Result of the design.

@@ -161,7 +161,7 @@ def _anticlockwise_corners(points: Corners) -> Corners:
 def _width(line: Any) -> float:
     """Return the width of a polyline in the unit of the drawing.
 
-    The width is 0 if the polyline has no width or a width that varies.
+    The width is 0 if the polyline has no width, or if its width is not constant.
     """
     if line.dxftype() != "LWPOLYLINE":
         return 0.0

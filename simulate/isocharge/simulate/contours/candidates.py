@@ -1,6 +1,6 @@
 """Candidates for the position at which contours meet, and a grid from which the starting points of a search are chosen.
 
-The module `triangulation` improves several candidates for each of many presses at once.
+Each press has several candidates, and the module `triangulation` improves the candidates of many presses at once.
 """
 
 from dataclasses import dataclass
@@ -33,8 +33,8 @@ RANGE_MARGIN = 0.02
 class Candidates:
     """Possible contacts (candidates) of several presses. Each press may have any number of candidates.
 
-    The spread of a candidate is a length that measures how far the contours of the press are from meeting at the
-    candidate.
+    The spread of a candidate is a length. It is zero if all contours of the press meet at the candidate, and it is
+    larger if the contours pass the candidate at some distance.
 
     Attributes:
         press: Index of the press to which each candidate belongs, shape (n,).
@@ -48,7 +48,7 @@ class Candidates:
 
     @classmethod
     def from_starting_points(cls, press: Integers, contact: Array) -> "Candidates":
-        """Create candidates with an infinite spread from the starting points of a search.
+        """Convert the starting points of a search into candidates with an infinite spread.
 
         Args:
             press: Index of the press to which each starting point belongs, shape (n,).
@@ -81,7 +81,7 @@ class Candidates:
         return Candidates(self.press, better_contact, smaller_spread)
 
     def without_duplicates(self, tolerance: float) -> "Candidates":
-        """Sort the candidates by press and then by spread, and remove duplicates.
+        """Sort the candidates by press and by spread, and remove duplicates.
 
         A candidate is a duplicate if it is near a candidate of the same press that has a smaller spread and is not a
         duplicate itself.
@@ -112,7 +112,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class SeedGrid:
-    """Charges at the nodes of a square grid over a disk, from which the starting points of a search are chosen.
+    """Charges at the nodes of a square grid over a disk. The starting points of a search are chosen from the nodes.
 
     Attributes:
         position: Positions (x, y) of the nodes, shape (n_node, 2), mm.
@@ -168,7 +168,7 @@ class SeedGrid:
         )
 
     def relative_size_at(self, force: Array) -> Array:
-        """Interpolate the size of the charges at given forces, relative to their size at the middle force.
+        """Interpolate the size of the charges at given forces, relative to the size at the middle force.
 
         Args:
             force: Forces, any shape, N.
@@ -268,7 +268,7 @@ class SeedGrid:
         return press, node[press, column]
 
     def is_out_of_range(self, charge: Array, force: Array | None) -> Booleans:
-        """Return whether at least one charge of each press lies outside the range of the charges at the nodes.
+        """Return for each press whether at least one of its charges lies outside the range of the charges at the nodes.
 
         Args:
             charge: Charges of the presses, shape (n, n_electrode), pC.
@@ -303,8 +303,8 @@ def _nodes_on_disk(radius: float) -> tuple[int, Integers, Array]:
         (n_node,). Positions (x, y) of the selected nodes, shape (n_node, 2), mm.
     """
     side = 2 * max(4, int(np.ceil(radius / NODE_SPACING))) + 1  # odd, so that the centre of the disk is a node
-    line = np.linspace(-radius, radius, side)
-    square_grid = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
+    coordinates = np.linspace(-radius, radius, side)
+    square_grid = np.stack(np.meshgrid(coordinates, coordinates, indexing="ij"), axis=-1).reshape(-1, 2)
     grid_x, grid_y = square_grid.T
     index = np.flatnonzero(np.hypot(grid_x, grid_y) <= radius * (1.0 + 1.0 / side))
     position = onto_disk(square_grid[index], INNER_RADIUS * radius)

@@ -1,4 +1,4 @@
-"""Charges along lines from an electrode (Mirbagheri and others 2007, figures 2, 4, 7).
+"""Charges of presses on lines that start at an electrode (Mirbagheri and others 2007, figures 2, 4, 7).
 
 The mapping scheme of the paper consists of presses on lines that start at the centre of an electrode. The angles
 between neighbouring lines are equal, and so are the distances between neighbouring presses on a line. The paper fits a
@@ -35,7 +35,7 @@ The paper does not state this angle.
 
 @dataclass(frozen=True)
 class Mapping:
-    """Mapping scheme, which consists of presses at equal distances on lines from an electrode.
+    """Mapping scheme: presses at equal distances on lines that start at an electrode.
 
     Attributes:
         electrode: Name of the electrode at which the lines start.
@@ -60,7 +60,7 @@ class Mapping:
         step: float = STEP,
         length: float = LENGTH,
     ) -> "Mapping":
-        """Create a mapping scheme with lines at equal angles.
+        """Create a mapping scheme with equal angles between neighbouring lines.
 
         The last line always has the last angle, even if the angle between the last two lines is then smaller than
         `angle_step`.
@@ -108,7 +108,7 @@ class Mapping:
 
     @property
     def radius(self) -> float:
-        """Distance of the farthest press from the centre of the film, mm.
+        """Distance between the centre of the film and the farthest press, mm.
 
         A charge map that computes the charges of the presses must have at least this radius.
         """

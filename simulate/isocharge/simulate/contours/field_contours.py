@@ -27,7 +27,7 @@ TRACED_RADIUS = 1.0 - 5e-4
 
 @dataclass(frozen=True)
 class ContourField:
-    """Charges of presses with one force on a grid over the domain of a charge map, from which contours are traced.
+    """Charges on a grid of presses that have the same force. Contours are traced from these charges.
 
     Attributes:
         charge_map: Map that computes the charges of contacts. Splines are faster than a forward map.
@@ -86,10 +86,10 @@ class ContourField:
         Returns:
             Charges in ascending order, pC. The smallest and the largest charge of the electrode are not included.
         """
-        low, high = self.charge_range(electrode)
-        has_one_sign = low * high > 0.0
+        smallest, largest = self.charge_range(electrode)
+        has_one_sign = smallest * largest > 0.0
         spacing = np.geomspace if has_one_sign else np.linspace
-        charges = spacing(low, high, count + 2)  # includes the smallest and the largest charge
+        charges = spacing(smallest, largest, count + 2)  # includes the smallest and the largest charge
         return [float(charge) for charge in charges[1:-1]]
 
     @cached_property
@@ -100,8 +100,8 @@ class ContourField:
         """
         radius = TRACED_RADIUS * self.charge_map.domain.radius
         n_spacings = 2 * int(np.ceil(radius / GRID_SPACING))  # number of grid spacings along a diameter
-        line = np.linspace(-1.0, 1.0, n_spacings + 1)
-        square_x, square_y = np.meshgrid(line, line)
+        coordinates = np.linspace(-1.0, 1.0, n_spacings + 1)
+        square_x, square_y = np.meshgrid(coordinates, coordinates)
 
         # Map the square [-1, 1] x [-1, 1] onto the unit disk (elliptical grid mapping, Nowell 2005).
         disk_x = square_x * np.sqrt(1.0 - 0.5 * square_y**2)

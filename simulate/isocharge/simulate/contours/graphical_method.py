@@ -1,12 +1,12 @@
 """Contours and triangulation by the graphical method of Mirbagheri and others (2007).
 
-A polynomial is fitted to the charge along each line of a mapping scheme. The point of the line at which the polynomial
-has the given charge is one point of the contour. A cubic spline connects the points of all lines. The spline has free
-ends and is parametrised by the chord length, like the command SPLINE of AutoCAD. The splines of three electrodes form
-three pairs, and the two splines of a pair cross. The position of a press is the mean of three crossings, one for each
-pair. If two splines cross several times, the three crossings that are nearest to each other are used. In contrast to
-the graphical method, the modules `field_contours` and `triangulation` compute contours and positions directly from the
-charge map.
+A polynomial is fitted to the charge along each line of a mapping scheme. On each line, the point at which the
+polynomial is equal to the given charge belongs to the contour. A cubic spline connects the points of all lines. The
+spline has free ends and is parametrised by the chord length, like the command SPLINE of AutoCAD. The splines of three
+electrodes form three pairs, and the two splines of a pair cross. The position of a press is the mean of three
+crossings, with one crossing for each pair. If two splines cross several times, the three crossings that are nearest to
+each other are used. In contrast to the graphical method, the modules `field_contours` and `triangulation` compute
+contours and positions directly from the charge map.
 """
 
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ NEWTON_STEPS = 4
 
 @dataclass(frozen=True)
 class DrawnContour:
-    """Contour that is drawn by the graphical method, as a spline through one point on each line of a mapping scheme.
+    """Contour of the graphical method: a spline through one point on each line of a mapping scheme.
 
     Attributes:
         electrode: Name of the electrode.
@@ -59,12 +59,12 @@ class DrawnContour:
 
     @property
     def points(self) -> Array:
-        """Points (x, y) along the spline, which are the ends of its chords, shape (n, 2), mm."""
+        """Points (x, y) on the spline at which its chords end, shape (n, 2), mm."""
         return np.asarray(self._spline(self._parameters))
 
     @cached_property
     def _spline(self) -> "scipy.interpolate.CubicSpline":
-        """Spline that computes the position (x, y), mm, from the cumulative chord length of the knots, mm."""
+        """Spline that converts the cumulative chord length of the knots (mm) into the position (x, y), mm."""
         chord_lengths = np.linalg.norm(np.diff(self.knots, axis=0), axis=1)
         parameter = np.concatenate([[0.0], np.cumsum(chord_lengths)])
         return scipy.interpolate.CubicSpline(parameter, self.knots, bc_type="natural")
@@ -79,7 +79,7 @@ class DrawnContour:
     def crossings(self, other: "DrawnContour") -> Array:
         """Find the positions at which this contour crosses another contour.
 
-        Both splines are first approximated by chords. Each crossing of two chords is then improved by Newton's method.
+        Both splines are approximated by chords. Each crossing of two chords is improved by Newton's method.
 
         Args:
             other: The other contour.
@@ -94,7 +94,7 @@ class DrawnContour:
         return np.array(crossings).reshape(-1, 2)
 
     def _crossing_near(self, other: "DrawnContour", start: Array) -> Array:
-        """Find the crossing with another contour by Newton's method, which starts near this crossing.
+        """Find a crossing of this contour and another contour by Newton's method, starting near the crossing.
 
         Newton's method solves the equation own_spline(p) = other_spline(q) for the parameters p and q of both splines.
 
@@ -120,7 +120,7 @@ class DrawnContour:
 
 
 def _chord_crossings(first: Array, second: Array) -> Integers:
-    """Find the pairs of chords of two polylines that cross.
+    """Find all crossings between the chords of two polylines.
 
     A chord connects two successive points of a polyline.
 
@@ -227,7 +227,7 @@ class _Location(NamedTuple):
 
 @dataclass(frozen=True)
 class DrawnTriangulation:
-    """Estimator of the positions of presses from contours that are drawn by the graphical method.
+    """Estimator that determines the positions of presses by drawing contours according to the graphical method.
 
     Attributes:
         curves: Charges along lines that start at the first electrode, at the second electrode, and so on, in the order
@@ -289,7 +289,7 @@ class DrawnTriangulation:
         """Estimate the position of one press.
 
         Each triple of contours that meets results in a position with a spread. The position of the press is the mean of
-        the positions of all triples. The spread of the press is the largest spread of a triple.
+        the positions of all triples. The spread of the press is the largest spread of all triples.
 
         Args:
             charge: Touch charges, shape (n_electrode,), pC.

@@ -55,7 +55,7 @@ CHUNK = 512
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Estimator of the positions of presses from the points at which their contours meet.
+    """Estimator that determines the position of a press as the point at which its contours meet.
 
     Attributes:
         charge_map: Map that computes the charges of contacts. A forward map is replaced by splines, whose fit takes a
@@ -108,7 +108,7 @@ class Triangulation:
         return self._in_chunks(as_charges(charge, self.charge_map.electrodes), None)
 
     def _in_chunks(self, charge: Array, force: Array | None) -> Fix:
-        """Locate presses in chunks of `CHUNK` presses, which limits the required memory.
+        """Locate presses in chunks of `CHUNK` presses, in order to limit the required memory.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
@@ -133,8 +133,8 @@ class Triangulation:
     def _locate_chunk(self, charge: Array, force: Array | None) -> Fix:
         """Locate the presses of one chunk.
 
-        The method first finds the contacts near which the contours of each press meet, and then chooses one of these
-        contacts. If the force is given, the position is the mean of the crossings of the contours near the contact.
+        The method finds the contacts near which the contours of each press meet, and chooses one contact for each
+        press. If the force is given, the position is the mean of the crossings of the contours near the contact.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
@@ -207,7 +207,7 @@ class Triangulation:
         return SeedGrid.of(self._charges)
 
     def _starting_points(self, charge: Array, force: Array | None) -> Candidates:
-        """Choose the nodes of the grid that are nearer to the contours of a press than their neighbours.
+        """Choose the nodes of the grid at which the distance from the contours of a press is a local minimum.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
@@ -272,11 +272,11 @@ class Triangulation:
         return best[best.spread <= self.tolerance].without_duplicates(MIN_DISTANCE)
 
     def _replace_by_crossings(self, charge: Array, candidates: Candidates) -> Candidates:
-        """Replace each candidate by the mean of the crossings of the contours near this candidate.
+        """Replace the position of each candidate by the mean of the nearby crossings of contours.
 
         A triple of contours has three crossings, one for each pair of contours. The triple meets if all three crossings
-        lie within the tolerance of their mean. The new position of a candidate is the average of this mean over all
-        triples that meet near the candidate.
+        lie within the tolerance of their mean. Each triple that meets near a candidate yields such a mean. The new
+        position of the candidate is the average of these means.
 
         Args:
             charge: Touch charges of all presses, shape (n, n_electrode), pC.
@@ -307,9 +307,9 @@ class Triangulation:
         return Candidates(candidates.press, contact, spread)[n_meeting > 0].without_duplicates(MIN_DISTANCE)
 
     def _crossings_of_pair(self, charge: Array, candidates: Candidates, pair: tuple[int, int]) -> Array:
-        """Find the crossing of the contours of two electrodes near each candidate, by Newton's method.
+        """Use Newton's method to find the crossing of the contours of two electrodes near each candidate.
 
-        The force of a candidate keeps its value.
+        The force of each candidate remains unchanged during the search.
 
         Args:
             charge: Charges of all presses, shape (n, n_electrode), pC.
@@ -343,11 +343,11 @@ class Triangulation:
         return crossing
 
     def _distances(self, contact: Array, charge: Array | float, *, is_force_fixed: bool) -> tuple[Array, Array]:
-        """Estimate the signed distance of each contact from the contour of each electrode, and its derivatives.
+        """Estimate signed distances between contacts and the contours of electrodes, with their derivatives.
 
         To first order, the distance is the difference of the charges divided by the length of the gradient of the
-        charge. The unknowns are x, y and, unless the force is fixed, ln F times the radius of the domain. All unknowns
-        are therefore lengths.
+        charge. The unknowns are x and y. If the force is not fixed, there is a third unknown: ln F times the radius of
+        the domain. All unknowns are therefore lengths.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -392,7 +392,7 @@ class Triangulation:
 
 
 def gauss_newton_step(slopes: Array, distance: Array) -> Array:
-    """Compute the damped Gauss-Newton steps of n problems, in which sums of squared distances are minimised.
+    """Compute a damped Gauss-Newton step for each of n problems, each of which minimises a sum of squares.
 
     Args:
         slopes: Derivatives of the distances with respect to the unknowns, shape (n, n_distance, n_unknown),

@@ -1,4 +1,4 @@
-"""Sampling of the positions, forces, probes and orientations of the presses of a sweep.
+"""Sampling of the presses of a sweep: their positions, forces, probes and orientations.
 
 There are three kinds of sampling:
 
@@ -196,7 +196,7 @@ class Sweep:
         return np.asarray(points[:count])
 
     def _force(self, fraction: Array) -> Array:
-        """Convert fractions of the logarithmic range of forces into forces.
+        """Convert numbers from 0 to 1 into forces by linear interpolation of the logarithm of the force.
 
         Args:
             fraction: Fractions from 0 (smallest force) to 1 (largest force), shape (n,).
@@ -211,7 +211,7 @@ class Sweep:
     def _grid(self, max_count: int, period: float) -> tuple[Complexes, Array, Array]:
         """Return the presses of a grid with every combination of a position, a force and a rotation.
 
-        First, the same number of steps is assumed for each dimension of the grid. The number of forces is then
+        First, the same number of steps is assumed for each dimension of the grid. After that, the number of forces is
         increased as far as the largest number of presses allows.
 
         Args:

@@ -1,10 +1,10 @@
 """Reader and writer of datasets. A dataset is a folder with shards, a manifest and a data card.
 
-The manifest is the file manifest.json. It contains the version of the format and the checksum of each shard, and
-describes the sensor, the probes, the ranges, the seed, the solver and the columns. The data card is the file README.md,
-which describes the dataset for human readers. The shards are files such as shard-00000.npz, over which the samples are
-distributed. Each shard contains the columns x_mm, y_mm, force_N, probe, orientation_deg and charge_pC. The column
-charge_pC has the shape (n, n_electrode), and all other columns have the shape (n,).
+The manifest is the file manifest.json. The manifest contains the version of the format and the checksum of each shard.
+It also describes the sensor, the probes, the ranges, the seed, the solver and the columns. The data card is the file
+README.md, which describes the dataset for human readers. The samples are distributed over the shards, which are files
+such as shard-00000.npz. Each shard contains the columns x_mm, y_mm, force_N, probe, orientation_deg and charge_pC. The
+column charge_pC has the shape (n, n_electrode), and all other columns have the shape (n,).
 
 A dataset is written into a temporary folder, which is renamed when the dataset is complete. A dataset of measured
 presses has the same format, but its manifest has no entries `solver` and `seed`.
@@ -70,7 +70,7 @@ class Samples:
         return len(self.x_mm)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return the array of each column by the name of the column."""
+        """Return a dictionary from the names of the columns to their arrays."""
         return {name: getattr(self, name) for name in COLUMNS}
 
 
@@ -121,7 +121,7 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
 
 
 def pack_shard(number: int, samples: Samples, sensor: Sensor) -> tuple[str, bytes]:
-    """Convert samples into the file of a shard.
+    """Convert samples into the content of the file of a shard.
 
     Args:
         number: Number of the shard, from 0.
@@ -188,7 +188,7 @@ def write_manifest(
 
 
 def data_card(name: str, manifest: dict[str, Any]) -> str:
-    """Return the text of the file `README.md` of a dataset, which is its data card.
+    """Return the data card of a dataset, which is the text of its file `README.md`.
 
     Args:
         name: Name of the dataset.
@@ -196,7 +196,7 @@ def data_card(name: str, manifest: dict[str, Any]) -> str:
     """
     probes = manifest.get("probes", [])
     ranges = manifest.get("ranges", {})
-    solver_settings = _flat(manifest.get("solver", {}))
+    solver_settings = _flattened_items(manifest.get("solver", {}))
     lines = [
         "---",  # metadata for data hubs: https://huggingface.co/docs/hub/datasets-cards
         f"pretty_name: {json.dumps(name)}",
@@ -229,14 +229,15 @@ def data_card(name: str, manifest: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _flat(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+def _flattened_items(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield the keys and values of nested tables as pairs.
 
-    The keys of a value in an inner table are joined by spaces. For example, {"a": {"b": 1}} yields ("a b", 1).
+    If a value is in an inner table, the keys that lead to this value are joined by spaces. For example, {"a": {"b": 1}}
+    yields ("a b", 1).
     """
     for key, value in table.items():
         if isinstance(value, dict):
-            for inner_keys, inner_value in _flat(value):
+            for inner_keys, inner_value in _flattened_items(value):
                 yield f"{key} {inner_keys}", inner_value
         else:
             yield key, value

@@ -1,4 +1,4 @@
-"""Simulation of a sweep, which computes the charges of many presses and writes them as a dataset.
+"""Simulation of a sweep: the charges of many presses are computed and written as a dataset.
 
 A forward map is built for every probe and evaluated for every press. The division of the work into tasks does not
 depend on the executor. The files of the dataset are therefore the same for every executor. Finished parts are saved in
@@ -128,7 +128,7 @@ def solve_maps(
     *,
     executor: Executor | None = None,
 ) -> tuple[ForwardMap, ...]:
-    """Build a forward map for each probe of a sweep, which covers the radius and the forces of the sweep.
+    """For each probe of a sweep, build a forward map that covers the radius and the forces of the sweep.
 
     Args:
         sensor: Sensor whose charges are computed.
@@ -189,7 +189,7 @@ def _manifest_entries(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any
 
 
 def _finish_shards(
-    run: ResumableRun, maps: Sequence[ForwardMap], presses: SweepPresses, executor: Executor | None, shard: int
+    run: ResumableRun, maps: Sequence[ForwardMap], presses: SweepPresses, executor: Executor | None, shard_size: int
 ) -> list[dict[str, Any]]:
     """Compute and save the shards that an interrupted run has not saved yet.
 
@@ -200,14 +200,14 @@ def _finish_shards(
         maps: Forward map of each probe.
         presses: All presses of the sweep.
         executor: Executor that computes the charges; None for this process.
-        shard: Number of presses in a shard.
+        shard_size: Number of presses in a shard.
 
     Returns:
         Entries of the manifest that describe all shards, in the order of the shards.
     """
     # Load the shards that an interrupted run has saved. The argument `final` states that a shard is a file of the
     # dataset, and not only an intermediate result.
-    presses_of_shards = list(_split(presses, shard))
+    presses_of_shards = list(_split(presses, shard_size))
     entries: dict[int, dict[str, Any]] = {}  # by the index of the shard
     for index, shard_presses in enumerate(presses_of_shards):
         data = run.load(shard_name(index), bytes, final=True)
@@ -230,7 +230,7 @@ def _finish_shards(
 
 
 def _split(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
-    """Yield successive parts of the presses with `size` presses each. The last part may be smaller."""
+    """Divide the presses into successive parts of `size` presses, and yield the parts. The last part may be smaller."""
     for start in range(0, len(presses), size):
         yield presses[start : start + size]
 

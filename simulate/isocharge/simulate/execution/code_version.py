@@ -19,16 +19,16 @@ def code_fingerprint() -> str:
     The text contains the versions of isocharge, NumPy, SciPy and shapely, and a checksum of the source files of
     isocharge.simulate and of the files of the built-in sensors.
     """
-    source = hashlib.sha256()
+    checksum = hashlib.sha256()
     for path in sources():
         relative_path = path.relative_to(PACKAGE).as_posix()
-        source.update(relative_path.encode() + b"\0" + path.read_bytes())
-    short_checksum = source.hexdigest()[:12]
+        checksum.update(relative_path.encode() + b"\0" + path.read_bytes())
+    short_checksum = checksum.hexdigest()[:12]
     isocharge_version = importlib.metadata.version("isocharge")
     libraries = [f"{name} {importlib.metadata.version(name)}" for name in LIBRARIES]
     return ", ".join([f"isocharge {isocharge_version} ({short_checksum})", *libraries])
 
 
 def sources() -> list[Path]:
-    """Return the files from which the checksum is computed, in an order that is the same on every machine."""
+    """Return the files that the checksum covers. Their order is the same on every machine."""
     return sorted([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.toml")], key=lambda path: path.as_posix())

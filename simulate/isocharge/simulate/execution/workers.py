@@ -94,9 +94,9 @@ def _result(future: Future[Result]) -> Result:
 
 @contextmanager
 def _executor_errors() -> Iterator[None]:
-    """Return a context manager that converts the exceptions of executors that lose workers into WorkersLost.
+    """Return a context manager that raises WorkersLost if the executor has lost its workers.
 
-    All other exceptions, such as those of a job, are raised unchanged.
+    All other exceptions, such as the exceptions of a job, are raised unchanged.
     """
     try:
         yield
@@ -171,13 +171,12 @@ def _abandon(pool: ProcessPoolExecutor, parent_end: Connection) -> None:
     """End the workers of a process pool although they are still computing, and wait until the pool has ended.
 
     The method `ProcessPoolExecutor.shutdown` is not sufficient. In this process, a manager thread manages the pool. If
-    the workers end unexpectedly, the manager thread may fail or wait forever in two cases, which this function
-    prevents:
+    the workers end unexpectedly, the manager thread may fail or wait forever. This function prevents two such cases.
 
-    - A future is cancelled, and then the workers end. The manager thread fails with an InvalidStateError if it has not
-      discarded the cancelled future yet.
-    - The workers end while a job that is larger than the buffer of a pipe is sent to them. The sending thread waits
-      forever if this process keeps a reading end of this pipe open (https://github.com/python/cpython/issues/94777).
+    In the first case, the workers end shortly after a future was cancelled. The manager thread fails with an
+    InvalidStateError if it has not discarded the cancelled future yet. In the second case, the workers end while a job
+    that is larger than the buffer of a pipe is sent to them. The sending thread waits forever if this process keeps a
+    reading end of this pipe open (https://github.com/python/cpython/issues/94777).
 
     Args:
         pool: Process pool whose results are no longer needed.
@@ -226,7 +225,7 @@ def _initialise_worker(worker_end: Connection) -> None:
 
 
 def _end_with_parent(worker_end: Connection) -> None:
-    """Wait until the parent process closes its end of the pipe, and then end this process."""
+    """Wait until the parent process closes its end of the pipe, and end this process."""
     worker_end.poll(None)  # the parent sends no data, so this returns only when its end is closed
     os._exit(1)
 

@@ -18,7 +18,8 @@ STEPS = (0.05, 0.05, 1e-3)
 ONE_SIDED_STEPS = (0.01, 0.01, 1e-3)
 """Steps of the one-sided differences in x and y (mm) and in ln F (dimensionless).
 
-They are smaller than `STEPS`, because the error of a one-sided difference decreases only linearly with the step."""
+They are smaller than `STEPS`, because the error of a one-sided difference decreases only linearly with the step.
+"""
 
 MIN_LOG_FORCE_HALF_WIDTH = 0.05
 """Smallest half width of a domain in ln F, dimensionless.
@@ -34,7 +35,7 @@ LIMIT_TOLERANCE = 1.0 + 1e-9
 class Domain:
     """Set of contacts for which a charge map is valid.
 
-    The positions of the contacts lie in a disk around the centre of the film, and their forces lie in an interval.
+    The positions of the contacts lie in a disk around the centre of the film, and the forces lie in an interval.
 
     Attributes:
         radius: Largest distance from the centre, mm.
@@ -78,8 +79,8 @@ class Domain:
         Returns:
             Scaled coordinates, shape (n, 3), dimensionless.
         """
-        logs = np.stack([contact[:, 0], contact[:, 1], np.log(contact[:, 2])], axis=1)
-        return np.asarray((logs - self.centre) / self.scale)
+        log_contact = np.stack([contact[:, 0], contact[:, 1], np.log(contact[:, 2])], axis=1)
+        return np.asarray((log_contact - self.centre) / self.scale)
 
     def to_contact(self, unit: Array) -> Array:
         """Convert the scaled coordinates that `to_unit` returns back into contacts (x, y, F).
@@ -114,8 +115,8 @@ class Domain:
         Returns:
             Whether each contact lies in the domain, shape (n,).
         """
-        inside = np.hypot(contact[:, 0], contact[:, 1]) <= self.radius * LIMIT_TOLERANCE
-        return np.asarray(inside & _are_within(contact[:, 2], self.force_range))
+        is_in_disk = np.hypot(contact[:, 0], contact[:, 1]) <= self.radius * LIMIT_TOLERANCE
+        return np.asarray(is_in_disk & _are_within(contact[:, 2], self.force_range))
 
     def check(self, contact: Array, source: str) -> Array:
         """Convert contacts into an array of floats, and raise an error if a contact lies outside the domain.
@@ -131,9 +132,9 @@ class Domain:
             SceneError: If the array does not have the shape (n, 3), or a contact lies outside the domain.
         """
         contact = as_contacts(contact, source)
-        inside = self.contains(contact)
-        if not inside.all():
-            first_outside = int(np.argmin(inside))  # index of the first False
+        is_inside = self.contains(contact)
+        if not is_inside.all():
+            first_outside = int(np.argmin(is_inside))  # index of the first False
             x, y, force = contact[first_outside]
             low, high = self.force_range
             raise SceneError(
@@ -199,10 +200,13 @@ class ChargeMap(Protocol):
 
 @runtime_checkable
 class LinearisedMap(ChargeMap, Protocol):
-    """Charge map with a method that computes charges and derivatives together, faster than two separate calls."""
+    """Charge map with a method that computes charges and derivatives together.
+
+    One call of the method is faster than separate calls for the charges and the derivatives.
+    """
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Compute the charges of contacts and their derivatives with respect to x, y and ln F.
+        """Compute the charges that contacts cause, and the derivatives of the charges with respect to x, y and ln F.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -213,9 +217,9 @@ class LinearisedMap(ChargeMap, Protocol):
 
 
 def linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
-    """Compute the charges of contacts and their derivatives with respect to x, y and ln F.
+    """Compute the charges that contacts cause, and the derivatives of the charges with respect to x, y and ln F.
 
-    If the map has a method `linearised`, this method computes the charges and their derivatives together.
+    If the map has a method `linearised`, the method computes charges and derivatives together, which is faster.
 
     Args:
         charge_map: Map that computes the charges.
@@ -231,7 +235,7 @@ def linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class FunctionMap:
-    """Charge map that computes charges with a given function, and their derivatives by central differences.
+    """Charge map that computes charges with a given function, and derivatives of the charges by central differences.
 
     Attributes:
         function: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns charges, shape (n, n_electrode),
@@ -256,7 +260,7 @@ class FunctionMap:
 
 @dataclass(frozen=True)
 class _RestrictedMap:
-    """Charge map with the charges of another map and a smaller domain.
+    """Charge map that computes the same charges as another map, but has a smaller domain.
 
     Attributes:
         unrestricted: Map that computes the charges and their derivatives.
@@ -281,7 +285,7 @@ class _RestrictedMap:
 
 
 def within(charge_map: ChargeMap, radius: float) -> ChargeMap:
-    """Return a charge map with the same charges, whose domain is restricted to a disk with the given radius (mm)."""
+    """Restrict the domain of a charge map to a disk with the given radius (mm). The charges do not change."""
     return _RestrictedMap(charge_map, charge_map.domain.within(radius))
 
 
@@ -312,10 +316,11 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
 
 
 def one_sided_differences(function: Callable[[Array], Array], contact: Array) -> tuple[Array, Array]:
-    """Compute a function of contacts and approximations of its derivatives, with four values of the function.
+    """Compute a function of contacts, and approximate its derivatives by one-sided differences.
 
-    Central differences need six values and are more accurate. The errors of these derivatives are proportional to
-    `ONE_SIDED_STEPS`. They are small enough for the steps of a search, whose result is checked by the values alone.
+    One-sided differences need four values of the function. Central differences need six values, but are more accurate.
+    The errors of one-sided differences are proportional to the steps `ONE_SIDED_STEPS`. These errors are small enough
+    for a search that uses the derivatives only to choose its steps.
 
     Args:
         function: Function of contacts (x, y, F), shape (n, 3), mm and N, that returns values, shape (n, k). The
@@ -368,10 +373,10 @@ def check_forces(force: Array | float, force_range: tuple[float, float], source:
         SceneError: If a force lies outside the range or is NaN.
     """
     forces = np.atleast_1d(force)
-    inside = _are_within(forces, force_range)
-    if not inside.all():
+    is_inside = _are_within(forces, force_range)
+    if not is_inside.all():
         low, high = force_range
-        first_outside = int(np.argmin(inside))  # index of the first False
+        first_outside = int(np.argmin(is_inside))  # index of the first False
         name = f"force of press {first_outside}" if forces.size > 1 else "force"
         raise SceneError(
             f"{name}: expected {low:g} to {high:g} N, which the {source} covers, got {forces[first_outside]:g} N"
@@ -407,7 +412,7 @@ def check_radius(radius: float, largest: float, source: str) -> None:
 
 
 def check_electrode_count(n_electrode: int) -> None:
-    """Raise an error if a sensor has fewer than three electrodes, which are too few to determine a contact.
+    """Raise an error if a sensor has fewer than three electrodes, because a contact has three unknowns.
 
     Args:
         n_electrode: Number of electrodes of the sensor.

@@ -2,13 +2,13 @@
 
 The splines compute charges and their derivatives about two hundred times faster than the forward map.
 
-Each charge is divided by the squared amplitude, which is a function of the force in the module `mechanics.scaling`.
-The scaled charges that result from this division depend only weakly on the force. At each of a few forces, a cubic
-spline in (x, y) approximates the scaled charges. The spline is fitted by least squares to presses on a disk around the
-centre of the film. Near an electrode, the charge of this electrode varies strongly with the position of the press.
-Around each electrode, a second spline with finer knots therefore corrects the charge of this electrode. For all other
-forces, the scaled charges are interpolated by Lagrange polynomials in ln F. A forward map interpolates its stress
-fields between forces in the same way. The interpolation between forces therefore adds no error.
+Each charge is divided by the squared amplitude of the press, which the module `mechanics.scaling` computes from the
+force. The scaled charges depend only weakly on the force. At each of a few forces, a cubic spline in (x, y)
+approximates the scaled charges. The spline is fitted by least squares to presses on a disk around the centre of the
+film. The charge of an electrode varies strongly with the position of a press near the electrode. Around each electrode,
+a second spline with more closely spaced knots therefore corrects the charge of the electrode. For all other forces, the
+scaled charges are interpolated by Lagrange polynomials in ln F. A forward map interpolates its stress fields between
+forces in the same way. The interpolation between forces therefore adds no further error.
 """
 
 from dataclasses import dataclass, replace
@@ -77,7 +77,7 @@ LOG_FORCE_STEP = 1e-4
 
 @dataclass(frozen=True)
 class Patch:
-    """Correction of the scaled charge of one electrode for presses in a rectangle around this electrode.
+    """Correction of the scaled charge of one electrode for presses in a rectangle around the electrode.
 
     The correction and its first derivatives are zero on the edges of the rectangle.
 
@@ -152,11 +152,11 @@ class ChargeSpline:
         # Fit coarse splines of all charges over the disk, and a finer correction near each electrode.
         sensor = forward_map.sensor
         samples = _ScaledCharges(forward_map, _force_nodes(forward_map))
-        coarse = _fit_disk(samples, domain.radius, max(spacing, COARSE_SPACING))
+        coarse_spline = _fit_disk(samples, domain.radius, max(spacing, COARSE_SPACING))
         patches: list[Patch] = []
         if spacing < COARSE_SPACING:  # otherwise the coarse splines are already as fine as the corrections
             for electrode in range(len(sensor.electrodes)):
-                patch = _fit_patch(samples, electrode, domain.radius, spacing, coarse)
+                patch = _fit_patch(samples, electrode, domain.radius, spacing, coarse_spline)
                 if patch is not None:
                     patches.append(patch)
 
@@ -167,7 +167,7 @@ class ChargeSpline:
             calibration=sensor.calibration,
             domain=domain,
             force=samples.force,
-            table=coarse,
+            table=coarse_spline,
             patches=tuple(patches),
             error=np.nan,
         )
@@ -205,7 +205,9 @@ class ChargeSpline:
         return derivatives
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Compute charges and derivatives together, faster than separate calls of `charges` and `derivatives`.
+        """Compute charges and derivatives together.
+
+        One call is faster than separate calls of `charges` and `derivatives`.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -222,7 +224,7 @@ class ChargeSpline:
         return charge, np.concatenate([position_derivative, log_force_derivative[..., None]], axis=2)
 
     def first_order(self, position: Array, force: Array | float) -> tuple[Array, Array, Array]:
-        """Compute the charges of presses, and the derivatives of these charges.
+        """Compute the charges of presses, and the derivatives of the charges.
 
         Positions outside the disk are accepted, because an iterative solver may try such positions.
 
@@ -275,9 +277,9 @@ class ChargeSpline:
     def scaled_charges(self, position: Array) -> Array:
         """Compute the scaled charges for all forces at which splines were fitted.
 
-        A scaled charge is a charge divided by the squared amplitude at its force. The splines over the disk approximate
-        the scaled charges of all electrodes. Each patch then corrects the scaled charge of one electrode in a rectangle
-        around this electrode. Finally, the calibration adds the crosstalk.
+        A scaled charge is a charge divided by the squared amplitude of the press. The splines over the disk approximate
+        the scaled charges of all electrodes. Each patch corrects the scaled charge of one electrode in a rectangle
+        around the electrode. Finally, the calibration adds the crosstalk.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
@@ -314,7 +316,7 @@ class ChargeSpline:
 
 
 def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
-    """Fit splines to a charge map if it is a forward map, because splines compute derivatives faster.
+    """Return splines in place of a forward map, because splines compute derivatives faster.
 
     The fit takes a few seconds. A charge map of another class is returned unchanged.
     """
@@ -327,8 +329,9 @@ def _force_nodes(forward_map: ForwardMap) -> Array:
     """Return the forces at which splines are fitted, shape (n_force,), N.
 
     If the piezoelectric coefficient d33 is zero, the splines have the forces at which the forward map was solved. If
-    d33 is not zero, the splines have a few more forces, because the charges caused by d33 depend on the force in
-    another way than the charges caused by the stress. A map with a single force keeps this single force.
+    d33 is not zero, the splines have a few more forces. The reason is that the charges caused by d33 are proportional
+    to the force, but the charges caused by the stress are not. If the map has a single force, the splines have the same
+    single force.
     """
     solved_force = forward_map.family.force
     min_log_force, max_log_force = np.log(forward_map.domain.force_range)
@@ -376,9 +379,10 @@ class _ScaledCharges:
     force: Array
 
     def at(self, position: Array, is_needed: Booleans) -> Array:
-        """Compute the scaled charges of presses, which are charges divided by the squared amplitude at their force.
+        """Compute the scaled charges that presses at given positions cause.
 
-        At each position, the charges are computed for every force at which splines are fitted.
+        A scaled charge is a charge divided by the squared amplitude of the press. At each position, the charges are
+        computed for every force at which splines are fitted.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
@@ -433,8 +437,8 @@ def _fit_patch(
 ) -> Patch | None:
     """Fit a fine spline that corrects the coarse spline near one electrode.
 
-    The correction is the scaled charge of this electrode minus the value that the coarse spline returns. The fine
-    spline covers a rectangle around the electrode.
+    The correction is the scaled charge of the electrode minus the value that the coarse spline returns. The fine spline
+    covers a rectangle around the electrode.
 
     Args:
         samples: Scaled charges to which the splines are fitted.

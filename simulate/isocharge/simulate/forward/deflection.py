@@ -1,4 +1,4 @@
-"""Tables of the deflection of a film under a circular probe, from which the live page draws the film."""
+"""Table of the deflection of a film under a circular probe. The live page draws the film from the table."""
 
 import numpy as np
 

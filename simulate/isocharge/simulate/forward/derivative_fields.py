@@ -1,7 +1,7 @@
-"""Computation of the derivatives of the stress field of a film with respect to a side force or the pretension.
+"""Derivatives of the stress in a film with respect to a side force or to the pretension.
 
 The derivatives are used for small corrections, so they need not be as accurate as the stress itself. The derivatives
-are therefore solved at fewer presses than the stress of a forward map.
+are therefore computed for fewer presses than the stress of a forward map.
 """
 
 from concurrent.futures import Executor
@@ -16,10 +16,10 @@ NODE_COUNTS = (6, 6)
 
 
 def solve_derivatives(forward_map: ForwardMap, read: Reading, executor: Executor | None) -> ForwardMap:
-    """Compute derivatives of the stress for a few presses, and return a map that interpolates these derivatives.
+    """Compute derivatives of the stress for a few presses, and return a map that interpolates the derivatives.
 
-    The presses are distributed over the domain of a forward map, and are solved with the mesh of this map. The solves
-    take about ten seconds.
+    The presses are distributed over the domain of a forward map, and are solved with the mesh of the forward map. The
+    solves take about ten seconds.
 
     Args:
         forward_map: Forward map of the film under a circular probe. It provides the domain, the mesh and the readout.

@@ -1,4 +1,4 @@
-"""Families of presses with one probe, of which only a few presses are solved.
+"""Families of presses with one probe. Only a few presses of a family are solved.
 
 The solved presses are the nodes of the family. For every other press, the stress is interpolated between the nodes.
 """
@@ -38,7 +38,7 @@ film. The rim is far from the probe. A few harmonics of the orientation therefor
 
 
 class NodeCount(NamedTuple):
-    """Number of nodes at which a family of presses is solved.
+    """Numbers of distances, forces and orientations for which a family of presses is solved.
 
     Attributes:
         distances: Number of distances of the presses from the centre of the film.
@@ -66,7 +66,7 @@ power of the force to another, and pass through zero.
 
 @dataclass(frozen=True)
 class Family:
-    """Presses at which the stress is solved, in order to interpolate the stress of all presses in a domain.
+    """Solved presses, between which the stress under all presses in a domain is interpolated.
 
     Attributes:
         domain: Presses for which the stress can be interpolated.
@@ -166,13 +166,13 @@ class Family:
     def _rotation_weights(self, rotation: Array) -> Array:
         """Compute the weights that interpolate between the rotations of the family by a trigonometric polynomial.
 
-        The family has N evenly spaced rotations. If t is the angle between the interpolated rotation and a rotation of
-        the family, the weight of the latter is the Dirichlet kernel
+        The family has N evenly spaced rotations. Let t be the angle between the interpolated rotation and a rotation of
+        the family. The weight of this rotation of the family is the Dirichlet kernel
 
             (1 + 2 cos(t) + 2 cos(2 t) + ...) / N
 
-        with all harmonics up to N / 2. If N is even, the highest harmonic has the amplitude 1 in place of 2, because
-        the sine of the highest harmonic is zero at every rotation of the family.
+        with all harmonics up to N / 2. If N is even, the highest harmonic has the amplitude 1 instead of 2, because the
+        sine of the highest harmonic is zero at every rotation of the family.
 
         Args:
             rotation: Rotations of the probe relative to the direction of the press, shape (n,), rad.
@@ -211,11 +211,11 @@ class Family:
         return solved.reshape(self.distance.size, self.solved_rotations.size, self.force.size, -1)
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
-        """Extend the stress from the rotations within one period of the probe to all rotations, by symmetry.
+        """By symmetry, extend the stress from the rotations within one period of the probe to all rotations.
 
         A rotation of the probe by one period does not change the press, but rotates the mesh. The stress of each
-        further period is therefore computed from the stress of the solved period, by a rotation of the elements of the
-        mesh and of the components of the stress.
+        further period is therefore the stress of the solved period, with rotated elements of the mesh and rotated
+        stress components.
 
         Args:
             solved: Scaled stress in a frame that rotates with the probe, as returned by `solve`, shape
@@ -295,8 +295,8 @@ def check_presses(domain: Domain, count: int) -> list[CheckPress]:
 def check_family(film: Film, probe: Probe, domain: Domain) -> None:
     """Raise an error if no forward map can be built for a film, a probe and a domain.
 
-    Only the outermost press with the largest force is checked. If this press can exist, all other presses of the domain
-    can exist, too.
+    Only the outermost press with the largest force is checked. If the outermost press with the largest force can exist,
+    all other presses of the domain can exist, too.
 
     Args:
         film: Film of the forward map.
@@ -349,7 +349,7 @@ def probe_frame_stress(solved: Equilibrium, surface: Surface) -> Array:
 
 @dataclass(frozen=True)
 class Chain:
-    """Presses on one film at one position with different forces, which are solved one after the other.
+    """Presses with different forces at one position of one film. The presses are solved one after the other.
 
     Each solve starts from the equilibrium under the previous force.
 

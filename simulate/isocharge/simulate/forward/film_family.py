@@ -6,13 +6,13 @@ force. The scaled stress under a press depends on Poisson's ratio and on five nu
     distance / a,   F / (E h a),   pretension / E,   h / a,   R / a.
 
 All films of a family have the same Poisson's ratio. In a frame that moves with the probe, the stress at the nodes of
-the mesh is a smooth function of the five numbers. The stress is computed at the nodes of a Chebyshev grid and
-interpolated between these nodes. The stresses on the grid are stored as a proper orthogonal decomposition with about
-fifty modes (Sirovich 1987). The forward map of a single film is obtained by interpolation over the last three numbers.
-This interpolation takes about one millisecond.
+the mesh is a smooth function of the five dimensionless numbers. The stress is computed at the nodes of a Chebyshev grid
+and interpolated between the nodes. The stresses on the grid are stored as a proper orthogonal decomposition with about
+fifty modes (Sirovich 1987). The forward map of a single film is obtained by interpolation over pretension / E, h / a
+and R / a. This interpolation takes about one millisecond.
 
-Files contain the coefficients and modes as integers. Modes with small contributions are stored with fewer bits. The
-rounding to integers changes a charge by a relative amount of about 3e-5.
+Files contain the coefficients and modes as integers. Modes that contribute little to the stress are stored with fewer
+bits than the other modes. The rounding to integers changes a charge by a relative amount of about 3e-5.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, SceneError, SolveError
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.family import CheckPress, Family, check_family, solve_films
-from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, FilmLimits, bits_of, decompose, quantised
+from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, FilmLimits, bits_of, decompose, quantise
 from isocharge.simulate.forward.film_modes import MODES, FilmModes, ModeMap
 from isocharge.simulate.forward.forward_map import ForwardMap, direct_charges
 from isocharge.simulate.mesh.blocks import Resolution
@@ -108,7 +108,7 @@ class FilmFamily:
     ) -> "FilmFamily":
         """Build the family of all films that are possible according to a prior distribution.
 
-        About five thousand presses are solved. The interpolated charges are then compared with direct solves.
+        About five thousand presses are solved. Finally, the interpolated charges are compared with direct solves.
 
         Args:
             prior: Prior distribution of the parameters of the film and of the probe radius.
@@ -229,8 +229,8 @@ class FilmFamily:
         # Each mode has one scale for its coefficients at all nodes of the grid, and one scale for its own values.
         bits = bits_of(self.coefficients, self.modes, MAX_BITS, EXTRA_BITS)  # shape (n_mode,)
         axes_of_grid = tuple(range(len(AXES)))
-        coefficients, coefficient_scale = quantised(self.coefficients, axes_of_grid, bits)
-        modes, mode_scale = quantised(self.modes, 1, bits[:, None])
+        coefficients, coefficient_scale = quantise(self.coefficients, axes_of_grid, bits)
+        modes, mode_scale = quantise(self.modes, 1, bits[:, None])
         imperfections = {} if self.imperfections is None else self.imperfections.to_arrays()
         return {
             "poisson": self.poisson,
@@ -360,7 +360,7 @@ def _check_shapes(arrays: Mapping[str, Any]) -> None:
 def _check_back(film: Film) -> None:
     """Raise an error if a film has a closed back or a static pressure.
 
-    A family of films covers neither of these properties.
+    A family of films covers neither a closed back nor a static pressure.
 
     Args:
         film: Film to be checked.

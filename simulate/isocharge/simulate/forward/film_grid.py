@@ -1,4 +1,4 @@
-"""Grid of films and presses at which a family of films is solved, and decomposition of the solved stresses into modes.
+"""Grid of films and presses for which a family of films is solved, and decomposition of the stresses into modes.
 
 The modes and their coefficients are rounded to integers before they are stored in a file.
 """
@@ -93,7 +93,7 @@ class FilmGrid:
 
 
 def _interpolation_coordinate(axis: str, value: Array | float) -> Any:
-    """Convert values along an axis into the coordinate in which the stress is interpolated along this axis.
+    """Convert values along an axis of the grid into the interpolation coordinate of the axis.
 
     For the load and the reach, the coordinate is the logarithm of the value. For the tension, the coordinate is the
     logarithm of the sum of the tension and `SOFTENING`. For the distance, the coordinate is computed by the function
@@ -139,8 +139,8 @@ def _axis_value(axis: str, coordinate: Array) -> Array:
 def bits_of(coefficients: Array, modes: Array, max_bits: int, extra_bits: float) -> Array:
     """Compute the number of bits with which the values of each mode are stored in a file.
 
-    The stresses are the product coefficients @ modes. If the contribution of a mode to this product is half as large as
-    that of another mode, the mode needs one bit less for the same absolute error. Every mode has at least 2 bits.
+    The stresses are the product coefficients @ modes. If a mode contributes half as much to the stresses as another
+    mode, it needs one bit less for the same absolute error. Every mode has at least 2 bits.
 
     Args:
         coefficients: Coefficients of the modes, shape (..., n_mode).
@@ -158,7 +158,7 @@ def bits_of(coefficients: Array, modes: Array, max_bits: int, extra_bits: float)
     return np.asarray(np.clip(np.round(max_bits + extra_bits + relative_bits), 2.0, max_bits))
 
 
-def quantised(values: Array, axis: int | tuple[int, ...], bits: Array | int) -> tuple[np.ndarray, Array]:
+def quantise(values: Array, axis: int | tuple[int, ...], bits: Array | int) -> tuple[np.ndarray, Array]:
     """Divide values by a scale, and round the quotients to integers.
 
     Args:
@@ -179,9 +179,9 @@ def decompose(stress: Array, max_error: float) -> tuple[Array, Array]:
     """Decompose the stresses of many presses into a few modes (proper orthogonal decomposition, Sirovich 1987).
 
     The stress field of each press is approximated by a weighted sum of the modes: stress = coefficients @ modes. Before
-    the decomposition, the stress at each node is divided by its root mean square over the presses. Without this
-    division, the decomposition would be accurate only under the probe, where the stress is large, and not at the
-    electrodes.
+    the decomposition, the stress at each node is divided by its root mean square over the presses. Without the division
+    by the root mean square, the decomposition would be accurate only under the probe, where the stress is large, and
+    not at the electrodes.
 
     Args:
         stress: Scaled stresses (s11, s22, s12) at the nodes of the mesh for all presses, shape (..., n_node * 3).
@@ -208,8 +208,8 @@ def _right_singular_vectors(matrix: Array, max_error: float) -> Array:
 
     The singular value decomposition is M = U S V^T. The squares of the singular values are the eigenvalues of both Gram
     matrices, M M^T and M^T M. The columns of U are the eigenvectors of M M^T, and the columns of V are the eigenvectors
-    of M^T M. Only the eigenvectors of the smaller Gram matrix are computed. If these eigenvectors are the columns of U,
-    the right singular vectors follow from V^T = S^-1 U^T M.
+    of M^T M. Only the eigenvectors of the smaller Gram matrix are computed. If the computed eigenvectors are the
+    columns of U, the right singular vectors follow from V^T = S^-1 U^T M.
 
     Args:
         matrix: The matrix M, shape (n_row, n_column).

@@ -1,8 +1,8 @@
-"""Changes of the charges that small imperfections of a film cause, to first order.
+"""First-order changes that small imperfections of a film cause in the charges.
 
 The tension or the stiffness of a film may depend on the direction. The clamp may be oval, and the piezoelectric axes
 may be rotated. Poisson's ratio may differ from the assumed value, and the wires may have crosstalk. Each mode describes
-one such imperfection by the first-order change of the charges that the imperfection causes.
+one such imperfection by the change that the imperfection causes in the charges.
 
 `MODES` declares each mode, and `ModeMap` computes the charges of the modes for any film of a family. For some modes,
 the module `solver.sensitivity` computes the change of the stress field. The change of the stress field is computed on a
@@ -22,7 +22,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, SceneError
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.family import Family, solve_films
-from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, FilmLimits, bits_of, decompose, quantised
+from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, FilmLimits, bits_of, decompose, quantise
 from isocharge.simulate.forward.forward_map import EVEN_FIELD, ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mesh.blocks import Resolution
@@ -239,7 +239,7 @@ class ModeMap:
     def mode_jacobian(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to the values of the modes.
 
-        The derivatives are those of a film without imperfections.
+        The derivatives are computed for a film without imperfections.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
@@ -310,8 +310,8 @@ class SolvedFilms(Protocol):
 class FilmModes:
     """Stress fields that imperfections cause in the films of a family, decomposed into a few components.
 
-    A stress field is the change of the scaled stress by one of `FIELDS`. The fields at a node of the grid are the sum
-    of the components, each multiplied by its coefficient at this node.
+    A stress field is the change of the scaled stress that one of the imperfections in `FIELDS` causes. At each node of
+    the grid, the fields are a weighted sum of the components.
 
     Attributes:
         grid: Grid of films and presses at which the fields are solved.
@@ -411,7 +411,7 @@ class FilmModes:
             the size of the stress at each node, by which the components are divided.
         """
         axes_of_grid = tuple(range(len(AXES)))
-        coefficients, coefficient_scale = quantised(self.coefficients, axes_of_grid, SCALE_BITS)
+        coefficients, coefficient_scale = quantise(self.coefficients, axes_of_grid, SCALE_BITS)
 
         # The components are divided by the size of the stress at each node. This size is rounded to a power of two,
         # which compresses well. A tiny number is added to the size, because the logarithm of zero does not exist.
@@ -422,7 +422,7 @@ class FilmModes:
         node_size = np.float32(np.exp2(node_exponent))
         relative_components = (node_stress / node_size).reshape(n_component, -1)
         bits = bits_of(self.coefficients, relative_components, MAX_BITS, EXTRA_BITS)
-        components, component_scale = quantised(relative_components, 1, bits[:, None])
+        components, component_scale = quantise(relative_components, 1, bits[:, None])
         return {
             "grid_shape": np.array(self.grid.shape),
             "grid": np.concatenate([getattr(self.grid, name) for name in AXES]),

@@ -3,9 +3,9 @@
 All presses with one probe form a family with two coordinates: the distance from the centre of the film, and the force.
 If the probe is not axisymmetric, its orientation is a third coordinate. Presses in other directions from the centre are
 obtained by a rotation of the film. In a frame that moves with the probe, the stress at the nodes of the mesh is a
-smooth function of the coordinates. Presses are solved at Chebyshev nodes in the distance and in the logarithm of the
-force, and at evenly spaced orientations. For every other press, the stress field is interpolated, and the charges are
-computed by integration of the interpolated field over the electrodes. The positions of the electrodes therefore do not
+smooth function of the coordinates of the family. Presses are solved at Chebyshev nodes in the distance and in the
+logarithm of the force, and at evenly spaced orientations. For every other press, the stress field is interpolated. The
+charges are integrals of the interpolated field over the electrodes. The positions of the electrodes therefore do not
 affect the accuracy of the interpolation. When a map is built, its charges are compared with those of direct solves.
 """
 
@@ -164,7 +164,7 @@ class ForwardMap:
 
     @property
     def settings(self) -> SolveSettings:
-        """Settings with the theory and the mesh of this map, with which other presses can be solved.
+        """Settings for solving other presses with the theory and the mesh of this map.
 
         The width of the thin rings at the rim remains "auto", so that it is chosen for each press.
         """
@@ -229,8 +229,8 @@ class ForwardMap:
     def relative_error(self, check: CheckPress, direct: Array) -> float:
         """Compute the largest relative difference between the interpolated and the directly solved charges of a press.
 
-        The difference of each electrode is divided by the directly solved charge of this electrode. A charge that is
-        smaller than `CHARGE_FLOOR` times the largest charge of the press is replaced by this bound.
+        The difference at each electrode is divided by the directly solved charge of the electrode. The divisor is at
+        least `CHARGE_FLOOR` times the largest charge of the press.
 
         Args:
             check: Press at which the charges are compared.
@@ -241,14 +241,14 @@ class ForwardMap:
         """
         x, y = check.position
         contact = np.array([[x, y, check.force]])  # a single press
-        (interpolated,) = self.charges(contact, check.rotation)
+        (interpolated_charge,) = self.charges(contact, check.rotation)
         charge_scale = np.maximum(np.abs(direct), CHARGE_FLOOR * np.abs(direct).max())
-        return float((np.abs(interpolated - direct) / charge_scale).max())
+        return float((np.abs(interpolated_charge - direct) / charge_scale).max())
 
     def field_charges(self, contact: Array, is_odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
-        """Compute the charges of each of the stress fields that the table contains, for a circular probe.
+        """Compute the charges of each stress field in the table, for a circular probe.
 
-        The crosstalk is omitted, and so are the charges that the contact pressure causes.
+        The result includes neither the crosstalk nor the charges that the contact pressure causes.
 
         Args:
             contact: Presses (x, y, F) in the domain, shape (n, 3), mm and N.
@@ -279,10 +279,10 @@ class ForwardMap:
     def stress_charges_by_force(self, position: Array, is_needed: Booleans) -> Array:
         """Compute the charges that the stress causes at given positions, for all forces of the family at once.
 
-        The crosstalk is omitted, and so are the charges that the contact pressure causes. The probe keeps its own
-        orientation. The stresses under the different forces are treated as several stress fields of a map with a single
-        force. The interpolation between distances, and the search for the points in the mesh, are then done only once
-        for all forces.
+        The result includes neither the crosstalk nor the charges that the contact pressure causes. The probe keeps its
+        own orientation. The stresses under the different forces are treated as several stress fields of a map with a
+        single force. The interpolation between distances and the location of the points in the mesh are therefore done
+        only once for all forces.
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
@@ -314,7 +314,7 @@ class ForwardMap:
         return np.asarray(charge_by_force * unit_ratio[:, None])
 
     def pressure_charges(self, position: Array) -> Array:
-        """Compute the charges that the contact pressure causes, divided by the force.
+        """Compute the charges per force that the contact pressure causes.
 
         Crosstalk is omitted. The probe keeps its own orientation.
 
@@ -328,7 +328,7 @@ class ForwardMap:
 
     @cached_property
     def _stacked_forces(self) -> "ForwardMap":
-        """Map with a single force, in whose table the stress under each force of the family is a separate field.
+        """Map with a single force. Its table contains the stress under each force of the family as a separate field.
 
         The table has single precision.
         """
@@ -342,7 +342,7 @@ class ForwardMap:
         return replace(self, family=family, table=table.astype(np.float32))
 
     def _unrotated_charges(self, contact: Array) -> Array:
-        """Compute the charges of presses in the domain or slightly outside, with the probe in its own orientation.
+        """Compute the charges of presses in or slightly outside the domain, with the probe in its own orientation.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -353,7 +353,7 @@ class ForwardMap:
         return self._unchecked_charges(contact, np.zeros(len(contact)))
 
     def _unchecked_charges(self, contact: Array, orientation: Array) -> Array:
-        """Compute the charges of presses in the domain or slightly outside.
+        """Compute the charges of presses that lie in the domain or slightly outside the domain.
 
         The presses are evaluated in chunks, which limits the required memory.
 
@@ -375,7 +375,8 @@ class ForwardMap:
     def _chunk_charges(self, position: Complexes, force: Array, orientation: Array) -> Array:
         """Compute the charges of one chunk of presses.
 
-        The charges of the stress and of the contact pressure are added. Then the crosstalk is added.
+        The charges that the stress causes and the charges that the contact pressure causes are added. Then the
+        crosstalk is added.
 
         Args:
             position: Positions x + iy, shape (n,), mm.
@@ -391,7 +392,7 @@ class ForwardMap:
         return self.sensor.calibration.read(charge)
 
     def _pressure_charges(self, position: Complexes, orientation: Array) -> Array:
-        """Compute the charges that the contact pressure causes, divided by the force.
+        """Compute the charges per force that the contact pressure causes.
 
         Crosstalk is omitted.
 
@@ -424,7 +425,7 @@ class ForwardMap:
         is_odd: Booleans,
         rules: tuple[tuple[ReadoutPoints, Booleans], ...],
     ) -> Array:
-        """Interpolate the stress fields of one chunk of presses, and compute their charges by integration.
+        """Interpolate the stress fields of one chunk of presses, and integrate the fields to obtain the charges.
 
         Args:
             position: Positions x + iy, shape (n,), mm.

@@ -33,7 +33,7 @@ class PressChunk:
     probe_angle: Array
 
     def scaled_charges(self, press_index: Integers, points: Complexes, weights: Array, is_odd: Booleans) -> Array:
-        """Compute the charges of several pairs of a press and an electrode, by integration of the stress fields.
+        """Compute the charge of each pair of a press and an electrode, by integration of the stress fields.
 
         Args:
             press_index: Index of the press of each pair, shape (n_pair,).

@@ -5,10 +5,10 @@ collects only the polarisation caused by the in-plane stress (Mirbagheri et al.,
 
     Q = A * mean(d31 * s11 + d32 * s22).
 
-The mid-surface stresses s11 and s22 are in the axes of the film, and axis 1 is the drawn direction x. The area readout
-computes the mean over the area of the electrode. The edge readout computes the mean of s11 over the left and right
-edges, and the mean of s22 over the lower and upper edges (equation 3 of the paper). The touch charge is the charge
-under load minus the charge without load. The charge of a uniform pretension therefore cancels.
+The mid-surface stresses s11 and s22 refer to the axes of the film, and axis 1 is the drawn direction x. The area
+readout computes the mean over the area of the electrode. The edge readout computes the mean of s11 over the left and
+right edges, and the mean of s22 over the lower and upper edges (equation 3 of the paper). The touch charge is the
+charge under load minus the charge without load. The charge of a uniform pretension therefore cancels.
 """
 
 from dataclasses import dataclass
@@ -217,7 +217,7 @@ def electrode_distances(sensor: Sensor, position: Complexes) -> Array:
     """Compute the relative distance between each position and each electrode.
 
     Each part of an electrode is enclosed by a circle. The distance from the centre of an enclosing circle is divided by
-    the radius of the circle. The relative distance is the smallest of these ratios.
+    the radius of the circle. The relative distance is the smallest of the ratios of all parts.
 
     Args:
         sensor: Sensor with the electrodes.
@@ -239,7 +239,7 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     The charge per area is the coefficient d33 times the mean of the stress s33 over the thickness. The stress s33 is
     minus the contact pressure at the probe, and zero at the free back of the film. The mean of s33 over the thickness
     is therefore minus half of the contact pressure. The charge of an electrode is therefore -d33 / 2 times the part of
-    the force that acts on this electrode. The coefficient d33 of PVDF is negative, so the charge is positive.
+    the force that acts on the electrode. The coefficient d33 of PVDF is negative, so the charge is positive.
 
     Args:
         sensor: Sensor with the electrodes.
@@ -269,7 +269,7 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
     """Compute the pyroelectric charge that a uniform change of the temperature causes.
 
     The clamp is assumed to expand like the film. If the clamp expands differently, the pretension of the film also
-    changes. The module `mechanics.film_temperature` computes this change of the pretension.
+    changes. The module `mechanics.film_temperature` computes the change of the pretension.
 
     Args:
         sensor: Sensor with the electrodes and the pyroelectric coefficient.

@@ -99,7 +99,7 @@ class ReadoutRules:
 
     @cached_property
     def has_smooth_far_field(self) -> bool:
-        """Whether the mesh is fine enough for the rule with few points over electrodes far from the probe."""
+        """Whether the mesh is fine enough to use the rule with few points for electrodes far from the probe."""
         # The radii of the rings increase by a constant ratio from the edge of the probe to the rim of the film.
         ring_ratio = (self.sensor.film.radius / self.probe.reach) ** (1.0 / self.resolution.rings)
         return bool(ring_ratio <= MAX_RING_RATIO)

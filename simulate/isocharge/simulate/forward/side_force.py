@@ -1,14 +1,14 @@
-"""Changes of the charges that a side force or the friction of the probe causes.
+"""Effect of a side force and of the friction of the probe on the charges.
 
 A side force (Fx, Fy) of the probe on the film changes the charges to first order by
 
     dQ = jacobian @ (Fx, Fy).
 
-There are two stress fields: the change of the stress by a side force along the direction of the press, and the change
-of the stress by a side force across this direction. The stress fields are computed from the tangent of the equilibrium
-(see `solver.sensitivity`) at a few distances and forces. Between these distances and forces, the stress fields are
-interpolated as in a forward map. If the side force is at most 0.2 times the force of the press, the terms of second
-order are smaller than 1 % of dQ.
+A side force has two stress fields. The first field is the stress change that a side force along the direction of the
+press causes, and the second field is the stress change that a side force across the direction of the press causes. The
+stress fields are computed from the tangent of the equilibrium (see `solver.sensitivity`) at a few distances and forces.
+Between the solved presses, the stress fields are interpolated as in a forward map. If the side force is at most 0.2
+times the force of the press, the terms of second order are smaller than 1 % of dQ.
 
 Example:
 
@@ -55,7 +55,7 @@ class SideForceMap:
 
     @classmethod
     def build(cls, film: ForwardMap, *, executor: Executor | None = None) -> "SideForceMap":
-        """Compute the stress fields of a side force for a few presses in the domain of a forward map.
+        """Solve a few presses in the domain of a forward map, and compute the stress fields of a side force.
 
         The solves take about ten seconds.
 
@@ -78,7 +78,7 @@ class SideForceMap:
         return cls(film, replace(derivative_map, table=stress_table), holding_column.ravel())
 
     def jacobian(self, contact: Array) -> Array:
-        """Compute the derivatives of the charges with respect to the side force (Fx, Fy) of the probe on the film.
+        """Compute the derivatives of the charges with respect to the side force (Fx, Fy) that the probe exerts.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
@@ -133,7 +133,7 @@ class SideForceMap:
         return limit_to_friction(holding_force, coefficient * force)
 
     def friction_charges(self, contact: Array, coefficient: float) -> Array:
-        """Compute the change of the charges that the friction of a probe on a vertical stage causes, to first order.
+        """Compute, to first order, how the friction of a probe on a vertical stage changes the charges.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
@@ -159,7 +159,7 @@ class SideForceMap:
 
 
 def _read_side_force(solved: Equilibrium, surface: Surface) -> Array:
-    """Compute the stress fields of a side force under one press, and the holding force.
+    """Compute the stress fields of a side force, and the holding force, for one press.
 
     Args:
         solved: Equilibrium of the film under a press on the positive x axis.
@@ -169,5 +169,6 @@ def _read_side_force(solved: Equilibrium, surface: Surface) -> Array:
         The values of `side_force_stress`, followed by the ratio of the holding force to the force of the press, shape
         (n_value + 1,), dimensionless. The ratio is positive if the holding force points away from the centre.
     """
+    # The second component is zero, because the press is symmetric about the x axis.
     outward_force, _ = holding_force(solved)
     return np.append(side_force_stress(solved, surface), outward_force / solved.force)

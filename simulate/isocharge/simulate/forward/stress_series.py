@@ -1,6 +1,7 @@
-"""Approximation of the stress of a film under a round probe by Chebyshev series, from which the playground computes.
+"""Chebyshev series that approximate the stress of a film under a round probe.
 
-The module is also a command, which writes the series of the built-in film with a thickness of 25 um to a file:
+The playground computes charges from these series. The module is also a command, which writes the series of the built-in
+film with a thickness of 25 um to a file:
 
     python -m isocharge.simulate.forward.stress_series FILE.json
 """
@@ -31,7 +32,8 @@ FORCE_RANGE_N = (0.05, 2.0)
 
 MAX_DISTANCE_mm = 30.0
 """Largest distance of a press from the centre, mm. This distance is four times the radius of the smallest working
-area."""
+area.
+"""
 
 MAX_RING = 0.97
 """Largest radius of the rings that the series cover, in film radii, dimensionless.
@@ -52,7 +54,7 @@ Between the charges that are computed from the series and those of the forward m
 
 
 def stress_series(forward_map: ForwardMap) -> StressSeries:
-    """Fit Chebyshev series to the logarithm of the sum s11 + s22 of the stress components of a forward map.
+    """Fit Chebyshev series to the logarithm of the stress sum s11 + s22 of a forward map.
 
     For each press, a conformal map of the film onto itself maps the footprint of the probe to a circle around the
     centre. The stress has a kink at the edge of the footprint. Therefore one series covers the rings inside the circle,
@@ -67,8 +69,8 @@ def stress_series(forward_map: ForwardMap) -> StressSeries:
     max_distance_mm = forward_map.domain.radius
     min_force_N, max_force_N = forward_map.domain.force_range
     film = forward_map.sensor.film
-    inner = np.empty((N_DISTANCES, N_FORCES, N_INNER_RINGS, N_ANGLES))
-    outer = np.empty((N_DISTANCES, N_FORCES, N_OUTER_RINGS, N_ANGLES))
+    inner_log_stress = np.empty((N_DISTANCES, N_FORCES, N_INNER_RINGS, N_ANGLES))
+    outer_log_stress = np.empty((N_DISTANCES, N_FORCES, N_OUTER_RINGS, N_ANGLES))
 
     # Map the Chebyshev nodes from [-1, 1] to fractions from 0 to 1 of the ranges of distance, force and ring.
     distances_mm = max_distance_mm * 0.5 * (_nodes(N_DISTANCES) + 1.0)
@@ -88,16 +90,16 @@ def stress_series(forward_map: ForwardMap) -> StressSeries:
         for force_index, force_N in enumerate(forces_N):
             inner_stress = _stress_sum(forward_map, distance_mm, force_N, inner_points_mm)
             outer_stress = _stress_sum(forward_map, distance_mm, force_N, outer_points_mm)
-            inner[distance_index, force_index] = np.log(inner_stress)
-            outer[distance_index, force_index] = np.log(outer_stress)
+            inner_log_stress[distance_index, force_index] = np.log(inner_stress)
+            outer_log_stress[distance_index, force_index] = np.log(outer_stress)
     return StressSeries(
         film=film_to_dict(film),
         probe_radius_mm=forward_map.probe.reach,
         max_distance_mm=max_distance_mm,
         force_range_N=(min_force_N, max_force_N),
         max_ring=MAX_RING,
-        inner=_coefficients(inner),
-        outer=_coefficients(outer),
+        inner=_coefficients(inner_log_stress),
+        outer=_coefficients(outer_log_stress),
     )
 
 
@@ -107,7 +109,7 @@ def _nodes(count: int) -> Array:
 
 
 def _automorphism(distance: float, probe_radius: float) -> tuple[float, float]:
-    """Compute the conformal map of the unit disk onto itself that maps a circle around the centre to the probe's edge.
+    """Compute the disk automorphism that maps a circle around the centre of the disk to the edge of the probe.
 
     The map has the form (z + c) / (1 + c z) with a parameter c. On the diameter through the probe, the map is a
     translation of atanh(z) by atanh(c).
@@ -175,8 +177,9 @@ def _coefficients(values: Array) -> Array:
     for axis, count in enumerate(values.shape):
         values_from_coefficients = chebyshev.chebvander(_nodes(count), count - 1)  # shape (count, count)
         coefficients_from_values = np.linalg.inv(values_from_coefficients)
-        transformed = np.tensordot(coefficients_from_values, coefficients, (1, axis))  # the axis becomes the first one
-        coefficients = np.moveaxis(transformed, 0, axis)
+        # The product has the transformed axis as its first axis.
+        transformed_values = np.tensordot(coefficients_from_values, coefficients, (1, axis))
+        coefficients = np.moveaxis(transformed_values, 0, axis)
     return coefficients
 
 

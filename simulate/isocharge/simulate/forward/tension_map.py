@@ -1,13 +1,13 @@
-"""Changes of the charges that a change of the pretension or of the temperature of the film causes.
+"""Effect of the pretension and of the temperature of the film on the charges.
 
 A change of the pretension by (T11, T22, T12) changes the charges to first order by
 
     dQ = tension_jacobian @ (T11, T22, T12).
 
-The change of the stress by a change of the pretension is computed from the tangent of the equilibrium (see
-`solver.sensitivity`), at a few distances and forces. Between these distances and forces, the change of the stress is
-interpolated as in a forward map. If the film becomes warmer than its ring, the pretension of the film changes. The
-module `mechanics.film_temperature` computes this change of the pretension.
+The stress change that a change of the pretension causes is computed from the tangent of the equilibrium (see
+`solver.sensitivity`), at a few distances and forces. Between the solved presses, the stress change is interpolated as
+in a forward map. If the film becomes warmer than its ring, the pretension of the film changes. The module
+`mechanics.film_temperature` computes the change of the pretension.
 
 Example:
 
@@ -46,7 +46,7 @@ class TensionMap:
 
     @classmethod
     def build(cls, film: ForwardMap, *, executor: Executor | None = None) -> "TensionMap":
-        """Compute the stress fields of a change of the pretension for a few presses in the domain of a forward map.
+        """Solve a few presses in the domain of a forward map, and compute the stress fields of a pretension change.
 
         The solves take about ten seconds.
 
@@ -63,7 +63,7 @@ class TensionMap:
         return cls(film, solve_derivatives(film, tension_stress, executor))
 
     def tension_jacobian(self, contact: Array) -> Array:
-        """Compute the derivatives of the charges with respect to the pretension (T11, T22, T12) along x and y.
+        """Compute the derivatives of the charges with respect to the pretension (T11, T22, T12) in the axes x and y.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.

@@ -1,8 +1,8 @@
 """Coarse forward map that covers nearly the whole film, for presses far outside the working area.
 
-The map is used, for example, to find all presses on the film that cause the same charges as a given press. In such a
-search, the charges of presses near the clamp may have an error of a few percent. An accurate forward map up to the
-clamp would take minutes to build.
+The map is used, for example, to find all presses on the film that cause the same charges as a given press. For such a
+search, an error of a few percent is acceptable in the charges of presses near the clamp. A forward map that is accurate
+up to the clamp would take minutes to build.
 """
 
 from concurrent.futures import Executor

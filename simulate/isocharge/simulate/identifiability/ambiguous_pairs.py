@@ -76,7 +76,7 @@ class AmbiguousPairs:
 
     @property
     def outer_radius(self) -> Array:
-        """Distance of the outer contact of each pair from the centre of the film, shape (n,), mm."""
+        """Distance between the centre of the film and the outer contact of each pair, shape (n,), mm."""
         first_radius = np.hypot(*self.first[:, :2].T)
         second_radius = np.hypot(*self.second[:, :2].T)
         return np.asarray(np.maximum(first_radius, second_radius))
@@ -91,9 +91,9 @@ class AmbiguousPairs:
 
     @property
     def summary(self) -> str:
-        """Sentence about the first pair, whose outer contact is nearest to the centre of the film.
+        """Sentence about the pair whose outer contact is nearest to the centre of the film.
 
-        The text is empty if there are no pairs.
+        If there are no pairs, the property is an empty text.
         """
         if not len(self):
             return ""
@@ -110,9 +110,9 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     """Find pairs of distant contacts whose charges cannot be distinguished because of the noise.
 
     The first contact of a pair is a press with the given force at a position of a square lattice. For each first
-    contact, the other positions of the lattice are candidates for the second contact. At each candidate position, the
-    force is chosen that fits the charges of the first contact best. The best candidates are then improved by least
-    squares.
+    contact, the other positions of the lattice are candidates for the second contact. At each position, the function
+    determines the force whose charges fit the charges of the first contact best. It improves the best candidates by a
+    least-squares fit.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -149,10 +149,11 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
 def _candidates(
     charge_map: ChargeMap, noise: NoiseModel, position: Array, charge: Array, min_distance: Array
 ) -> tuple[Integers, Array]:
-    """Find candidates for the second contacts of ambiguous pairs on the lattice.
+    """Find contacts on the lattice that may be the second contacts of ambiguous pairs.
 
-    A distant position of the lattice is a candidate if its charges fit the charges of the first contact better than the
-    charges at the neighbouring positions do. Each first contact has at most `MAX_CANDIDATES` candidates.
+    The charges at a candidate fit the charges of the first contact at least as well as the charges at all neighbouring
+    positions. A candidate must also be far from the first contact. Each first contact has at most `MAX_CANDIDATES`
+    candidates.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -173,7 +174,7 @@ def _candidates(
     for first_index, first_charge in enumerate(charge):
         # At every position of the lattice, find the force whose charges fit those of the first contact best.
         observed = np.broadcast_to(first_charge, charge.shape)
-        log_force = profile.best(ratios, observed, noise)
+        log_force = profile.best_log_force(ratios, observed, noise)
         predicted = profile.charge(log_force, ratios)
         chi2 = ((observed - predicted) ** 2 / noise.variance(predicted)).sum(axis=1)  # shape (n,)
 
@@ -218,7 +219,7 @@ def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Arr
     barycentric = barycentric_weights(log_nodes)
 
     def weights(log_force: Array) -> Array:
-        """Compute weights for the ratios at the nodes, such that the weighted sum of the ratios is the charge.
+        """Compute the weights for which the weighted sum of the ratios at the nodes is equal to the charge.
 
         Args:
             log_force: Natural logarithms of the forces in N, shape (n,).

@@ -1,10 +1,11 @@
-"""Cramer-Rao limit, which is the smallest error of an unbiased estimator of a contact from noisy charges.
+"""Cramer-Rao limit: the smallest error with which an unbiased estimator can determine a contact from noisy charges.
 
 Let J = d(Q)/d(x, y, ln F, ...) be the matrix of the derivatives of the charges Q, and let the vector i contain the
-information that one reading provides about each charge (`NoiseModel.information`). The Fisher information is then
+information that one reading provides about each charge (`NoiseModel.information`). The Fisher information is the matrix
 J' diag(i) J. The covariance of an unbiased estimate is at least the inverse of the Fisher information (Kay 1993,
 chapter 3). An estimator that uses a prior distribution may have smaller errors where the charges provide little
-information. The limit of such estimators is the Bayes limit, which the package isocharge.train computes.
+information. The errors of such estimators have another lower limit, the Bayes limit, which the package isocharge.train
+computes.
 """
 
 from dataclasses import dataclass
@@ -49,13 +50,13 @@ class CramerRao:
 
     @property
     def force(self) -> Array:
-        """Smallest standard deviation of the estimated force divided by the force, shape (n,), dimensionless."""
+        """Smallest standard deviation of the estimated force, relative to the force, shape (n,), dimensionless."""
         variance = np.diagonal(self.covariance, axis1=1, axis2=2)
         return np.asarray(np.sqrt(variance[:, 2]))  # ln F
 
 
 def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Array | None = None) -> CramerRao:
-    """Compute the Cramer-Rao limits of contacts from charges and their derivatives.
+    """Use charges and their derivatives to compute the Cramer-Rao limits of contacts.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC.
@@ -82,7 +83,7 @@ def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Arra
 
 
 def limits_at(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> CramerRao:
-    """Compute the Cramer-Rao limits of contacts from a charge map.
+    """Use a charge map to compute the Cramer-Rao limits of contacts.
 
     Args:
         charge_map: Map that computes the charges of contacts.

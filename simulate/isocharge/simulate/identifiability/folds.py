@@ -1,21 +1,22 @@
-"""Search for the folds of a charge map, near which different contacts have the same charges.
+"""Search for the folds of a charge map.
 
-Charges Q determine a contact only where the map from (x, y, ln F) to the charges is one to one. The map is not one to
-one near a fold. At a fold, the derivative J = d(Q)/d(x, y, ln F) is singular, and the map reverses its orientation
-across the fold. With three electrodes, det J changes its sign, and folds are lines. With more electrodes, J is not
-square and is singular only at isolated points. The map intersects itself at a singular point. Contacts on opposite
-sides of a singular point therefore have the same charges (Whitney 1944).
+Charges Q determine a contact only where the map from (x, y, ln F) to the charges is one to one. Near a fold, different
+contacts have the same charges. At a fold, the derivative J = d(Q)/d(x, y, ln F) is singular, and the map reverses its
+orientation across the fold. With three electrodes, folds are lines at which det J changes its sign. With more
+electrodes, J is not square and is singular only at isolated points. The map intersects itself at a singular point.
+Contacts on opposite sides of a singular point therefore have the same charges (Whitney 1944).
 
 The orientation is reversed between two contacts a and b if det(J(a)' W J(b)) < 0, where the diagonal matrix W contains
-the inverse variances of the charges. For three electrodes, this determinant has the sign of det J(a) det J(b). For more
-electrodes, the criterion is reliable only if the two contacts are close to each other. Between distant contacts, for
-example on opposite sides of an electrode, the map may turn by more than a right angle without a fold. A segment with
-reversed orientation is therefore bisected until it is shorter than `SEGMENT_LENGTH`, or until the orientation is
-reversed in neither half. A fold that is smaller than the spacing of the grid is found by a search for the minima of the
-smallest singular value of J.
+the inverse variances of the charges. For three electrodes, this determinant has the same sign as the product det J(a)
+det J(b). For more electrodes, the criterion is reliable only if the two contacts are close to each other. Between
+distant contacts, such as contacts on opposite sides of an electrode, the map may turn by more than a right angle even
+if there is no fold. If the orientation is reversed between the ends of a segment, the segment is therefore bisected
+until it is shorter than `SEGMENT_LENGTH`, or until the orientation is reversed in neither half. A fold may be smaller
+than the spacing of the grid. In order to find such folds, the module searches for positions where the smallest singular
+value of J has a minimum.
 
-If the electrodes lie on one circle, the charges of an isotropic film hardly change if the press is moved to its mirror
-image in this circle. The map therefore has a fold near the circle for any number of electrodes.
+If all electrodes of an isotropic film lie on one circle, a press and its mirror image in this circle cause nearly the
+same charges. The map therefore has a fold near the circle for any number of electrodes.
 
 Even without folds, two distant contacts may have the same charges. The module `ambiguous_pairs` finds such contacts.
 """
@@ -53,7 +54,7 @@ COMPASS = np.stack([np.cos(_COMPASS_ANGLE), np.sin(_COMPASS_ANGLE)], axis=1)
 
 
 def has_reversed_orientation(first: Array, second: Array) -> Booleans:
-    """Return whether the charge map reverses its orientation between pairs of neighbouring contacts.
+    """Return whether the charge map reverses its orientation between the two contacts of each pair.
 
     Args:
         first: Derivatives of the charges with respect to (x, y, ln F) at the first contact of each pair, divided by the
@@ -87,7 +88,7 @@ def _unit_columns(jacobian: Array) -> Array:
 
 
 def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> Array:
-    """Compute the derivatives of the charges of contacts, divided by the standard deviations of the charges.
+    """Compute derivatives of charges, and divide the derivatives by the standard deviations of the charges.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -101,23 +102,24 @@ def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel)
     return np.asarray(jacobian / noise.sigma(charge)[..., None])
 
 
-def singular_values(scaled: Array) -> Array:
+def singular_values(scaled_jacobian: Array) -> Array:
     """Compute how strongly the charges depend on the position if the force is unknown.
 
-    If a change of the force could also cause a change of the charges, this change contains no information about the
-    position. The derivatives with respect to x and y are therefore projected onto the subspace that is orthogonal to
-    the derivative with respect to ln F. The singular values of the projected derivatives are the inverse standard
-    deviations of the position in the best and in the worst direction. At a fold, the second singular value is zero.
+    A change of the charges contains no information about the position if a change of the force could also have caused
+    it. The derivatives with respect to x and y are therefore projected onto the subspace that is orthogonal to the
+    derivative with respect to ln F. The singular values of the projected derivatives are the inverses of two standard
+    deviations: those of the position in the best direction and in the worst direction. At a fold, the second singular
+    value is zero.
 
     Args:
-        scaled: Derivatives of the charges with respect to x, y and ln F, divided by the standard deviations of the
-            charges, shape (n, n_electrode, 3).
+        scaled_jacobian: Derivatives of the charges with respect to x, y and ln F, divided by the standard deviations of
+            the charges, shape (n, n_electrode, 3).
 
     Returns:
         Two singular values for each contact in descending order, shape (n, 2), 1/mm.
     """
-    position_derivative = scaled[:, :, :2]
-    force_derivative = scaled[:, :, 2]
+    position_derivative = scaled_jacobian[:, :, :2]
+    force_derivative = scaled_jacobian[:, :, 2]
     force_length = np.linalg.norm(force_derivative, axis=1, keepdims=True)
     force_direction = force_derivative / np.maximum(force_length, np.finfo(float).tiny)  # unit vectors
 
@@ -129,7 +131,7 @@ def singular_values(scaled: Array) -> Array:
 
 @dataclass(frozen=True)
 class Folds:
-    """Folds of a charge map at one force, and the positions where the charges contain least information.
+    """Folds of a charge map for one force, and the positions about which the charges contain least information.
 
     Attributes:
         points: Positions (x, y) on folds, ordered by the distance from the centre, shape (n, 2), mm. With three
@@ -144,7 +146,7 @@ class Folds:
 
 
 def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel) -> Folds:
-    """Find the folds of a charge map for contacts with one force.
+    """Find the folds of a charge map for contacts that all have the same force.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -156,11 +158,12 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
         The folds, and the positions where the charges contain least information about the position.
     """
     search = _FoldSearch(charge_map, noise, force)
-    scaled = rings.per_ring(search.scaled(rings.position.reshape(-1, 2)))  # shape (n_ring, n_angle, n_electrode, 3)
-    weakest = search.weakest_positions(rings, scaled)
+    jacobian_of_positions = search.scaled_jacobian(rings.position.reshape(-1, 2))
+    scaled_jacobian = rings.per_ring(jacobian_of_positions)  # shape (n_ring, n_angle, n_electrode, 3)
+    weakest = search.weakest_positions(rings, scaled_jacobian)
 
     # Large folds lie between neighbouring positions. A small fold may lie at one of the weakest positions.
-    points = np.concatenate([search.folds_between(rings, scaled), search.folds_near(weakest)])
+    points = np.concatenate([search.folds_between(rings, scaled_jacobian), search.folds_near(weakest)])
 
     # Sort the folds by their distance from the centre.
     x, y = points.T
@@ -169,7 +172,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
 
 
 class _FoldSearch:
-    """Search for the folds of a charge map, for contacts with one force.
+    """Search for the folds of a charge map for contacts that all have the same force.
 
     Scaled derivatives are the derivatives of the charges with respect to (x, y, ln F), divided by the standard
     deviations of the charges.
@@ -188,7 +191,7 @@ class _FoldSearch:
         self.force = force
         self.radius = INNER_RADIUS * charge_map.domain.radius
 
-    def scaled(self, position: Array) -> Array:
+    def scaled_jacobian(self, position: Array) -> Array:
         """Compute the scaled derivatives at positions.
 
         Args:
@@ -202,7 +205,7 @@ class _FoldSearch:
         return scaled_derivatives(self.charge_map, contact, self.noise)
 
     def smallest_singular_value(self, position: Array) -> Array:
-        """Compute the smaller one of the two `singular_values` at each position.
+        """Compute the smaller of the two `singular_values` at each position.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
@@ -210,24 +213,27 @@ class _FoldSearch:
         Returns:
             Smaller singular value, shape (n,), 1/mm.
         """
-        return singular_values(self.scaled(position))[:, 1]
+        return singular_values(self.scaled_jacobian(position))[:, 1]
 
-    def folds_between(self, rings: Rings, scaled: Array) -> Array:
+    def folds_between(self, rings: Rings, scaled_jacobian: Array) -> Array:
         """Find folds between neighbouring positions on the same ring or on neighbouring rings.
 
         A fold lies between two positions if the charge map has opposite orientations at these positions.
 
         Args:
             rings: Positions between which folds are searched for.
-            scaled: Scaled derivatives at all positions, shape (n_ring, n_angle, n_electrode, 3).
+            scaled_jacobian: Scaled derivatives at all positions, shape (n_ring, n_angle, n_electrode, 3).
 
         Returns:
             Positions (x, y) on folds, shape (n, 2), mm.
         """
         position = rings.position
         next_on_ring = np.roll(position, -1, axis=1)
-        has_radial_fold = has_reversed_orientation(scaled[:-1], scaled[1:])  # between neighbouring rings
-        has_ring_fold = has_reversed_orientation(scaled, np.roll(scaled, -1, axis=1))  # on the same ring
+        next_jacobian_on_ring = np.roll(scaled_jacobian, -1, axis=1)
+
+        # A radial fold lies between two neighbouring rings. A ring fold lies between two positions on the same ring.
+        has_radial_fold = has_reversed_orientation(scaled_jacobian[:-1], scaled_jacobian[1:])
+        has_ring_fold = has_reversed_orientation(scaled_jacobian, next_jacobian_on_ring)
         first = np.concatenate([position[:-1][has_radial_fold], position[has_ring_fold]])
         second = np.concatenate([position[1:][has_radial_fold], next_on_ring[has_ring_fold]])
         return self._bisect(first, second)
@@ -248,8 +254,8 @@ class _FoldSearch:
         if not len(first):
             return np.empty((0, 2))
         points = []
-        first_scaled = self.scaled(first)
-        second_scaled = self.scaled(second)
+        first_jacobian = self.scaled_jacobian(first)
+        second_jacobian = self.scaled_jacobian(second)
         while len(first):
             # Store the centres of short segments.
             middle = 0.5 * (first + second)
@@ -259,9 +265,9 @@ class _FoldSearch:
 
             # Find the half of each other segment in which the orientation is reversed. A segment is dropped if the
             # orientation is reversed in neither half.
-            middle_scaled = self.scaled(middle)
-            in_first_half = has_reversed_orientation(first_scaled, middle_scaled)
-            in_second_half = has_reversed_orientation(middle_scaled, second_scaled)
+            middle_jacobian = self.scaled_jacobian(middle)
+            in_first_half = has_reversed_orientation(first_jacobian, middle_jacobian)
+            in_second_half = has_reversed_orientation(middle_jacobian, second_jacobian)
             remaining = ~is_short & (in_first_half | in_second_half)
             use_second_half = (in_second_half & ~in_first_half)[remaining]
 
@@ -271,25 +277,25 @@ class _FoldSearch:
             first = np.where(use_second_position, middle[remaining], first[remaining])
             second = np.where(use_second_position, second[remaining], middle[remaining])
             use_second_matrix = use_second_half[:, None, None]  # broadcasts with shape (n, n_electrode, 3)
-            first_scaled = np.where(use_second_matrix, middle_scaled[remaining], first_scaled[remaining])
-            second_scaled = np.where(use_second_matrix, second_scaled[remaining], middle_scaled[remaining])
+            first_jacobian = np.where(use_second_matrix, middle_jacobian[remaining], first_jacobian[remaining])
+            second_jacobian = np.where(use_second_matrix, second_jacobian[remaining], middle_jacobian[remaining])
         return np.concatenate(points)
 
-    def weakest_positions(self, rings: Rings, scaled: Array) -> Array:
+    def weakest_positions(self, rings: Rings, scaled_jacobian: Array) -> Array:
         """Find the positions where the smallest singular value of the scaled derivatives has a local minimum.
 
-        A search starts at each position of the rings whose singular value is not larger than those of its neighbours.
+        A search starts at each position on the rings if no neighbouring position has a smaller singular value.
 
         Args:
             rings: Positions from which the starting positions are chosen.
-            scaled: Scaled derivatives at all positions, shape (n_ring, n_angle, n_electrode, 3).
+            scaled_jacobian: Scaled derivatives at all positions, shape (n_ring, n_angle, n_electrode, 3).
 
         Returns:
             Positions (x, y) of the minima, shape (n, 2), mm.
         """
-        n_ring, n_angle, _, _ = scaled.shape
-        scaled_of_positions = scaled.reshape(-1, *scaled.shape[2:])
-        _, smaller_singular_value = singular_values(scaled_of_positions).T
+        n_ring, n_angle, _, _ = scaled_jacobian.shape
+        jacobian_of_positions = scaled_jacobian.reshape(-1, *scaled_jacobian.shape[2:])
+        _, smaller_singular_value = singular_values(jacobian_of_positions).T
         smallest = smaller_singular_value.reshape(n_ring, n_angle)
 
         # The filter returns the smallest value among 3 x 3 positions: the position itself and its neighbours on the
@@ -305,9 +311,10 @@ class _FoldSearch:
         return self._minimise(rings.position[is_minimum], smallest[is_minimum], first_step[ring])
 
     def folds_near(self, position: Array) -> Array:
-        """Select the positions near which the orientation of the charge map is reversed within `SEGMENT_LENGTH`.
+        """Select the positions at which the orientation of the charge map is reversed.
 
-        The orientations at opposite points of a small circle around each position are compared.
+        The orientations are compared at opposite points of a circle around each position. The diameter of the circle is
+        `SEGMENT_LENGTH`.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm.
@@ -316,11 +323,11 @@ class _FoldSearch:
             Selected positions (x, y), shape (m, 2), mm.
         """
         circle_points = position[:, None] + 0.5 * SEGMENT_LENGTH * COMPASS  # shape (n, 8, 2)
-        scaled = self.scaled(circle_points.reshape(-1, 2))
-        scaled_on_circle = scaled.reshape(len(position), len(COMPASS), *scaled.shape[1:])
+        scaled_jacobian = self.scaled_jacobian(circle_points.reshape(-1, 2))
+        jacobian_on_circle = scaled_jacobian.reshape(len(position), len(COMPASS), *scaled_jacobian.shape[1:])
         half = len(COMPASS) // 2  # the points i and i + half are opposite
-        is_reversed = has_reversed_orientation(scaled_on_circle[:, :half], scaled_on_circle[:, half:])  # shape (n, 4)
-        return np.asarray(position[is_reversed.any(axis=1)])
+        is_reversed = has_reversed_orientation(jacobian_on_circle[:, :half], jacobian_on_circle[:, half:])
+        return np.asarray(position[is_reversed.any(axis=1)])  # `is_reversed` has the shape (n, 4)
 
     def _minimise(self, start: Array, start_value: Array, first_step: Array) -> Array:
         """Find local minima of the smallest singular value by a compass search (Kolda, Lewis and Torczon 2003).

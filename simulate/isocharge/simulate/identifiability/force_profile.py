@@ -1,4 +1,4 @@
-"""Search for the force that explains given charges best at a known position, for many positions at once."""
+"""Search for the force that best explains given charges if the position is known."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class ForceProfile:
     """Function that computes the charges at a position from the force.
 
     The charges at a position are Q = weights(ln F) @ terms. The weights depend only on the force F, and the terms
-    depend only on the position. The charges increase approximately like a power of the force. The exponent of this
+    depend only on the position. Each charge is approximately proportional to a power of the force. The exponent of this
     power is nearly the same for all positions and electrodes.
 
     Attributes:
@@ -41,7 +41,7 @@ class ForceProfile:
 
     @classmethod
     def of(cls, weights: Callable[[Array], Array], force_range: tuple[float, float]) -> "ForceProfile":
-        """Create a profile, and tabulate the exponent with which the charges increase with the force.
+        """Create a profile, and tabulate its exponent as a function of the force.
 
         Args:
             weights: Function that computes weights, shape (n, n_term), from values of ln F, shape (n,).
@@ -57,7 +57,7 @@ class ForceProfile:
         return cls(weights, (min_log_force, max_log_force), log_forces, exponent)
 
     def charge(self, log_force: Array, terms: Array) -> Array:
-        """Compute the charges at several positions, each under its own force.
+        """Compute the charges of presses at several positions. Each press has its own force.
 
         Args:
             log_force: Natural logarithm of the force in N at each position, shape (n,).
@@ -70,7 +70,7 @@ class ForceProfile:
         return np.asarray(np.einsum("nk,nke->ne", term_weights, terms))  # sum over the terms (index k)
 
     def slope(self, log_force: Array, charge: Array) -> Array:
-        """Compute the derivatives of charges with respect to ln F, from the tabulated exponent.
+        """Use the tabulated exponent to compute the derivatives of charges with respect to ln F.
 
         Args:
             log_force: Natural logarithm of the force in N, shape (n,).
@@ -82,11 +82,11 @@ class ForceProfile:
         exponent = np.interp(log_force, self.log_forces, self.exponent)
         return np.asarray(exponent[:, None] * charge)
 
-    def best(self, terms: Array, charge: Array, noise: NoiseModel) -> Array:
-        """Find the force at each position that explains measured charges best, by weighted least squares.
+    def best_log_force(self, terms: Array, charge: Array, noise: NoiseModel) -> Array:
+        """For each position, find the force that best explains the measured charges (weighted least squares).
 
-        Each step computes the factor by which the predicted charges must be multiplied to fit the measured charges
-        best. The exponent of the profile converts this factor into a change of ln F.
+        Each step computes a factor. Multiplied by this factor, the predicted charges fit the measured charges best. The
+        exponent of the profile converts this factor into a change of ln F.
 
         Args:
             terms: Terms of the charges at each position, shape (n, n_term, n_electrode).
@@ -102,8 +102,8 @@ class ForceProfile:
             # With the weights w = 1 / variance, the best factor is sum(w P Q) / sum(w P P), where P are the predicted
             # charges, Q are the measured charges, and the sums are over the electrodes (index e).
             predicted = self.charge(log_force, terms)
-            weighted = predicted / noise.variance(predicted)
-            factor = np.einsum("ne,ne->n", weighted, charge) / np.einsum("ne,ne->n", weighted, predicted)
+            weighted_charge = predicted / noise.variance(predicted)
+            factor = np.einsum("ne,ne->n", weighted_charge, charge) / np.einsum("ne,ne->n", weighted_charge, predicted)
 
             # A negative factor has no logarithm. Measured charges with opposite signs lead to the smallest force.
             positive_factor = np.maximum(factor, 1e-300)

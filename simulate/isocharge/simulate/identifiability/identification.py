@@ -1,4 +1,4 @@
-"""Computation of how well the charges of a sensor determine contacts: error limits, folds and working area."""
+"""Analysis of how well the charges of a sensor determine contacts: error limits, folds and working area."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -60,7 +60,7 @@ BOUND_NAMES: dict[Bound, str] = {"fold": "fold", "ambiguous pair": "twins", "err
 
 @dataclass(frozen=True)
 class LimitMap:
-    """Cramer-Rao limits of contacts with one force on rings around the centre of the film.
+    """Cramer-Rao limits of contacts that lie on rings around the centre of the film and have the same force.
 
     Attributes:
         force: Force of all contacts, N.
@@ -104,7 +104,7 @@ class LimitMap:
         )
 
     def statistics(self) -> dict[str, float]:
-        """Compute the median, the root mean square and the maximum of the errors over the disk, for JSON.
+        """Return a dictionary for JSON with the median, the root mean square and the maximum of the errors.
 
         The weight of a position is the area that it represents. Errors of the force are in percent of the force.
         """
@@ -127,7 +127,7 @@ class LimitMap:
 
 @dataclass(frozen=True)
 class Identification:
-    """Result of `identify`, which states how well the charges of a sensor determine contacts.
+    """Result of `identify`: a description of how well the charges of a sensor determine contacts.
 
     Attributes:
         sensor: Sensor that was analysed.
@@ -164,7 +164,7 @@ class Identification:
         error: float = DEFAULT_ERROR,
         executor: Executor | None = None,
     ) -> "Identification":
-        """Compute how well the charges of a sensor determine contacts in the domain of its forward map.
+        """Compute how well the charges of a sensor determine the contacts in the domain of a forward map.
 
         The mirror region is not computed.
 
@@ -191,24 +191,24 @@ class Identification:
 
     @property
     def determined_share(self) -> float:
-        """Share of the searched disk in which the position error does not exceed its limit for any force.
+        """Fraction of the area of the searched disk where the position error is within its limit for all forces.
 
         The disk includes the regions on both sides of folds. Contacts on opposite sides of a fold may have the same
-        charges. Other information, such as preceding frames, is then necessary to distinguish these contacts.
+        charges. In this case, other information, such as preceding frames, is necessary to distinguish the contacts.
         """
         is_allowed = np.all([limits.position <= self.area.error for limits in self.maps], axis=0)
         return float(np.average(is_allowed.mean(axis=1), weights=self.maps[0].rings.distance))
 
     @property
     def summary(self) -> str:
-        """Sentences that describe the working area, and the error of the side force if its limits were computed."""
+        """Sentences that describe the working area, and also the error of the side force if it was computed."""
         if not self.side_force:
             return self._area_summary
         return f"{self._area_summary} {self._side_force_summary}"
 
     @property
     def _area_summary(self) -> str:
-        """Sentences that describe the working area, and the larger area in which preceding frames are needed."""
+        """Sentences about the working area, and about the larger area in which preceding frames are needed."""
         area = self.area
         if not (len(area.folds) or len(area.pairs)):
             return area.summary
@@ -263,7 +263,7 @@ class Identification:
         }
 
     def _errors_by_distance(self) -> dict[str, list[float]]:
-        """Return the median and the largest position error on each ring for JSON, with two lists for each force."""
+        """Return lists for JSON: the distances of the rings, and the median and the largest error on each ring."""
         errors = {"distance_mm": self.maps[0].rings.distance.tolist()}
         for limits in self.maps:
             errors[f"median_position_mm_at_{limits.force:g}_N"] = np.median(limits.position, axis=1).tolist()
@@ -333,7 +333,7 @@ def identify(
 
 
 def search_radius(sensor: Sensor, probe: Probe) -> float:
-    """Return the radius of the disk in which the working area is searched for, mm.
+    """Return the radius of the disk that the search for the working area covers, mm.
 
     In most cases, a fold near the outer electrodes bounds the working area. The radius of the disk is therefore the
     distance of the outermost corner of an electrode from the centre. If the outermost corner is near the clamp, the
@@ -351,7 +351,7 @@ def search_radius(sensor: Sensor, probe: Probe) -> float:
 def map_to_search(
     sensor: Sensor, probe: Probe, force_range: tuple[float, float], executor: Executor | None = None
 ) -> ForwardMap:
-    """Build a forward map for the search for the working area.
+    """Build the forward map that the search for the working area uses.
 
     The first radius of the map is `search_radius`. If the charges cannot be interpolated accurately up to this radius,
     the radius is multiplied by `RADIUS_REDUCTION`, at most `MAX_REDUCTIONS` times.
@@ -401,7 +401,7 @@ def _limit_maps(charges: ChargeMap, noise: NoiseModel, forces: list[float], radi
 def _median(values: Array, weights: Array) -> float:
     """Compute the weighted median of values.
 
-    Half of the total weight belongs to values up to the weighted median.
+    The values up to the weighted median have half of the total weight.
 
     Args:
         values: Values, shape (n,).

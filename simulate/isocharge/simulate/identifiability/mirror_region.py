@@ -1,10 +1,10 @@
 """Computation of the mirror region of a sensor.
 
 A press in the mirror region lies outside the working area and has the same charges as a press inside the working area.
-No method can therefore notice from the charges that the press lies outside. If all electrodes lie on one circle of
-radius R, the mirror region covers almost the whole film. An inversion in this circle preserves the ratios of the
-distances to the points of the circle. A point load at the distance r from the centre therefore has nearly the same
-influence on the points of the circle as a point load at the distance R^2 / r.
+Therefore no method can conclude from the charges that the press lies outside the working area. If all electrodes lie on
+one circle of radius R, the mirror region covers almost the whole film. An inversion in this circle preserves the ratios
+of the distances to the points of the circle. A point load at the distance r from the centre therefore has nearly the
+same influence on the points of the circle as a point load at the distance R^2 / r.
 """
 
 from concurrent.futures import Executor
@@ -52,7 +52,7 @@ charges.
 
 @dataclass(frozen=True)
 class MirrorRegion:
-    """Share of the presses at each position outside the working area that have the charges of a press in this area.
+    """For each position outside the working area, the share of presses with the charges of a press in this area.
 
     Attributes:
         inner: Radius of the working area, mm.
@@ -72,7 +72,8 @@ class MirrorRegion:
     def of(cls, charges: ChargeMap, radius: float, whole_film: ChargeMap, noise: NoiseModel) -> "MirrorRegion":
         """Compute which presses outside the working area have the same charges as a press inside the working area.
 
-        The presses lie in the middle of each sector of each ring between the working area and the edge of the film.
+        The part of the film outside the working area is divided into rings, and each ring is divided into sectors. The
+        presses lie in the middle of the sectors.
 
         Args:
             charges: Accurate charge map of the working area.
@@ -106,7 +107,7 @@ class MirrorRegion:
 
     @property
     def total_share(self) -> float:
-        """Share of all presses outside the working area that have the charges of a press in this area, dimensionless.
+        """Share of the presses outside the working area whose charges agree with those of a press in this area.
 
         The weight of a press is the area of its sector.
         """
@@ -115,7 +116,7 @@ class MirrorRegion:
 
     @property
     def summary(self) -> str:
-        """Sentence that states the share of the presses outside the working area that cannot be noticed."""
+        """Sentence that states which share of the presses outside the working area cannot be noticed."""
         presses = (
             f"presses of {self.forces[0]:.2g} to {self.forces[-1]:.2g} N from {self.inner:.3g} to {self.outer:.3g} mm "
             "from the centre"
@@ -140,7 +141,7 @@ class MirrorRegion:
 
 
 def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
-    """Return for each of several presses whether a press inside a domain causes the same charges, up to the noise.
+    """Return for each press whether a press inside a domain causes charges that agree within the noise.
 
     Args:
         inside: Charge map of the domain.
@@ -180,7 +181,7 @@ def mirror_region(
     *,
     executor: Executor | None = None,
 ) -> MirrorRegion | None:
-    """Compute the mirror region of a sensor, from a coarse charge map of the whole film.
+    """Compute the mirror region of a sensor by means of a coarse charge map of the whole film.
 
     Outside the working area, a probe that is not round is replaced by a round probe with the same reach.
 

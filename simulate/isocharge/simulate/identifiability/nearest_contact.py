@@ -36,7 +36,7 @@ CHUNK = 2048
 
 
 def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, start: Array) -> tuple[Array, Array]:
-    """Find the contacts whose charges are nearest to given charges, from starting points near the solution.
+    """Find the contacts whose charges are nearest to given charges. The starting points must be near the solution.
 
     A least-squares descent leads from each starting point to a contact.
 
@@ -52,7 +52,7 @@ def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, sta
     """
 
     def predicted_sigma(_: Integers, predicted: Array) -> Array:
-        """Return the standard deviations of the noise of the predicted charges, of the same shape, pC."""
+        """Return the standard deviation of the noise of each predicted charge, shape (k, n_electrode), pC."""
         return noise.sigma(predicted)
 
     contact, residual = _descend(charge_map, charge, predicted_sigma, start, STEPS)
@@ -62,10 +62,10 @@ def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, sta
 def explain(
     charge_map: ChargeMap, charge: Array, sigma: Array, start: Array, *, min_change: float = MIN_CHANGE
 ) -> tuple[Array, Array]:
-    """Find the contacts whose charges are nearest to given charges, from any starting points.
+    """Find the contacts whose charges are nearest to given charges. The starting points may be anywhere.
 
     A least-squares descent leads from each starting point to a contact. In contrast to `nearest_contact`, the standard
-    deviations of the charges are given, and the starting points need not be near the solution.
+    deviations of the charges are given.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -80,7 +80,7 @@ def explain(
     """
 
     def given_sigma(rows: Integers, _: Array) -> Array:
-        """Return the given standard deviations of the charges in some rows, shape (k, n_electrode), pC."""
+        """Return the given standard deviations for k selected rows of charges, shape (k, n_electrode), pC."""
         return np.asarray(sigma[rows])
 
     return _descend(charge_map, charge, given_sigma, start, MAX_STEPS, min_change)
@@ -117,7 +117,8 @@ def _descend(
     min_log_force, max_log_force = np.log(force_range)
     centre = charge_map.domain.centre
     half_width = np.array([radius, radius, 0.5 * (max_log_force - min_log_force)])
-    divisor = np.where(half_width > 0.0, half_width, 1.0)  # the half width of ln F is zero if there is a single force
+    # The half width of ln F is zero if there is a single force.
+    nonzero_half_width = np.where(half_width > 0.0, half_width, 1.0)
 
     def to_contact(unit_coordinates: Array) -> Array:
         """Convert unit coordinates, shape (k, 3), into contacts (x, y, F), shape (k, 3), mm and N."""
@@ -126,7 +127,7 @@ def _descend(
         return np.column_stack([log_contact[:, :2], force])
 
     def residuals(rows: Integers, unit_coordinates: Array) -> tuple[Array, Array]:
-        """Compute the residuals (Q - Q(c)) / sigma of some rows of the charges, and their derivatives.
+        """Compute the residuals (Q - Q(c)) / sigma for selected rows of charges, and the derivatives of the residuals.
 
         Args:
             rows: Indices of the rows, shape (k,).
@@ -142,7 +143,7 @@ def _descend(
         return (charge[rows] - predicted) / sigma, derivatives.swapaxes(1, 2)
 
     log_start = np.column_stack([start[:, :2], np.log(start[:, 2])])  # (x, y, ln F)
-    unit_start = (log_start - centre) / divisor
+    unit_start = (log_start - centre) / nonzero_half_width
     unit_solution, residual = minimise(residuals, unit_start, max_steps, min_change)
     return to_contact(unit_solution), residual
 
@@ -156,10 +157,11 @@ def search(
     candidates: int = CANDIDATES,
     min_change: float = MIN_CHANGE,
 ) -> tuple[Array, Array]:
-    """Find the contacts whose charges are nearest to given charges, without given starting points.
+    """Find the contacts whose charges are nearest to given charges, and choose the starting points.
 
-    The given charges are compared with the charges of candidates, which are contacts that are distributed over the
-    domain. For each row of charges, least-squares descents start from the candidates with the nearest charges.
+    Candidates are contacts that are distributed over the domain. The function compares the given charges with the
+    charges of the candidates. For each row of charges, least-squares descents start from the candidates with the
+    nearest charges.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -230,10 +232,10 @@ def _unit_candidates(count: int) -> Array:
 def _nearest_rows(
     charge: Array, sigma: Array, candidate_charges: Array, is_neighbour: Booleans, count: int
 ) -> Integers:
-    """Find the candidates with the nearest charges for each row of charges.
+    """For each row of charges, find the candidates whose charges are nearest to this row.
 
-    Two candidates that are neighbours of each other are not both returned for the same row. The smallest distance is
-    searched for several times, because this is faster than sorting all distances.
+    For each row, at most one of two neighbouring candidates is returned. The function searches for the smallest
+    distance several times, because sorting all distances would be slower.
 
     Args:
         charge: Given charges, shape (n, n_electrode), pC.
@@ -250,8 +252,8 @@ def _nearest_rows(
     # Without the constant, the squared distances of all rows and candidates are one matrix product.
     inverse_variance = sigma**-2.0
     weights = np.hstack([inverse_variance, -2.0 * charge * inverse_variance])
-    powers = np.hstack([candidate_charges**2, candidate_charges])
-    squared_distance = weights @ powers.T  # shape (n, n_candidate)
+    charge_powers = np.hstack([candidate_charges**2, candidate_charges])
+    squared_distance = weights @ charge_powers.T  # shape (n, n_candidate)
     nearest = np.empty((len(charge), count), dtype=np.intp)
     for rank in range(count):
         nearest_candidate = squared_distance.argmin(axis=1)

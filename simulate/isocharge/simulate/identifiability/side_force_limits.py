@@ -87,7 +87,7 @@ class SideForceLimits:
         return self._median(self.side_force) <= MAX_SIDE_FORCE_ERROR
 
     def statistics(self) -> dict[str, Any]:
-        """Compute the weighted median and the maximum of the errors, for JSON.
+        """Return the weighted median and the maximum of the errors as a dictionary for JSON.
 
         Errors of the force and of the side force are in percent of the force.
         """
@@ -125,7 +125,7 @@ def side_force_limits(
     radius: float,
     executor: Executor | None = None,
 ) -> tuple[SideForceLimits, ...]:
-    """Compute the limits of contacts with an unknown side force, for each of several forces.
+    """For each of several forces, compute the limits of contacts with an unknown side force.
 
     Args:
         forward_map: Forward map of the sensor.

@@ -1,4 +1,4 @@
-"""Computation of the working area, which is the disk within which the charges determine the contact."""
+"""Computation of the working area: the disk in which the charges determine the contact."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -102,10 +102,11 @@ def working_area(
     """Find the working area within the domain of a charge map.
 
     The radius of the working area is the smallest of four radii: the radius at which the position error exceeds its
-    limit, the distance of the nearest fold, the radius of the nearest ambiguous pair, and the radius of the domain.
+    limit, the distance from the centre to the nearest fold, the radius of the nearest ambiguous pair, and the radius of
+    the domain.
 
-    A forward map is first replaced by splines, which are faster. Any other charge map, such as a fit to measured
-    charges, is evaluated for about 400,000 contacts. Without the search for ambiguous pairs, the charge map is
+    A forward map is first replaced by splines, because splines are faster. Any other charge map, such as a fit to
+    measured charges, is evaluated for about 400,000 contacts. Without the search for ambiguous pairs, the charge map is
     evaluated for about 130,000 contacts.
 
     Args:
@@ -225,7 +226,7 @@ def _error_radius(charge_map: ChargeMap, rings: Rings, force: float, noise: Nois
 def _nearest_exceeding_distance(
     charge_map: ChargeMap, position: Array, force: float, noise: NoiseModel, error: float
 ) -> float:
-    """Return the smallest distance (mm) from the centre to a given position at which the error exceeds its limit.
+    """Return the distance (mm) from the centre to the nearest given position with an error above its limit.
 
     The distance is infinite if the error does not exceed its limit at any of the given positions.
 

@@ -1,1 +1,1 @@
-"""Design of electrode layouts, which searches for the electrode positions with the smallest position errors."""
+"""Design of electrode layouts: a search for the electrode positions with the smallest position errors."""

@@ -1,4 +1,4 @@
-"""Design case, which states the requirements of an electrode layout and the rules for the electrode positions."""
+"""Design case: the requirements of an electrode layout, and the rules for the electrode positions."""
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -68,7 +68,7 @@ NO_NUISANCES = Nuisances(probe_radius=0.0, pretension=0.0, gain=0.0)
 
 @dataclass(frozen=True)
 class WeightMap:
-    """Weights of the position error in the goal of a design, as a function of the position.
+    """Weights of the position errors in the goal of a design. The weight depends on the position of the press.
 
     Attributes:
         name: Name of the file that contains the weights.
@@ -81,7 +81,7 @@ class WeightMap:
     def weigh(self, presses: Array) -> Array:
         """Compute the weights of presses by linear interpolation between the rows of the table.
 
-        A press outside the area that the table covers has the weight of the nearest row.
+        If the table does not cover the position of a press, the press has the weight of the nearest row.
 
         Args:
             presses: Positions (x, y), shape (n, 2), mm.
@@ -262,7 +262,7 @@ class DesignCase:
 
     @property
     def new_count(self) -> int:
-        """Number of new electrodes, whose positions the design chooses."""
+        """Number of new electrodes. The design chooses their positions."""
         return self.electrodes - len(self.keep)
 
     @property
@@ -280,12 +280,12 @@ class DesignCase:
     def fine_grid(self) -> Array:
         """Positions (x, y) of presses on a fine grid, shape (n, 2), mm.
 
-        The grid is fine because the largest position error mostly occurs beside an electrode, within a small region.
+        The grid is fine because the largest position error mostly occurs in a small region beside an electrode.
         """
         return square_grid(self.radius, self.radius / FINE_GRID_STEPS)
 
     def weights(self, presses: Array) -> Array:
-        """Return the weight of each press in the minimised quantity.
+        """Return the weight of each press in the quantity that the design minimises.
 
         Args:
             presses: Positions (x, y), shape (n, 2), mm.
@@ -296,10 +296,10 @@ class DesignCase:
         return self.goal.weigh(presses) if isinstance(self.goal, WeightMap) else np.ones(len(presses))
 
     def clearance(self, positions: Array) -> Array:
-        """Compute the margins with which single squares satisfy the distance rules.
+        """Compute the margin with which each square satisfies the distance rules.
 
-        A square must have at least the distance `rim` from the rim of the film, and at least the gap `gap` to the
-        bounding boxes of the kept electrodes.
+        The distance between a square and the rim of the film must be at least `rim`. The gap between a square and the
+        bounding box of a kept electrode must be at least `gap`.
 
         Args:
             positions: Centres (x, y) of the squares, shape (n, 2), mm.
@@ -324,7 +324,7 @@ class DesignCase:
         return np.asarray(np.min(clearances, axis=0))
 
     def pair_clearance(self, positions: Array, others: Array) -> Array:
-        """Compute the margins with which pairs of new squares satisfy the rule for the gap between two electrodes.
+        """Compute the margin with which each pair of new squares satisfies the rule for the gap between electrodes.
 
         Args:
             positions: Centres (x, y) of the first squares, shape (n, 2), mm.
@@ -354,7 +354,7 @@ class DesignCase:
     def layout(self, positions: Array) -> Sensor:
         """Create the sensor that has the kept electrodes and new squares at given positions.
 
-        The new squares get their names in anticlockwise order, beginning at the x axis.
+        The new squares are named in anticlockwise order, beginning at the x axis.
 
         Args:
             positions: Centres (x, y) of the new squares, shape (n, 2), mm.

@@ -1,16 +1,16 @@
-"""Table from which the charges of electrodes at any position on the film are computed.
+"""Table for computing the charges of electrodes at any position on the film.
 
 The table also contains the derivatives of the charges with respect to the position and the force of the press, the
 probe radius and the pretension. The equilibrium of a round film under a press depends on the distance of the press from
 the centre, but not on the electrodes. A conformal map (see `mesh.placement`) transforms the edge of the probe into a
 circle |z| = rho. In the coordinate z of the conformal map, the stress is smooth except for a kink on the circle.
 
-The equilibrium is solved at a few distances from the centre, which are Chebyshev nodes in `distance_coordinate`. The
-stress and its derivatives, which are computed by finite differences, are stored on a polar grid in z. The rows of the
-grid are equally spaced in |z| within the circle, and equally spaced in ln|z| between the circle and the rim. Between
-the solved distances, the table is interpolated by polynomials in the distance coordinate. Between the nodes of the
-grid, the table is interpolated by local cubic polynomials. The charge of an electrode is its area times the mean charge
-per area.
+The equilibrium is solved for presses at a few distances from the centre. In `distance_coordinate`, these distances are
+Chebyshev nodes. The stress and its derivatives are stored on a polar grid in z. The derivatives are computed by finite
+differences. The rows of the grid are equally spaced in |z| within the circle, and equally spaced in ln|z| between the
+circle and the rim. Between the solved distances, the table is interpolated by polynomials in the distance coordinate.
+Between the nodes of the grid, the table is interpolated by local cubic polynomials. The charge of an electrode is its
+area times the mean charge per area.
 """
 
 import math
@@ -97,7 +97,7 @@ POINT_CHUNK = 20_000
 
 @dataclass(frozen=True)
 class ChargeTable:
-    """Table from which the charges of electrodes of any shape are computed, for presses with one probe and one force.
+    """Table for computing the charges of electrodes of any shape. All presses have the same probe and the same force.
 
     The presses may lie anywhere in a disk around the centre of the film.
 
@@ -179,7 +179,7 @@ class ChargeTable:
 
 @dataclass(frozen=True)
 class _PressedFilm:
-    """Charge per area under several presses, at the nodes of the polar grid of each press.
+    """Charge per area that several presses cause, at the nodes of the polar grid of each press.
 
     Attributes:
         table: Charge table from which the charges per area were interpolated.
@@ -201,7 +201,7 @@ class _PressedFilm:
 
     @classmethod
     def of(cls, table: ChargeTable, presses: Array) -> "_PressedFilm":
-        """Interpolate the charges per area under several presses from a charge table.
+        """Compute the charges per area that several presses cause by interpolating a charge table.
 
         Args:
             table: Charge table that covers the presses.
@@ -259,7 +259,7 @@ class _PressedFilm:
         return rows
 
     def electrode_rows(self, electrode: Electrode) -> Array:
-        """Compute the charge of one electrode of any shape, and the derivatives of this charge, for all presses.
+        """For all presses, compute the charge of one electrode of any shape and the derivatives of this charge.
 
         Args:
             electrode: Electrode at its nominal position.
@@ -278,7 +278,7 @@ class _PressedFilm:
         return electrode.area * np.concatenate(means)[:, None]
 
     def mean_rows(self, press_index: Integers, points: Array, weights: Array) -> Array:
-        """Compute weighted means of the charge per area and of its derivatives over points on the film.
+        """Average the charge per area and its derivatives over points on the film. The averages are weighted.
 
         The values at the points are interpolated from the polar grid of each press.
 
@@ -310,7 +310,7 @@ class _PressedFilm:
         return mean
 
     def _nodes_around(self, press_index: Integers, points: Complexes, point_weights: Array) -> tuple[Integers, Array]:
-        """Find the nodes of the polar grids that surround given points, and their weights for cubic interpolation.
+        """Find the grid nodes that surround given points, and the weights of these nodes for cubic interpolation.
 
         Args:
             press_index: Index of the press to whose grid each row of points belongs, shape (k,).
@@ -338,8 +338,8 @@ class _PressedFilm:
     def _grid_coordinates(self, press_index: Integers, points: Complexes) -> tuple[Array, Array]:
         """Compute the fractional rows and columns of points on the polar grids.
 
-        A fractional row of 2.5, for example, lies in the middle between the rows 2 and 3. Points beyond the rim are
-        moved to the rim.
+        For example, the fractional row 2.5 lies halfway between the rows 2 and 3. Points beyond the rim are moved to
+        the rim.
 
         Args:
             press_index: Index of the press to whose grid each row of points belongs, shape (k,).
@@ -412,7 +412,7 @@ def _row_weights(row: Array) -> tuple[Integers, Array]:
 def _stress_at(
     film: Film, surface: Surface, probe: Circle, force: float, settings: SolveSettings, distance: float
 ) -> Array:
-    """Compute the stress and its derivatives on the polar grid of a press on the positive x axis.
+    """For a press on the positive x axis, compute the stress and its derivatives on the polar grid.
 
     The derivatives are computed by finite differences between solved presses.
 
@@ -483,7 +483,7 @@ def _stress_at(
 
 
 def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Array:
-    """Compute the points of the polar grid of a press on the positive x axis.
+    """For a press on the positive x axis, compute the points of the polar grid.
 
     The grid is polar in the coordinate z of a conformal map. The conformal map transforms the edge of the probe into a
     circle |z| = rho around the centre. The rows of the grid are equally spaced in |z| within the circle, and equally

@@ -1,4 +1,4 @@
-"""Design of an electrode layout with small position errors, whose charges are not ambiguous."""
+"""Design of an electrode layout that has small position errors and unambiguous charges."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -49,14 +49,14 @@ class ErrorMap:
     with_nuisances: Array
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
-        """Return the maximum and the root mean square of the errors without and with nuisances, for JSON."""
+        """Return a dictionary for JSON with the maximum and the rms of the errors without and with nuisances."""
         return {
             "noise_alone": self._statistics(self.noise_alone),
             "with_nuisances": self._statistics(self.with_nuisances),
         }
 
     def _statistics(self, errors: Array) -> dict[str, Any]:
-        """Return the largest error, its position, and the root mean square of all errors, for JSON.
+        """Return a dictionary for JSON with the largest error, its position, and the rms of all errors.
 
         Args:
             errors: Error of each press, shape (n,), mm.
@@ -93,11 +93,11 @@ class Design:
 
     @property
     def unambiguous(self) -> bool:
-        """Whether the search found neither folds nor ambiguous pairs of the new layout."""
+        """Whether the search found neither folds nor ambiguous pairs for the new layout."""
         return self.summary == UNAMBIGUOUS
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the case, the new layout, the errors of both layouts, and the result of the checks, for JSON."""
+        """Return a dictionary for JSON with the case, the new layout, the errors of both layouts and the checks."""
         return {
             "case": self.case.to_dict(),
             "sensor": self.sensor.name,
@@ -129,8 +129,8 @@ class _CheckedLayout(NamedTuple):
 def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     """Find the layout that has the smallest position errors among the layouts without folds and ambiguous pairs.
 
-    Random layouts are improved on a grid, and the best layouts are refined. In the order of their errors, the refined
-    layouts are then searched for folds and ambiguous pairs. The first layout without folds and ambiguous pairs is
+    Random layouts are improved on a grid, and the best layouts are refined. The refined layouts are searched for folds
+    and ambiguous pairs in ascending order of their errors. The first layout without folds and ambiguous pairs is
     returned. If every layout has folds or ambiguous pairs, the layout with the smallest error is returned.
 
     Args:
@@ -183,7 +183,7 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
 
 
 def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMap | None:
-    """Build the forward map with which all layouts of a design case are searched for folds and ambiguous pairs.
+    """Build the forward map that the search for folds and ambiguous pairs uses for all layouts of a design case.
 
     All layouts use the same map, because the stress of the film does not depend on the electrodes. The map covers the
     default range of forces and the force of the case.
@@ -206,7 +206,7 @@ def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMa
 def ambiguities(case: DesignCase, charges: ChargeMap) -> str:
     """Search for folds and ambiguous pairs of a layout, and describe them in a sentence.
 
-    The search is done for the smallest and the largest force of the charge map, and for the force of the case.
+    The search covers three forces: the smallest and the largest force of the charge map, and the force of the case.
 
     Args:
         case: Requirements of the layout, with the radius, the force and the noise.

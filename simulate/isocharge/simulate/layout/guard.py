@@ -1,14 +1,14 @@
-"""Search for the position of a guard electrode, a square whose charge reveals presses outside the working area.
+"""Search for the position of a guard electrode, whose charge reveals presses outside the working area.
 
 If all electrodes lie on one circle, a press outside the circle has nearly the same charges as a press inside the circle
-(see `mirror_region`). A guard electrode at another distance from the centre has different charges under these two
-presses.
+(see `mirror_region`). These two presses cause different charges on a guard electrode, which is a square at another
+distance from the centre.
 
 The search first finds pairs of contacts that have the same charges without the guard electrode. One contact of a pair
 is a press outside the working area, and the other contact is inside the working area. For each possible position of the
-guard electrode, its charge is added, and a least-squares descent starts from the inner contact of each pair. If the
-descent finds a contact with the same charges, the guard electrode does not reveal the press outside. For the best
-positions, the mirror region is then computed by a search over the whole working area.
+guard electrode, the charge of this electrode is added to the charges of each pair, and a least-squares descent starts
+from the inner contact. If the descent finds a contact with the same charges, the guard electrode does not reveal the
+press outside. For the best positions, the mirror region is computed by a search over the whole working area.
 """
 
 from concurrent.futures import Executor
@@ -60,7 +60,7 @@ LIMIT_ANGLES = 36
 
 @dataclass(frozen=True)
 class PositionLimits:
-    """Cramer-Rao limits of the position error in the working area, for presses with the force of a design case.
+    """Cramer-Rao limits of the position error for presses in the working area. The force is that of a design case.
 
     Attributes:
         rms: Root mean square of the limits over the working area, mm.
@@ -113,7 +113,7 @@ class GuardDesign:
 
     @property
     def guard(self) -> Electrode:
-        """Guard electrode, which is the only electrode that the initial sensor does not have."""
+        """Guard electrode, which is the electrode that the initial sensor does not have."""
         (name,) = set(self.sensor.electrode_names) - set(self.case.keep)
         return next(electrode for electrode in self.sensor.electrodes if electrode.name == name)
 
@@ -126,7 +126,7 @@ class GuardDesign:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the case, the guard electrode, and the results without and with this electrode, for JSON."""
+        """Return a dictionary for JSON with the case, the guard electrode, and the results without and with it."""
         return {
             "case": self.case.to_dict(),
             "sensor": self.sensor.name,
@@ -152,10 +152,10 @@ def guard_case(sensor: Sensor, radius: float, **settings: Any) -> DesignCase:
 
 
 def design_guard(case: DesignCase, *, executor: Executor | None = None) -> GuardDesign:
-    """Find the position of a guard electrode that leaves the fewest presses outside the working area unnoticed.
+    """Find the position at which a guard electrode leaves the fewest presses outside the working area unnoticed.
 
-    If several positions have nearly the smallest share of unnoticed presses, the position with the smallest position
-    limits in the working area is preferred.
+    If several positions have nearly the smallest share of unnoticed presses, the function prefers the position with the
+    smallest Cramer-Rao limits of the position error in the working area.
 
     Args:
         case: Design case that `guard_case` created.
@@ -223,7 +223,7 @@ def _free_positions(case: DesignCase) -> Array:
 
 
 def _with_guard(case: DesignCase, position: Array) -> Sensor:
-    """Return the sensor of a design case with a guard electrode, which is added as the last electrode.
+    """Add a guard electrode to the sensor of a design case. The guard electrode becomes the last electrode.
 
     Args:
         case: Design case with the sensor and the side of the square.
@@ -240,7 +240,7 @@ def _with_guard(case: DesignCase, position: Array) -> Sensor:
 
 
 def _mirror_region(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMap, sensor: Sensor) -> MirrorRegion:
-    """Compute the mirror region of a sensor from forward maps of another sensor with the same film.
+    """Compute the mirror region of a sensor by means of forward maps of another sensor with the same film.
 
     Args:
         case: Design case with the radius of the working area and the noise.
@@ -253,11 +253,12 @@ def _mirror_region(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMa
 
 
 def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMap, sensors: list[Sensor]) -> Array:
-    """Estimate the share of presses outside the working area that cannot be noticed, for several guard electrodes.
+    """For several guard electrodes, estimate which share of the presses outside the working area cannot be noticed.
 
     A press cannot be noticed if a contact in the working area explains its charges. Presses that are noticed without a
     guard electrode are also noticed with every guard electrode. For each of the other presses, the charge of the guard
-    electrode is added. A descent then starts from the contact that explains the charges without the guard electrode.
+    electrode is added to the charges of the press. A descent starts from the contact that explains the charges without
+    the guard electrode.
 
     Args:
         case: Design case with the radius of the working area and the noise.
@@ -328,8 +329,8 @@ class JoinedMap:
 def _presses_outside(case: DesignCase, outer_map: ForwardMap) -> Array:
     """Return presses that are distributed evenly over the film outside the working area.
 
-    Successive presses have different forces. There are `N_FORCES` forces, which cover the same range as those of
-    `MirrorRegion`.
+    Successive presses have different forces. The presses have `N_FORCES` different forces, which cover the same range
+    as the forces of `MirrorRegion`.
 
     Args:
         case: Design case with the radius of the working area.

@@ -3,11 +3,11 @@
 The parameters of a press are x, y, ln F and the nuisance parameters. Let the matrix A contain the derivatives of the
 charges of all electrodes with respect to the parameters. Let W be the diagonal matrix of the Fisher information that
 one reading provides about each charge, and let P be the inverse of the prior covariance of the parameters. The Fisher
-information matrix of the parameters is then B = A' W A + P. The Cramer-Rao limit of the position is the block of the
-inverse of B that belongs to x and y.
+information matrix of the parameters is B = A' W A + P. The Cramer-Rao limit of the position is the block of the inverse
+of B that belongs to x and y.
 
-A further electrode adds a matrix a a' to B, where a is the row of sqrt(W) A that belongs to this electrode. The limit
-then changes according to Sherman and Morrison (1950):
+A further electrode adds a matrix a a' to B, where a is the row of sqrt(W) A that belongs to this electrode. The formula
+of Sherman and Morrison (1950) describes the change of the limit:
 
     tr_xy (B + a a')^-1 = tr_xy B^-1 - |(B^-1 a)_xy|^2 / (1 + a' B^-1 a).
 
@@ -119,7 +119,7 @@ def position_variance(inverse: Array) -> Array:
 
 
 def squared_errors_with_candidates(sensitivity: Array, candidates: Array) -> Array:
-    """Compute the squared position errors of a layout with one further electrode, for many candidates.
+    """For many candidate electrodes, compute the squared position errors of a layout with this candidate.
 
     Let B be the information matrix of the layout, and let the vector a contain the sensitivities of a candidate.
     According to Sherman and Morrison (1950), the sum of the variances of x and y with the candidate is

@@ -1,10 +1,10 @@
 """Search for electrode positions with small position errors, in two stages.
 
-The first stage is an exchange on a grid (Fedorov 1972; Meyer and Nachtsheim 1995), which starts from a random layout.
-Each square in turn is moved to the position of the grid at which the error of the whole layout is smallest, until the
-error no longer decreases. The formula of Sherman and Morrison computes the errors for all positions of the grid at once
-(see `position_error`). If the goal is the largest error, the exchange minimises a power mean of the errors, which
-approximates the largest error.
+The first stage starts from a random layout and is an exchange on a grid (Fedorov 1972; Meyer and Nachtsheim 1995). Each
+square in turn is moved to the position of the grid at which the error of the whole layout is smallest, until the error
+no longer decreases. The formula of Sherman and Morrison computes the errors for all positions of the grid at once (see
+`position_error`). If the goal is the largest error, the exchange minimises an approximation of the largest error: a
+power mean of all errors.
 
 The second stage is a refinement. The largest error mostly occurs near the edge of an electrode, between the presses of
 a coarse grid. The refinement therefore considers the presses with the largest errors on a fine grid. The refinement
@@ -129,8 +129,8 @@ def random_layouts(case: DesignCase) -> tuple[Array, list[Integers]]:
 def _random_layout(case: DesignCase, grid: Array, rng: np.random.Generator) -> Integers:
     """Choose a random position of the grid for each new square.
 
-    The positions are tried in random order. A position is chosen if its square has the required distance from the
-    squares at all positions that were chosen earlier.
+    The positions are tried in random order. A position is chosen if a square at this position has the required distance
+    from the squares at all positions that were chosen earlier.
 
     Args:
         case: Design case with the number of new squares and the distance rules.
@@ -172,8 +172,8 @@ class Search:
     def presses(self) -> Array:
         """Positions (x, y) of the presses for which the refinement evaluates a layout, shape (n, 2), mm.
 
-        The presses form a fine grid if the goal is the largest error. For all other goals, the presses are those of the
-        exchange.
+        The presses form a fine grid if the goal is the largest error. For all other goals, the refinement uses the same
+        presses as the exchange.
         """
         return self.case.fine_grid if self.case.goal == "worst" else self.case.search_presses
 
@@ -367,9 +367,9 @@ class Search:
     def _refinement_round(self, positions: Array, max_step: float) -> Array:
         """Improve a layout by sequential quadratic programming for the presses that have the largest errors.
 
-        The variables are the coordinates of the squares and, as the last variable, a bound of the logarithms of the
-        errors. The bound is minimised under two constraints: no logarithm of an error exceeds the bound, and the
-        distance rules are satisfied.
+        The variables are the coordinates of the squares and a bound. The bound, which is the last variable, is an upper
+        limit of the logarithms of the errors. The bound is minimised under two constraints. No logarithm of an error
+        exceeds the bound, and the layout satisfies the distance rules.
 
         Args:
             positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
@@ -465,9 +465,9 @@ class _Exchange:
         )
 
     def mean_powers(self, other_squares: Integers) -> Array:
-        """Compute the mean of the powers of the errors for a further square at each position of the grid.
+        """For each position of the grid, compute the mean power of the errors after adding a square there.
 
-        The error of each press is raised to the power `power`, and the weighted mean over the presses is computed.
+        The error of each press is raised to the power `power`. The result is the weighted mean over the presses.
 
         Args:
             other_squares: Indices of the grid positions of the other new squares of the layout, shape (n_new - 1,).
@@ -487,7 +487,7 @@ class _Exchange:
     def improve(self, layout: Integers) -> tuple[float, Integers]:
         """Move single squares until no such move improves the layout.
 
-        In each sweep, every square in turn is moved to the position of the grid with the smallest error of the layout.
+        In each sweep, every square in turn is moved to the grid position at which the error of the layout is smallest.
 
         Args:
             layout: Index of the grid position of each new square, shape (n_new,).

@@ -6,8 +6,9 @@ amplifier decays by a factor of e within the time tau. The output v of the ampli
     v[n] = exp(-dt / tau) v[n-1] + g (q[n] - q[n-1]) + b dt,
 
 where q is the charge of the film, g is the gain, b is the bias current, and dt is the time between two readings. The
-charge of the film is the sum of the touch charge and the pyroelectric charge. After the amplifier, the simulation
-applies the offset, hum, white noise, clipping and the rounding of the converter.
+charge of the film is the sum of the touch charge and the pyroelectric charge. To the output of the amplifier, the
+simulation adds an offset, hum and white noise. The output is finally clipped, and rounded to the codes of the
+converter.
 
 The response of a film with creep to a unit step of the touch charge is
 
@@ -18,9 +19,10 @@ to days. A Prony series with two terms per decade of time approximates the logar
 charge follows from Boltzmann's superposition principle. The exponential term describes the thermoelastic effect: the
 film cools when it is stretched, and then returns to its initial temperature.
 
-The noise levels `bench` and `surgery` contain plausible values of hum, offset, bias and mismatch for environments with
-weak or strong electrical interference. The values of these noise levels were not measured. The noise levels `clean` and
-`reference` contain only noise without memory, which the module `measuring_chain.noise` describes.
+The noise levels `bench` and `surgery` contain plausible values of the hum, the offset, the bias current and the
+mismatch for environments with weak or strong electrical interference. The values of `bench` and `surgery` were not
+measured. The noise levels `clean` and `reference` contain only noise that does not depend on earlier readings. The
+module `measuring_chain.noise` describes this noise.
 """
 
 import math
@@ -63,7 +65,7 @@ PositiveOrInfinite = Annotated[float, Meta(gt=0.0, description="a positive numbe
 class Amplifier:
     """Parameters of a simulated measuring chain with any number of channels.
 
-    The bounds that the types of the parameters state are checked only when the parameters are read from a file.
+    The types of the parameters state bounds, which are checked only when the parameters are read from a file.
 
     Attributes:
         noise: Noise of each reading, which does not depend on earlier readings.
@@ -194,11 +196,11 @@ class Measurement:
         # Draw correlated temperatures of the air and the film. The temperature of the film has the standard deviation
         # `temperature_rms`. The film responds to the air as a low-pass filter, which multiplies the standard deviation
         # of the temperature by the factor `correlation`. This factor is also the correlation of the two temperatures.
-        common, independent = amplifier.temperature_rms * self.rng.standard_normal(2)
+        common_draw, independent_draw = amplifier.temperature_rms * self.rng.standard_normal(2)
         variance_ratio = self._variance_ratio
         correlation = math.sqrt(variance_ratio)
-        self._air_temperature = common / correlation
-        self._film_temperature = correlation * common + math.sqrt(1.0 - variance_ratio) * independent
+        self._air_temperature = common_draw / correlation
+        self._film_temperature = correlation * common_draw + math.sqrt(1.0 - variance_ratio) * independent_draw
 
         # There is no touch before the measurement, so the film has only its pyroelectric charge.
         self._film_charge = self.pyro_charge_per_K * self._film_temperature
@@ -217,8 +219,8 @@ class Measurement:
     def __call__(self, charge: Array, charge_per_K: Array | None = None) -> Array:
         """Simulate the readings of the next block of touch charges.
 
-        The simulation applies the effects of the film, the amplifiers, the hum, the noise and the converter in this
-        order. The state of the measuring chain at the end of the block is stored for the next block.
+        The simulation applies the effects of the film, the amplifiers, the hum, the noise and the converter one after
+        the other. The state of the measuring chain at the end of the block is stored for the next block.
 
         Args:
             charge: Touch charges, shape (n, electrodes), pC.
@@ -363,13 +365,13 @@ class Measurement:
         """
         limit = self.amplifier.limit
         bits = self.amplifier.bits
-        clipped = np.clip(output, -limit, limit)
+        clipped_output = np.clip(output, -limit, limit)
         if not bits:
-            return clipped
+            return clipped_output
 
         # The converter has 2^bits codes for the range from -limit to limit.
         charge_per_code = 2.0 * limit / 2**bits
         lowest_code = -(2 ** (bits - 1))
         highest_code = 2 ** (bits - 1) - 1
-        codes = np.clip(np.round(clipped / charge_per_code), lowest_code, highest_code)
+        codes = np.clip(np.round(clipped_output / charge_per_code), lowest_code, highest_code)
         return np.asarray(codes * charge_per_code)

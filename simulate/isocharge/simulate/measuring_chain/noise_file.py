@@ -127,7 +127,8 @@ def load_amplifier(level: str) -> Amplifier:
 def noise_model(level: str) -> NoiseModel:
     """Return the built-in noise model of a level, or a noise model that is described in a TOML file.
 
-    If the file describes a complete measuring chain, only the part of its noise without memory is returned.
+    If the file describes a complete measuring chain, only the noise that does not depend on earlier readings is
+    returned.
 
     Example of a file:
 

@@ -1,12 +1,12 @@
-"""Energy of the pressure on the whole film, which consists of a static pressure and the pressure of trapped air.
+"""Energy of a static pressure on the film, and energy of the air that is trapped behind the film.
 
 Let V0 be the volume of the closed cavity behind the film, and let p0 be the pressure of the atmosphere. If the film
 displaces the volume V at constant temperature, the pressure of the trapped air rises by p0 V0 / (V0 - V) - p0 (Boyle's
 law). The energy of the trapped air is -p0 V0 (ln(1 - V / V0) + V / V0).
 
-Both pressures act perpendicular to the undeformed film and on its undeformed area, as in the theory of plates. In the
-units of `mechanics.scaling`, the ratio V / V0 is the integral of the deflection W over the film, multiplied by the
-dimensionless group `compression`.
+As in the theory of plates, the static pressure and the pressure of the air act perpendicular to the undeformed film,
+and on its undeformed area. In the units of `mechanics.scaling`, the ratio V / V0 is the integral of the deflection W
+over the film, multiplied by the dimensionless group `compression`.
 """
 
 from functools import cached_property
@@ -40,11 +40,11 @@ class BackPressure:
 
     @cached_property
     def weights(self) -> Array:
-        """Weights of the nodes in the integral of the deflection over the meshed part of the film, shape (n_node,)."""
+        """Weights with which nodal deflections are integrated over the meshed part of the film, shape (n_node,)."""
         return self.geometry.gather(self.geometry.mass)
 
     def energy(self, deflection: Array) -> float:
-        """Compute the energy of both pressures on the meshed part of the film.
+        """Compute the energy of the static pressure and of the trapped air for the meshed part of the film.
 
         The energy of the whole film is the energy of the trapped air minus the work of the static pressure. The energy
         of the meshed part is the energy of the whole film divided by the number of copies of the mesh that cover the

@@ -5,7 +5,7 @@ The potential energy of the film is
     Pi = stretching energy + bending energy + pressure energy - load * mean(W) - dot(side load, mean(U1, U2)).
 
 The two means are taken over the footprint of the probe and weighted with the pressure of the probe. The module
-`mechanics.back_pressure` computes the pressure energy, which belongs to the pressure on the whole film.
+`mechanics.back_pressure` computes the pressure energy, which is the energy of a static pressure and of trapped air.
 
 The energy is a function of the scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3). Lengths are in units
 of the film radius a. The displacements w and u, and the Green-Lagrange strain E, are
@@ -15,11 +15,11 @@ of the film radius a. The displacements w and u, and the Green-Lagrange strain E
 where A is the amplitude of the press, which the module `mechanics.scaling` computes. The expression in brackets is the
 scaled strain E'. The scaled strain is of order one for every force.
 
-The stress follows from Saint-Venant-Kirchhoff elasticity in plane stress as S = E_young A^2 (C : E' + tau I). In this
-formula, C is the elasticity matrix divided by Young's modulus, tau is the scaled pretension, and I is the unit tensor.
-Energies are in units of E_young h a^2 A^4, where h is the thickness of the film. For an anisotropic film, a matrix is
-added to C, and a deviator is added to tau I (`scaling.Anisotropy`). The bending stiffness is always computed for an
-isotropic film.
+The stress follows from Saint-Venant-Kirchhoff elasticity in plane stress as S = E_young A^2 (C : E' + tau I). Here, C
+is the elasticity matrix divided by Young's modulus, tau is the scaled pretension, and I is the unit tensor. Energies
+are in units of E_young h a^2 A^4, where h is the thickness of the film. For an anisotropic film, a matrix is added to
+C, and a deviator is added to tau I (`scaling.Anisotropy`). The bending stiffness is always computed for an isotropic
+film.
 """
 
 from dataclasses import replace
@@ -73,7 +73,7 @@ class ElasticFilm:
         return self.groups.side_load != (0.0, 0.0)
 
     def energy(self, field: Array) -> float:
-        """Compute the potential energy of a field, which is the stored energy minus the work of the probe.
+        """Compute the potential energy of a field as the stored energy minus the work of the probe.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
@@ -91,7 +91,7 @@ class ElasticFilm:
         return stored_energy - work
 
     def residual(self, field: Array) -> Array:
-        """Compute the gradient of the potential energy, which is the internal minus the external force at each node.
+        """Compute the gradient of the potential energy: the internal force minus the external force at each node.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
@@ -124,7 +124,7 @@ class ElasticFilm:
         return self.groups.load * float(np.linalg.norm(self.geometry.load))
 
     def work(self, field: Array) -> float:
-        """Compute the magnitude of the work of the probe, or of the static pressure if there is no probe.
+        """Compute the magnitude of the work that the probe does, or that the static pressure does if there is no probe.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
@@ -134,7 +134,7 @@ class ElasticFilm:
         return self.groups.load * abs(float(self.geometry.load @ field[:, 2]))
 
     def in_plane_scale(self, field: Array) -> float:
-        """Compute the norm of the in-plane forces of the elements, by which the in-plane residual is divided.
+        """Compute the norm of the in-plane forces of the elements, which scales the in-plane residual.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
@@ -165,8 +165,8 @@ class Membrane:
 
     The energy is integral( E' : C : E' / 2 + tau (tr E' - div U) ), where E' is the scaled strain, C is the elasticity
     matrix, tau is the scaled pretension and U is the in-plane displacement. The integral of div U over a clamped film
-    is zero. The term div U is nevertheless subtracted from tr E', because the rounding errors of this term would
-    dominate all other terms for a large pretension.
+    is zero. The term div U is nevertheless subtracted from tr E', because its rounding errors would otherwise exceed
+    all other terms if the pretension is large.
 
     The scaled deformation gradient F has the components F_ia = d_ia + A^2 U_i,a for i = 1, 2, and F_3a = W,a. The
     symbol d_ia is the Kronecker delta, and an index after a comma denotes a derivative. If v is a test displacement
@@ -189,7 +189,7 @@ class Membrane:
 
     @property
     def _deviator(self) -> Array | None:
-        """Pretension minus its mean in units of E_young A^2, shape (2, 2). None if the pretension is isotropic."""
+        """Pretension minus its mean, in units of E_young A^2, shape (2, 2). None if the pretension is isotropic."""
         return None if self.groups.anisotropy is None else _symmetric_matrix(self.groups.anisotropy.tension)
 
     def _elastic_stress(self, scaled_strain: Array) -> Array:
@@ -240,8 +240,8 @@ class Membrane:
     def energy(self, field: Array) -> float:
         """Compute the stretching energy integral( E' : C : E' / 2 + tau (tr E' - div U) ) of a field.
 
-        In this formula, E' is the scaled strain, C is the elasticity matrix, tau is the scaled pretension, and U is the
-        in-plane displacement.
+        Here, E' is the scaled strain, C is the elasticity matrix, tau is the scaled pretension, and U is the in-plane
+        displacement.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
@@ -290,7 +290,7 @@ class Membrane:
         return np.asarray(transposed_gradient @ stacked_traction)
 
     def tangent(self, field: Array) -> Array:
-        """Compute the second derivatives of the stretching energy of the elements.
+        """Compute the second derivatives of the stretching energy of each element.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
@@ -330,7 +330,7 @@ class Membrane:
         return matrix.transpose(0, 2, 1, 4, 3)  # the node before the component
 
     def _material_block(self, deformation: Array, i: int, j: int) -> Array:
-        """Compute second derivatives of the elastic energy density with respect to slopes of two components.
+        """Compute the second derivatives of the elastic energy density with respect to the slopes of two components.
 
         The result is the product B_i C B_j', where C is the elasticity matrix. The matrix B_i contains the derivatives
         of the strain (E11, E22, 2 E12) with respect to the slopes of component i. For the isotropic part of C, the
@@ -383,9 +383,9 @@ class Bending:
         integral( m phi ) = -integral( dot(grad W, grad phi) )   for every basis function phi.
 
     This definition also clamps the slope at the rim, because it includes the basis functions on the rim (Ciarlet and
-    Raviart 1974). The integral on the left is computed with the Gauss-Lobatto rule of the nodes. Therefore the matrix M
-    of this integral is diagonal. The Laplacian is then m = -M^-1 L W, where L is the matrix of the integral on the
-    right. The bending energy is beta / 2 * W L^T M^-1 L W.
+    Raviart 1974). The integral of m phi is computed with the Gauss-Lobatto rule of the nodes. With the Gauss-Lobatto
+    rule, the matrix M of the integral is diagonal. The Laplacian is therefore m = -M^-1 L W, where L is the matrix of
+    the integral of dot(grad W, grad phi). The bending energy is beta / 2 * W L^T M^-1 L W.
 
     The matrix L^T M^-1 L couples elements that do not touch each other. In order to keep the matrix sparse, the linear
     solves have an additional unknown mu = sqrt(beta) M^-1 (L - s M) W at each node. The linear system for a right-hand
@@ -395,10 +395,10 @@ class Bending:
         [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0],
 
     where K is the matrix without bending and s is a shift. The solution W does not depend on the shift, because the
-    Schur complement is K + beta L^T M^-1 L for every shift. The lowest eigenvalue of the film is 5.78. If the shift
-    lies between 0 and twice the lowest eigenvalue, the first block is positive definite. The first block is positive
-    definite even if K is zero, as in a thick film without tension. The complete matrix is then quasi-definite and needs
-    no pivoting (Vanderbei 1995).
+    Schur complement is K + beta L^T M^-1 L for every shift. The lowest eigenvalue of the negative Laplacian on the film
+    is 5.78. If the shift lies between 0 and twice the lowest eigenvalue, the first block of the matrix is positive
+    definite. The first block is positive definite even if K is zero, as in a thick film without tension. The complete
+    matrix is therefore quasi-definite, and can be factorised without pivoting (Vanderbei 1995).
     """
 
     def __init__(self, geometry: Geometry, stiffness: float) -> None:

@@ -1,14 +1,14 @@
-"""Change of the pretension of a film by the temperatures of the film and of the ring in which it is clamped.
+"""Change of the pretension that results from temperature changes of the film and of its ring.
 
 A film that is clamped in a ring cannot expand freely. If the film becomes warmer by dT and the ring by dR, the elastic
 strain along axis i of the film changes by
 
     strain_i = ring_expansion * dR - expansion_i * dT.
 
-The pretension changes by the stress of this strain, which follows from the plane-stress stiffness of the film. A drawn
-film expands more across the drawn direction than along this direction. Therefore its tension becomes uneven. The
-temperature of a thin film follows the temperature of the air within seconds. The ring needs many minutes to reach the
-temperature of the air.
+The pretension changes by the stress that this change of the strain causes. The stress follows from the plane-stress
+stiffness of the film. A drawn film expands more across the drawn direction than along the drawn direction. The tension
+of a drawn film therefore becomes uneven. The temperature of a thin film follows the temperature of the air within
+seconds. The ring needs many minutes to reach the temperature of the air.
 """
 
 from dataclasses import replace
@@ -26,7 +26,7 @@ def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> 
     """Compute by how much the pretension changes if the temperatures of the film and of its ring change.
 
     The elastic strain of the clamped film is the expansion of the ring minus the free expansion of the film. The change
-    of the pretension is the stress of this strain.
+    of the pretension is the stress that corresponds to the elastic strain.
 
     Args:
         film: The film. If the film has no expansion coefficients, the result is zero.
@@ -48,7 +48,7 @@ def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> 
 
 
 def warmed(sensor: Sensor, film_warming_K: float, ring_warming_K: float = 0.0) -> Sensor:
-    """Return a copy of the sensor with the pretension that the film has at other temperatures of film and ring.
+    """Return a copy of the sensor with the pretension at other temperatures of the film and its ring.
 
     Args:
         sensor: The sensor at the temperatures for which it is described.

@@ -8,10 +8,10 @@ to
     (pretension / E) A      for a membrane with a large pretension,
     16 pi b A               for a plate, with b = (h / a)^2 / (12 (1 - poisson^2))
 
-(Schwerin 1929; Timoshenko and Woinowsky-Krieger 1959, art. 19). The amplitude A is defined as the solution of the cubic
-equation in which the sum of the three terms is equal to F / (E h a). The amplitude is also a good approximation between
-the three limiting cases. The in-plane displacement is proportional to A^2. If the deflection is divided by a A, the
-scaled deflection is of order one, and only the ratios of the three terms remain as parameters of the press.
+(Schwerin 1929; Timoshenko and Woinowsky-Krieger 1959, art. 19). The amplitude A is the solution of a cubic equation, in
+which the sum of the three terms equals F / (E h a). Between the three limiting cases, the cubic equation is a good
+approximation. The in-plane displacement is proportional to A^2. If the deflection is divided by a A, the scaled
+deflection is of order one, and only the ratios of the three terms remain as parameters of the press.
 """
 
 from dataclasses import dataclass, replace
@@ -201,7 +201,7 @@ class DimensionlessGroups:
 
 
 def scaled_stress(scaled_strain: Array, groups: DimensionlessGroups) -> Array:
-    """Compute the scaled stress of a scaled strain with the elasticity of the film.
+    """Compute the scaled stress that belongs to a scaled strain, with the elasticity of the film.
 
     Args:
         scaled_strain: Scaled strain (E11, E22, 2 E12), shape (..., 3), in units of A^2.
@@ -242,7 +242,7 @@ def _anisotropy(film: Film, squared_amplitude: float, angle: float) -> Anisotrop
 
 
 def orthotropic_moduli(film: Film) -> Array:
-    """Compute the elasticity matrix of a film minus the elasticity matrix of an isotropic film.
+    """Compute the difference between the elasticity matrix of a film and that of an isotropic film.
 
     Both matrices are divided by Young's modulus E, and refer to the axes of the film. The moduli along the two axes are
     E1 = E r and E2 = E / r, where r is the square root of E1 / E2.

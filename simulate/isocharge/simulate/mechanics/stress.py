@@ -52,7 +52,7 @@ def strain(slopes: Array, squared_amplitude: float) -> Array:
 
 
 def stress(strain: Array, poisson: float, moduli: Array | None = None) -> Array:
-    """Compute the plane stress of a strain by Hooke's law, without the pretension.
+    """Compute the plane stress that a strain causes according to Hooke's law, without the pretension.
 
     Args:
         strain: Strain (E11, E22, 2 E12), shape (..., 3).

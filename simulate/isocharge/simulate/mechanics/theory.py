@@ -1,4 +1,4 @@
-"""Choice of the theory of the film, and estimates of the errors that are caused by the omitted terms of a theory.
+"""Choice of the theory of the film, and estimates of the errors that the omitted terms of a theory cause.
 
 All theories are special cases of one formulation with two optional terms.
 
@@ -8,7 +8,8 @@ sqrt(D / N), where D is the bending stiffness and N is the tension force per len
 tension are small, the bending stiffness carries the load.
 
 The second term is *stretching*, the effect of the induced stress on the deflection. Without stretching, the deflection
-is a linear function of the force. The charges are then computed from the linear deflection in a second step.
+is a linear function of the force. In a theory without stretching, the charges are computed from the deflection in a
+second step.
 
 All theories include the pretension. The two terms and the pretension determine the name of a theory::
 
@@ -102,13 +103,13 @@ def bending_length(film: Film, force: float) -> float:
 
 
 def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
-    """Estimate the relative change of a charge that is caused by the bending of the film at the footprint.
+    """Estimate by how much the bending of the film at the footprint changes a charge, relative to the charge.
 
-    The change is proportional to the squared ratio of the bending length to the reach R of the footprint. The tension
-    at the footprint is the sum of the pretension and the induced stress S. The induced stress is estimated for a
-    membrane without pretension. If w' is the slope of the membrane at the footprint, the stress is S = E w'^2 / 2. The
-    vertical force at the footprint is 2 pi R h S w' = F. These two equations result in w'^3 = F / (pi R h E). If the
-    induced stress is much larger than the pretension, bending hardly changes the charges.
+    The estimated change is proportional to the squared ratio of the bending length to the reach R of the footprint. The
+    tension at the footprint is the sum of the pretension and the induced stress S. The induced stress is estimated for
+    a membrane without pretension. If w' is the slope of the membrane at the footprint, the stress is S = E w'^2 / 2.
+    The vertical force at the footprint is 2 pi R h S w' = F. The equations for the stress and for the force result in
+    w'^3 = F / (pi R h E). If the induced stress is much larger than the pretension, bending hardly changes the charges.
 
     Args:
         film: The film, with Young's modulus E and thickness h.
@@ -156,7 +157,7 @@ def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
 
 
 def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
-    """Estimate the relative error of a charge that is caused by the terms that a theory omits.
+    """Estimate the relative error that the omitted terms of a theory cause in a charge.
 
     The error is the sum of an estimate for omitted stretching and an estimate for omitted bending. A theory with
     neither stretching nor bending cannot describe a film without pretension. A theory without bending cannot describe a

@@ -1,1 +1,1 @@
-"""Meshes of presses: their elements, the positions of the elements on the film, and the refinement along coats."""
+"""Meshes of presses, positions of the elements on the film, and refinement along the edges of a coat."""

@@ -1,21 +1,21 @@
-"""Elements of a mesh and their adjacency, which do not depend on the film and on the position of the probe.
+"""Elements of a mesh, which depend neither on the film nor on the position of the probe.
 
 The footprint of the probe contains a core polygon with n corners, and is enclosed by the innermost circle of the mesh.
 The mesh consists of three parts:
 
     1. The core polygon is divided into n quadrilaterals that meet at its centroid.
-    2. The area between the core polygon and the innermost circle is divided into one or two layers of 2 n blocks.
+    2. The area between the core polygon and the innermost circle is divided into one or two layers of 2 n blocks each.
     3. The area between the innermost circle and the rim of the film is divided into rings of 2 n sectors. If the film
-       resists bending, the rings at the rim are thin.
+       resists bending, the outermost rings are thin.
 
 The core polygon of a polygonal footprint is the footprint itself. The core polygon of a circular footprint is a square
-inside the footprint, and the innermost circle is the boundary of the footprint. Every other curved footprint has a core
-polygon and two layers of blocks. The first layer ends at the boundary of the footprint, and the second layer ends at
-the innermost circle. Each block can be divided into smaller elements.
+inside the footprint, and the innermost circle is the boundary of the footprint. The mesh of a curved footprint that is
+not circular has two layers of blocks. The first layer ends at the boundary of the footprint, and the second layer ends
+at the innermost circle. Each block can be divided into smaller elements.
 
-A press with a circular probe is symmetric about the line from the centre of the film to the probe. If the film is also
-symmetric about this line, only the upper half of the film is meshed. The class `Placement` computes the positions of
-the elements, and the class `Template` numbers their nodes.
+A press with a circular probe is symmetric about the line from the centre of the film to the probe. If the film is
+symmetric about the same line, only the upper half of the film is meshed. The class `Placement` computes the positions
+of the elements, and the class `Template` numbers their nodes.
 """
 
 from dataclasses import asdict, dataclass
@@ -66,7 +66,7 @@ class Blocks:
     Each element has two local coordinates from -1 to 1. The coordinate xi increases outwards, and the coordinate eta
     increases anticlockwise. The (order + 1)^2 nodes of an element are ordered first by eta and then by xi. The elements
     are ordered from the inside of the mesh to the outside. The elements of the core polygon come first, followed by the
-    elements of the layers, and by the elements of the rings.
+    elements of the layers and the elements of the rings.
 
     Attributes:
         resolution: Fineness of the mesh.
@@ -151,8 +151,9 @@ class Blocks:
     def core_outline(self) -> Array:
         """Points along the edges of the core polygon, shape (n_sector + 1, n_corner + 1).
 
-        Each point is described by the weights of the corners and of the centroid of the core polygon. The points are
-        ordered anticlockwise. The first point is the middle of the edge before the first corner.
+        Each point is a weighted sum of the corners and the centroid of the core polygon, and is described by its
+        weights. The points are ordered anticlockwise. The first point is the middle of the edge before the first
+        corner.
         """
         # Weights of the corners, and of the middle of the edge after each corner. The weights of a corner are 1 for the
         # corner itself, and 0 for all other corners and for the centroid.
@@ -172,11 +173,12 @@ class Blocks:
 
     @cached_property
     def inner_corner_weights(self) -> Array:
-        """Corners of the elements inside the innermost circle, shape (n_inner, 4, n_corner + 1).
+        """Weights that describe the corners of the elements inside the innermost circle.
 
-        The four corners of an element are the first and the last corner of its inner side, and the first and the last
-        corner of its outer side. Each corner is described by the weights of the corners and of the centroid of the core
-        polygon. The weights of a corner on a curved side are zero, because `Placement` adds the curved sides.
+        The shape is (n_inner, 4, n_corner + 1). The four corners of an element are the first and the last corner of its
+        inner side, and the first and the last corner of its outer side. Each corner is a weighted sum of the corners
+        and the centroid of the core polygon. The weights of a corner on a curved side are zero, because `Placement`
+        adds the curved sides.
         """
         core_elements = [
             self._core_element(corner, radial_index, angular_index)
@@ -196,8 +198,8 @@ class Blocks:
     def _core_element(self, corner: int, radial_index: int, angular_index: int) -> list[Array]:
         """Return the corners of one element of the core polygon.
 
-        The quadrilateral of a corner lies between this corner, the centroid of the core polygon, and the middles of
-        both adjacent edges. Each quadrilateral consists of n_half_edge * n_half_edge elements.
+        The quadrilateral of a corner lies between the corner, the centroid of the core polygon, and the middles of both
+        adjacent edges. Each quadrilateral consists of n_half_edge * n_half_edge elements.
 
         Args:
             corner: Index of the corner of the core polygon whose quadrilateral contains the element.
@@ -228,10 +230,10 @@ class Blocks:
         ]
 
     def rotated(self, steps: int, steps_per_turn: int) -> Integers:
-        """Return the indices of the elements after a rotation of the probe that maps the mesh onto itself.
+        """Return how the elements are renumbered by a rotation of the probe that maps the mesh onto itself.
 
-        The elements of the core polygon are numbered corner by corner. The sectors are numbered layer by layer, and
-        anticlockwise within each layer.
+        The elements of the core polygon are numbered corner by corner. The sectors are numbered layer by layer and ring
+        by ring, and anticlockwise within each layer or ring.
 
         Args:
             steps: Number of steps by which the probe is rotated.
@@ -251,7 +253,7 @@ class Blocks:
         return np.concatenate([rotated_core_elements.ravel(), rotated_sectors.ravel()])
 
     def into_meshed_half(self, points: Complexes) -> tuple[Complexes, Booleans]:
-        """Reflect film points into the upper half of the film if only this half is meshed.
+        """Reflect film points into the upper half of the film if only the upper half is meshed.
 
         Args:
             points: Film points x + iy, any shape.

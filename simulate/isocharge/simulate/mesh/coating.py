@@ -1,19 +1,19 @@
 """Stiffness of a film with a coat on some of its parts.
 
-The edges of the coat need not follow the sides of the elements. Displacement and traction are continuous across an edge
-of the coat, but the strain jumps. The jump of the strain is sym(a x n) = N a, where n is the normal of the edge, a is a
-vector, and N is a matrix that depends on the normal. Within a band along the edge, the bare film and the coated film
-are treated as a laminate whose layers have the normal n. This treatment is the method of composite voxels
-(Kabel, Merkert and Schneider 2015).
+The edges of the coat need not follow the sides of the elements. Across an edge of the coat, the displacement and the
+traction are continuous, but the strain jumps. The jump of the strain is sym(a x n) = N a, where n is the normal of the
+edge, a is a vector, and N is a matrix that depends on the normal. Within a band along the edge, the bare film and the
+coated film are treated as a laminate whose layers are perpendicular to n. This treatment is the method of composite
+voxels (Kabel, Merkert and Schneider 2015).
 
 Phase i of the laminate has the elasticity matrix C_i and the volume share f_i. If E is the mean strain of the laminate,
 the strain of phase i is
 
     E_i = E + N M_i^-1 (T E - N^T C_i E),   M_i = N^T C_i N,   T = (sum f_i M_i^-1)^-1 sum f_i M_i^-1 N^T C_i.
 
-The mean stress of the laminate is sum f_i C_i E_i. The energy and the charges therefore include the jump of the strain,
-although the jump lies within elements. The remaining error is proportional to (b / w)^2, where b is the width of the
-band and w is the width of the coat.
+The mean stress of the laminate is sum f_i C_i E_i. The energy and the charges therefore account for the jump of the
+strain, even where the edge of the coat crosses an element. The remaining error is proportional to (b / w)^2, where b is
+the width of the band and w is the width of the coat.
 """
 
 from dataclasses import dataclass
@@ -47,10 +47,10 @@ class Coating:
     layer_moduli: Array
 
     def near(self, points: Complexes) -> Booleans:
-        """Return a fast estimate of which points lie on the coat or near the coat.
+        """Estimate quickly which points lie on the coat or near the coat.
 
-        The result is true for all points on the coat and within the band. The result may also be true for other points
-        near the coat. The result is false for distant points.
+        The result is true for all points on the coat and for all points within the band along its edges. The result may
+        also be true for other points near the coat. The result is false for distant points.
 
         Args:
             points: Film points x + iy, any shape, in film radii.
@@ -75,7 +75,8 @@ class Coating:
     def film_strain(self, points: Complexes, mean_strain: Array) -> Array:
         """Compute the strain at points from the mean strain of the laminate.
 
-        Each point lies in one phase of the laminate. The strain at the point is the strain of this phase.
+        Each point lies in one phase of the laminate. The strain at a point is the strain of the phase that contains the
+        point.
 
         Args:
             points: Film points x + iy, shape (n,), in film radii.
@@ -93,8 +94,8 @@ class Coating:
     def _is_near(self, part: Complexes, points: Complexes) -> Booleans:
         """Return which points lie near a polygon.
 
-        A point is near if it lies within the circumscribed circle of the polygon, after the radius of this circle is
-        increased by the width of the band.
+        A point is near if it lies within a circle around the mean of the corners. The radius of the circle is the
+        largest distance of a corner from the mean, plus the width of the band.
 
         Args:
             part: Corners x + iy of the polygon, shape (n,), in film radii.
@@ -105,7 +106,7 @@ class Coating:
         return np.asarray(np.abs(points - centre) < polygon_radius + self.band_width)
 
     def _shares(self, points: Complexes) -> Array:
-        """Compute the share of a small disk around each point that is covered by each layer of the coat.
+        """Compute which share of a small disk around each point is covered by each layer of the coat.
 
         The diameter of the disk is the width of the band along the edges.
 
@@ -195,7 +196,7 @@ class Coating:
         return _Laminate(shares, moduli, strain)
 
     def _normal_matrix(self, points: Complexes) -> Array:
-        """Compute the matrix N that converts a jump of the displacement derivative across an edge into a strain jump.
+        """Compute the matrix N that converts the jump of the displacement derivative at an edge into the strain jump.
 
         Args:
             points: Film points x + iy, any shape, in film radii.

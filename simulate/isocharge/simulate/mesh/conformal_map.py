@@ -1,4 +1,4 @@
-"""Parameters of the conformal map that places a mesh on the film, and angles and depths of the sectors and rings.
+"""Parameters of the conformal map that places a mesh on the film, and positions of the sectors and rings.
 
 The conformal map is a disk automorphism, which the docstring of the module `placement` describes. All lengths are in
 film radii, and all angles are in radians.
@@ -37,7 +37,7 @@ BISECTION_STEPS = 40
 
 
 def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
-    """Compute the conformal map of the unit disk that maps a circle around the origin onto a given circle.
+    """Compute the disk automorphism that maps a circle around the origin onto a given circle.
 
     The map converts a point z into (z + c) / (1 + c z) with a parameter c. The circle around the origin has the radius
     rho. For points on the x axis, the map adds arctanh(c) to arctanh(z). The map must convert -rho and rho into the two
@@ -62,9 +62,9 @@ def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
 def distance_coordinate(distance: Array | float) -> Any:
     """Convert distances from the centre into the coordinate in which fields are interpolated between presses.
 
-    If a press is near the clamp, the fields change over the short distance between the press and the clamp. The
-    coordinate stretches this short distance. Polynomials in the coordinate therefore interpolate the fields accurately.
-    The conformal map of `placement` is a translation along this coordinate.
+    If a press is near the clamp, the fields change strongly within the short distance between the press and the clamp.
+    The coordinate stretches this short distance. Polynomials in the coordinate therefore interpolate the fields
+    accurately. The conformal map of the module `placement` is a translation along this coordinate.
 
     Args:
         distance: Distances of presses from the centre of the film, in film radii.
@@ -76,10 +76,10 @@ def distance_coordinate(distance: Array | float) -> Any:
 
 
 def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]:
-    """Compute a circle on the film that encloses each footprint with a gap.
+    """Compute for each footprint a circle on the film that encloses the footprint with a gap.
 
-    The centre of the circle is the centroid of the footprint if this circle keeps a minimum distance from the rim.
-    Otherwise the centre of the circle is shifted from the centroid towards the centre of the film. The smallest
+    The centre of the circle is the centroid of the footprint if the circle keeps a minimum distance from the rim. If
+    the circle would be too close to the rim, its centre is shifted towards the centre of the film. The smallest
     sufficient shift is found by bisection.
 
     Args:
@@ -110,7 +110,7 @@ def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]
 
 
 def _enclosing_radius(outline: Complexes, centre: Array) -> Array:
-    """Compute the radius of a circle with a given centre on the x axis that encloses a footprint with a gap.
+    """Compute the radius of a circle that encloses a footprint with a gap. The centre of the circle is given.
 
     Args:
         outline: Points x + iy along the boundary of each footprint, shape (..., n), in film radii.
@@ -128,12 +128,12 @@ def _enclosing_radius(outline: Complexes, centre: Array) -> Array:
 def sector_angles(
     blocks: Blocks, stops: Complexes, reach: Array, centroid: Array, centre: Array, radius: Array, c_rho: Array
 ) -> Array:
-    """Compute the angles of the sides of the sectors on the innermost circle.
+    """Compute the angles at which the sides of the sectors meet the innermost circle.
 
-    The sides of the sectors begin at the points at which rays from the centroid of the footprint meet the circle. The
-    directions of the rays are a compromise between equal angles and the directions of some points inside the circle,
-    which are called stops. If the gap between the stops and the circle is narrow, the rays must pass close to the
-    stops, because elements would fold otherwise.
+    The sides of the sectors begin at the points at which rays from the centroid of the footprint meet the circle. Some
+    points on the inner side of the last layer of blocks are called stops. The directions of the rays are a compromise
+    between evenly spaced directions and the directions of the stops. If the gap between the stops and the circle is
+    narrow, the rays must pass close to the stops, because elements would fold otherwise.
 
     Args:
         blocks: The elements.
@@ -216,10 +216,10 @@ def _ray_angles(blocks: Blocks, stops: Complexes, radius_ratio: Array) -> Array:
 
 
 def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
-    """Compute the angles of the sides of the sectors on the rim.
+    """Compute the angles at which the sides of the sectors meet the rim.
 
     The conformal map compresses the far side of the film, which lies at the angle pi. Therefore the sides of the
-    sectors are shifted towards the angle pi. The angles on the innermost circle already contain a part of this shift.
+    sectors are shifted towards the angle pi. The angles on the innermost circle already contain a part of the shift.
 
     Args:
         angle: Angles on the innermost circle in the template plane, shape (..., n_sector + 1), rad.
@@ -236,10 +236,10 @@ def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
 
 
 def stretch_angles(angle: Array, factor: Array) -> Array:
-    """Multiply the tangent of half of each angle by a factor.
+    """Change each angle such that the tangent of half of the angle is multiplied by a factor.
 
     For points on a circle of radius rho around the origin, the conformal map with the parameter c multiplies the
-    tangent by (1 - c rho) / (1 + c rho). On the rim, the radius rho is 1.
+    tangent of half of the angle by (1 - c rho) / (1 + c rho). On the rim, the radius rho is 1.
 
     Args:
         angle: Angles, shape (..., n), rad.
@@ -257,8 +257,8 @@ def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
     """Compute the depths of the edges of the rings, from 0 on the innermost circle to 1 on the rim.
 
     The depth of a point is ln(r / rho) / ln(1 / rho), where r is the distance of the point from the origin of the
-    template plane, and rho is the radius of the innermost circle. All rings except the thin rings at the rim have equal
-    depths. Each thin ring is a third as wide as the previous thin ring.
+    template plane, and rho is the radius of the innermost circle. All rings except the thin rings at the rim cover
+    equal ranges of depth. Each thin ring is a third as wide as the previous thin ring.
 
     Args:
         resolution: Fineness of the mesh.
@@ -283,7 +283,7 @@ def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
 
 
 def widest_layer(resolution: Resolution, c: Array, rho: Array) -> Array:
-    """Compute the largest total width of the thin rings for which `ring_edges` does not limit their depth.
+    """Compute the largest total width of the thin rings for which `ring_edges` does not limit their total depth.
 
     Args:
         resolution: Fineness of the mesh.
@@ -300,6 +300,6 @@ def widest_layer(resolution: Resolution, c: Array, rho: Array) -> Array:
 def _max_thin_depth(resolution: Resolution) -> float:
     """Return the largest allowed total depth of the thin rings.
 
-    This depth is the depth of each ring if all thin rings together count as one ring and all rings have equal depths.
+    If the thin rings have the largest allowed depth, all thin rings together are as deep as each of the other rings.
     """
     return 1.0 / (resolution.rings + 1)

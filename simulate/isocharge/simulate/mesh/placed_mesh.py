@@ -1,4 +1,7 @@
-"""Mesh of a press, which consists of a template, its position on the film, and integration rules for the elements."""
+"""Mesh of a press.
+
+The mesh consists of a template, the position of the template on the film, and integration rules for the elements.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -80,7 +83,7 @@ class Geometry:
 
     @classmethod
     def build(cls, template: Template, points: Complexes, pressure: Pressure | None = None) -> "Geometry":
-        """Compute the integration rules of a mesh, and the share of the force of the probe that acts on each node.
+        """Compute the integration rules of a mesh, and the share of the probe's force that acts on each node.
 
         Args:
             template: Template of the mesh.
@@ -119,14 +122,14 @@ class Geometry:
 
     @property
     def stacked(self) -> Array:
-        """Attribute `gradient` with a common axis for the points and both derivatives.
+        """The array `gradient`, in which one axis contains all points and both derivatives at each point.
 
         The shape is (n_element, n_point * 2, n_local).
         """
         return self.gradient.reshape(len(self.gradient), -1, self.gradient.shape[-1])
 
     def gather(self, contributions: Array) -> Array:
-        """Add the contributions of all elements at each node.
+        """Sum the contributions of all elements at each node.
 
         The contributions at a hanging node are distributed to the nodes that determine the value at the hanging node.
 
@@ -261,7 +264,10 @@ class PlacedMesh:
 
     @cached_property
     def _node_gradient(self) -> Array:
-        """Derivatives of the basis functions by (X1, X2) at the nodes, shape (n_element, n_local, 2, n_local)."""
+        """Derivatives of the basis functions with respect to (X1, X2) at the nodes of every element.
+
+        The shape is (n_element, n_local, 2, n_local).
+        """
         _, derivatives = tensor_basis(self.resolution.order, self.template.xi, self.template.eta)
         gradient, _ = _film_gradient(derivatives[:, None], self.points)
         return gradient
@@ -299,8 +305,8 @@ def place(
 def to_oval(points: Complexes, oval: complex) -> Complexes:
     """Convert points of a circular film into points of an oval film.
 
-    Each point is displaced in the radial direction. Points within `UNDEFORMED_RADIUS` remain unchanged. At the rim, the
-    displacement divided by the radius is e cos(2 (angle - alpha)) in the direction `angle`.
+    Each point is displaced in the radial direction. Points within `UNDEFORMED_RADIUS` remain unchanged. The point of
+    the rim in the direction `angle` is displaced by e cos(2 (angle - alpha)) film radii.
 
     Args:
         points: Points x + iy of the circular film, any shape, in film radii.
@@ -344,8 +350,9 @@ def from_oval(points: Complexes, oval: complex) -> Complexes:
 
 
 def _displacement_ratio(radius: Array) -> Array:
-    """Compute the ratio of the relative displacement at a radius to the relative displacement of the rim.
+    """Compute the relative displacement at a radius, divided by the relative displacement of the rim.
 
+    A relative displacement is a displacement divided by the radius of the displaced point.
     The ratio increases with the third power of the distance from `UNDEFORMED_RADIUS`, and is 1 at the rim.
 
     Args:
@@ -408,7 +415,7 @@ class _Jacobian(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _quadrature(order: int) -> _Quadrature:
-    """Return the integration rules of elements of a given order.
+    """Return the integration rules for elements of a given polynomial order.
 
     The first rule uses the Gauss points of an element, and the second rule uses its nodes (Gauss-Lobatto rule).
 

@@ -1,4 +1,4 @@
-"""Positions of the elements of a mesh on the film for a given position of the probe.
+"""Positions of the elements on the film for a given position of the probe.
 
 The positions of the rings follow from a conformal map of the unit disk onto itself,
 
@@ -12,11 +12,11 @@ of the film. The map converts circles into circles. With the parameters
 the map converts the circle |z| = rho into the circle with the radius R and the centre p, which is the innermost circle
 of the mesh.
 
-Inside the innermost circle, the points of an element are interpolated linearly between its inner and its outer side.
-The sides of the elements lie on the core polygon, on the boundary of the footprint and on the innermost circle. The
-edges of a polygonal footprint remain straight, so the load is integrated exactly over the footprint. The values of
-fields at the nodes are smooth functions of the position of the probe. The module `point_location` finds the element
-that contains a film point.
+Inside the innermost circle, the points of an element are interpolated linearly between the inner and the outer side of
+the element. The sides of the elements lie on the core polygon, on the boundary of the footprint and on the innermost
+circle. The edges of a polygonal footprint remain straight, so the load is integrated exactly over the footprint. The
+values of fields at the nodes are smooth functions of the position of the probe. The module `point_location` finds the
+element that contains a film point.
 """
 
 from collections.abc import Callable
@@ -43,7 +43,7 @@ CHECKED_ORIENTATIONS = 12
 
 @dataclass(frozen=True)
 class Placement:
-    """Position of a template on the film. The arrays may have additional leading axes for several placements.
+    """Position of a template on the film. An object can contain several placements in leading axes of its arrays.
 
     Attributes:
         c: Parameter of the conformal map, shape (...).
@@ -288,11 +288,11 @@ def _unit_coordinates(blocks: Blocks) -> tuple[Array, Array]:
 
 
 def widest_smooth_layer(mesh: Blocks, probe: Probe, distance: float, film_radius: float) -> float:
-    """Compute the largest width of the thin rings for which the mesh is a smooth function of the position of the press.
+    """Compute the largest width of the thin rings with which the mesh changes smoothly with the position of the press.
 
-    If the press is near the rim, the function `ring_edges` limits the depth of wider thin rings. The positions of the
-    nodes, as functions of the distance of the press from the centre, would then have a kink. A polynomial in the
-    distance would therefore interpolate the fields inaccurately.
+    For presses near the rim, the function `ring_edges` limits the total depth of the thin rings. As functions of the
+    distance of the press from the centre, the positions of the nodes have a kink where the limit takes effect. If the
+    limit takes effect, polynomials in the distance therefore interpolate the fields inaccurately.
 
     Args:
         mesh: Template of the mesh.

@@ -1,7 +1,7 @@
 """Search for the elements that contain given film points.
 
-The elements of points outside the innermost circle are computed by closed formulas. The local coordinates of points
-inside the innermost circle are computed by Newton's method. The docstring of the module `placement` describes the
+For points outside the innermost circle, the elements are computed by closed formulas. For points inside the innermost
+circle, the local coordinates are computed by Newton's method. The docstring of the module `placement` describes the
 positions of the elements on the film.
 
 In this module, each element has two local coordinates from 0 to 1. The radial coordinate increases from the inner side
@@ -70,7 +70,7 @@ class QuadCorners(NamedTuple):
     def of_elements(self, element: Integers) -> "QuadCorners":
         """Select the corners of one element for each point.
 
-        The arrays of this object must have the shape (n_point, n_element), with one row of elements for each point.
+        The arrays of the object must have the shape (n_point, n_element), with one row of elements for each point.
 
         Args:
             element: Index of the element of each point, shape (n_point,).
@@ -196,8 +196,8 @@ def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> t
 
     The signed distance of a point from a side of an element is positive if the point and the element lie on the same
     side of the straight line through this side. Therefore the smallest of the four distances is positive for points
-    inside an element with straight sides. Each point is assigned to the element for which the smallest distance is
-    largest.
+    inside an element with straight sides. Each point is assigned to the element for which the smallest of its four
+    distances is largest.
 
     Args:
         placement: n placements, one for each point.
@@ -249,12 +249,12 @@ def _correct_sectors(
     radial: Array,
     angular: Array,
 ) -> None:
-    """Assign points that lie outside their element to another sector of the same layer.
+    """Reassign points that lie outside their element to another sector of the same layer.
 
-    The straight lines through the sides of two sectors may cross outside the elements. A point may then lie between the
-    lines of a sector that does not contain the point. For elongated probes near the rim, some points are assigned to a
-    wrong sector for this reason. The function tries the neighbouring sectors on both sides, then the next neighbours,
-    and so on.
+    The straight lines through the sides of two sectors may cross outside the elements. A point may therefore lie
+    between the lines of a sector that does not contain the point. For elongated probes near the rim, some points are at
+    first assigned to a wrong sector. The function tries the neighbouring sectors on both sides, then the next
+    neighbours, and so on.
 
     Args:
         placement: n placements, one for each point.
@@ -295,7 +295,7 @@ def _correct_sectors(
 def _inner_corners(placement: Placement, blocks: Blocks) -> QuadCorners:
     """Compute the corners of all elements inside the innermost circle.
 
-    Corners on straight sides are weighted sums of the corners and the centroid of the core polygon. The other corners
+    Corners on straight sides are weighted sums of the corners and the centroid of the core polygon. All other corners
     lie on the innermost circle or on the boundary of the footprint.
 
     Args:
@@ -329,8 +329,8 @@ def _local_coordinates(
 ) -> tuple[Array, Array]:
     """Compute the local coordinates of points in given elements inside the innermost circle by Newton's method.
 
-    The film point with the coordinates (radial, angular) is (1 - radial) * inner(angular) + radial * outer(angular). In
-    this formula, inner and outer are the two sides of the element as functions of the angular coordinate.
+    The film point with the coordinates (radial, angular) is (1 - radial) * inner(angular) + radial * outer(angular).
+    The functions inner and outer describe the two sides of the element by the angular coordinate.
 
     Args:
         placement: n placements, one for each point.
@@ -401,7 +401,7 @@ def _sides(placement: Placement, blocks: Blocks, element: Integers, corners: Qua
 
 
 def _circle_in_sector(placement: Placement, sector: Integers, angular: Array) -> tuple[Complexes, Complexes]:
-    """Compute points of the innermost circle and their derivatives with respect to the angular coordinate.
+    """Compute points of the innermost circle, and the derivatives of the points with respect to the angular coordinate.
 
     Args:
         placement: n placements, one for each point.
@@ -427,7 +427,7 @@ def _circle_in_sector(placement: Placement, sector: Integers, angular: Array) ->
 def _boundary_in_sector(
     placement: Placement, blocks: Blocks, sector: Integers, angular: Array
 ) -> tuple[Complexes, Complexes]:
-    """Compute boundary points of a curved footprint and their derivatives with respect to the angular coordinate.
+    """Compute boundary points of a curved footprint, and the derivatives with respect to the angular coordinate.
 
     Args:
         placement: n placements, one for each point.

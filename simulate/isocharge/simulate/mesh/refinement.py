@@ -136,9 +136,9 @@ class RefinedTemplate(Template):
     def to_split_elements(self, element: Integers, xi: Array, eta: Array) -> tuple[Integers, Array, Array]:
         """Convert positions in the original elements into positions in the split elements.
 
-        All split elements of one size are cells of a regular grid in their original element. Each cell has a unique
-        code. For each size, the code of the cell that contains a point is searched for among the codes of the elements
-        of this size.
+        All split elements of one size are cells of a regular grid in the original element. Each cell has a unique code.
+        For each size, the method computes the code of the cell that contains a point, and searches for an element of
+        this size with the same code.
 
         Args:
             element: Index of the original element of each point, shape (n,).
@@ -233,20 +233,20 @@ class RefinedTemplate(Template):
         """
         order = self.resolution.order
         sources = self._hanging_node_sources(points)
-        hanging = np.array(list(sources), dtype=np.intp)
-        regular = np.setdiff1d(np.arange(self.n_node), hanging)
+        hanging_nodes = np.array(list(sources), dtype=np.intp)
+        regular_nodes = np.setdiff1d(np.arange(self.n_node), hanging_nodes)
 
         # The row of a regular node has a single weight of 1. The row of a hanging node has order + 1 weights, one for
         # each node on the side of the larger element.
-        row = np.concatenate([regular, np.repeat(hanging, order + 1)])
-        column = np.concatenate([regular, *(source.nodes for source in sources.values())])
-        weight = np.concatenate([np.ones(regular.size), *(source.weights for source in sources.values())])
+        row = np.concatenate([regular_nodes, np.repeat(hanging_nodes, order + 1)])
+        column = np.concatenate([regular_nodes, *(source.nodes for source in sources.values())])
+        weight = np.concatenate([np.ones(regular_nodes.size), *(source.weights for source in sources.values())])
         direct_dependence = csr_array((weight, (row, column)), shape=(self.n_node, self.n_node))
 
         # A hanging node may depend on another hanging node. Substitute the dependence until all columns that are used
         # belong to regular nodes.
         constraint = direct_dependence
-        while np.isin(constraint.indices, hanging).any():
+        while np.isin(constraint.indices, hanging_nodes).any():
             constraint = direct_dependence @ constraint
             constraint.eliminate_zeros()
         return constraint
@@ -254,9 +254,9 @@ class RefinedTemplate(Template):
     def _hanging_node_sources(self, points: Complexes) -> dict[int, _HangingNodeSource]:
         """Find the hanging nodes, and the nodes that determine the values at the hanging nodes.
 
-        A side of a large element may be adjacent to 2, 4, 8 or more smaller elements. For each of these numbers, the
-        method computes the positions on the side at which the smaller elements would have nodes. A node at such a
-        position is a hanging node, unless the node belongs to the large element.
+        A side of a large element may be adjacent to 2, 4, 8 or more smaller elements. For each possible number of
+        smaller elements, the method computes the positions on the side at which the smaller elements would have nodes.
+        A node at such a position is a hanging node, unless the node belongs to the large element.
 
         Args:
             points: Film points x + iy of the nodes of all elements under the sample press, shape
@@ -292,17 +292,17 @@ class RefinedTemplate(Template):
             # Find the nodes at these film points. The returned distance is infinite where there is no node.
             coordinates = np.stack([candidate_points.real, candidate_points.imag], axis=-1)
             distance, nearest_node = node_tree.query(coordinates, distance_upper_bound=NODE_TOLERANCE)
-            for element, side, position in np.argwhere(np.isfinite(distance)):
-                node = int(nearest_node[element, side, position])
-                side_nodes = nodes_on_sides[element, side]
+            for element_index, side_index, candidate_index in np.argwhere(np.isfinite(distance)):
+                node = int(nearest_node[element_index, side_index, candidate_index])
+                side_nodes = nodes_on_sides[element_index, side_index]
                 is_node_of_large_element = node in side_nodes
                 if not is_node_of_large_element:
-                    sources[node] = _HangingNodeSource(side_nodes, weights[position])
+                    sources[node] = _HangingNodeSource(side_nodes, weights[candidate_index])
         return sources
 
 
 def _tree(points: Complexes) -> cKDTree:
-    """Create a search tree for the nearest neighbours among points x + iy, shape (n,)."""
+    """Create a tree that finds the nearest neighbours among points x + iy, shape (n,)."""
     return cKDTree(np.stack([points.real, points.imag], axis=1))
 
 
@@ -324,8 +324,8 @@ def _number_points(points: Complexes) -> tuple[int, Integers]:
 def refine(mesh: PlacedMesh, lines: Complexes, max_side: float) -> PlacedMesh:
     """Split the elements of a mesh along lines, until the elements on the lines are small enough.
 
-    An element is split if its longest side exceeds `max_side` and its middle is close to a line (`GRADING`). Each long
-    side of the element is halved. Short sides are not halved (`MIN_SIDE_RATIO`).
+    An element is split if the longest side exceeds `max_side` and the middle of the element is close to a line
+    (`GRADING`). Each long side of the element is halved. Short sides are not halved (`MIN_SIDE_RATIO`).
 
     Args:
         mesh: Mesh of a whole film.
@@ -345,10 +345,10 @@ def refine(mesh: PlacedMesh, lines: Complexes, max_side: float) -> PlacedMesh:
         corners, middle = _corners_and_middle(mesh, parent, low, size)
         side_length = np.abs(np.roll(corners, -1, axis=1) - corners)  # along xi, eta, xi and eta, shape (n_element, 4)
         length = np.maximum(side_length[:, :2], side_length[:, 2:])  # along xi and along eta, shape (n_element, 2)
-        longest = length.max(axis=1)
+        longest_side = length.max(axis=1)
         distance, _ = line_tree.query(np.stack([middle.real, middle.imag], axis=1))
-        is_too_large = (longest > max_side) & (distance < GRADING * longest)
-        is_split = is_too_large[:, None] & (length > MIN_SIDE_RATIO * longest[:, None])
+        is_too_large = (longest_side > max_side) & (distance < GRADING * longest_side)
+        is_split = is_too_large[:, None] & (length > MIN_SIDE_RATIO * longest_side[:, None])
         if not is_split.any():
             break
 

@@ -1,4 +1,7 @@
-"""Mesh templates, which contain the elements and the numbers of their nodes for all positions of a probe."""
+"""Mesh templates, which contain the elements of a mesh and the numbers of the nodes.
+
+A template is the same for all positions of a probe.
+"""
 
 from functools import lru_cache
 from typing import Self
@@ -46,7 +49,7 @@ class Template(Blocks):
     def __init__(self, resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> None:
         """Count the elements and number their nodes.
 
-        Nodes of different elements that have the same position under a sample press are the same node.
+        Nodes of different elements count as one node if they have the same position under a sample press.
 
         Args:
             resolution: Fineness of the mesh.
@@ -67,7 +70,7 @@ class Template(Blocks):
         self.on_axis = (np.abs(node_points.imag) < 1e-9) & self.half
 
     def from_base(self, values: np.ndarray) -> np.ndarray:
-        """Return the given values, because no element of this class is split.
+        """Return the given values, because a template of the base class has no split elements.
 
         The subclass `RefinedTemplate` interpolates the values from the original elements to the split elements.
 
@@ -80,7 +83,7 @@ class Template(Blocks):
         return values
 
     def to_split_elements(self, element: Integers, xi: Array, eta: Array) -> tuple[Integers, Array, Array]:
-        """Return the given positions, because no element of this class is split.
+        """Return the given positions, because a template of the base class has no split elements.
 
         The subclass `RefinedTemplate` converts positions in the original elements into positions in the split elements.
 
@@ -96,7 +99,7 @@ class Template(Blocks):
 
 
 class SampleCurve(CurvedProbe):
-    """Circular footprint that represents another curved footprint in the sample press, and has the same topology."""
+    """Circular footprint that replaces another curved footprint in the sample press. It has the same topology."""
 
     angle = 0.0
     notation = "sample"

@@ -67,8 +67,8 @@ class Rings:
         Returns:
             Contacts, ordered ring by ring, shape (n_ring * n_angle, 3).
         """
-        flat = self.position.reshape(-1, 2)
-        return np.concatenate([flat, np.full((len(flat), 1), force)], axis=1)
+        flat_position = self.position.reshape(-1, 2)
+        return np.concatenate([flat_position, np.full((len(flat_position), 1), force)], axis=1)
 
     def per_ring(self, values: Array) -> Array:
         """Split the first axis of an array into one axis for the rings and one axis for the angles.

@@ -70,7 +70,7 @@ All diagonal elements of the product are the mean of the diagonal of the 3 x 3 m
 def minimise(
     evaluate: ResidualFunction, start: Array, max_steps: int = MAX_STEPS, min_change: float = MIN_CHANGE
 ) -> tuple[Array, Array]:
-    """Find a local minimum of each problem by damped Gauss-Newton steps from a starting point.
+    """Find a local minimum of each problem by damped Gauss-Newton steps, which begin at a given starting point.
 
     Each problem minimises the sum of squares |r(u)|^2 over all points u of the domain D. The domain D is the unit disk
     times the interval [-1, 1]. A step that increases |r|^2 is rejected. The damping decreases after each accepted step
@@ -88,35 +88,37 @@ def minimise(
         Points in D, shape (n, 3), and the residuals at these points, shape (n, k).
     """
     point = into_domain(start).copy()
-    active = np.arange(len(start))  # indices of the problems whose iteration has not ended
-    start_residual, start_slopes = evaluate(active, point)
+    active_problems = np.arange(len(start))  # indices of the problems whose iteration has not ended
+    start_residual, start_slopes = evaluate(active_problems, point)
     residual = np.array(start_residual)  # r, shape (n, k)
     slopes = np.array(start_slopes)  # dr/du, shape (n, 3, k)
-    square = (residual**2).sum(axis=1)  # |r|^2, shape (n,)
+    squared_norm = (residual**2).sum(axis=1)  # |r|^2, shape (n,)
     damping = np.full(len(point), INITIAL_DAMPING)
     for _ in range(max_steps):
-        if not active.size:
+        if not active_problems.size:
             break
 
         # A step is accepted if it does not increase |r|^2 by more than rounding errors.
-        trial = bounded_step(point[active], residual[active], slopes[active], damping[active])
-        trial_residual, trial_slopes = evaluate(active, trial)
-        trial_square = (trial_residual**2).sum(axis=1)
-        change = (trial_square - square[active]) / (1.0 + trial_square)
+        trial_point = bounded_step(
+            point[active_problems], residual[active_problems], slopes[active_problems], damping[active_problems]
+        )
+        trial_residual, trial_slopes = evaluate(active_problems, trial_point)
+        trial_squared_norm = (trial_residual**2).sum(axis=1)
+        change = (trial_squared_norm - squared_norm[active_problems]) / (1.0 + trial_squared_norm)
         is_accepted = change <= MAX_INCREASE
-        accepted = active[is_accepted]
-        point[accepted] = trial[is_accepted]
-        residual[accepted] = trial_residual[is_accepted]
-        slopes[accepted] = trial_slopes[is_accepted]
-        square[accepted] = trial_square[is_accepted]
+        accepted_problems = active_problems[is_accepted]
+        point[accepted_problems] = trial_point[is_accepted]
+        residual[accepted_problems] = trial_residual[is_accepted]
+        slopes[accepted_problems] = trial_slopes[is_accepted]
+        squared_norm[accepted_problems] = trial_squared_norm[is_accepted]
 
         # Adapt the damping, and remove the problems whose iteration has ended.
-        lower_damping = np.maximum(damping[active] * DAMPING_DECREASE, MIN_DAMPING)
-        higher_damping = damping[active] * DAMPING_INCREASE
-        damping[active] = np.where(is_accepted, lower_damping, higher_damping)
+        lower_damping = np.maximum(damping[active_problems] * DAMPING_DECREASE, MIN_DAMPING)
+        higher_damping = damping[active_problems] * DAMPING_INCREASE
+        damping[active_problems] = np.where(is_accepted, lower_damping, higher_damping)
         is_changing = np.abs(change) >= min_change
-        is_damping_allowed = damping[active] <= MAX_DAMPING
-        active = active[is_changing & is_damping_allowed]
+        is_damping_allowed = damping[active_problems] <= MAX_DAMPING
+        active_problems = active_problems[is_changing & is_damping_allowed]
     return point, residual
 
 
@@ -124,8 +126,8 @@ def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array | 
     """Take one damped Gauss-Newton step that does not leave the domain D.
 
     The domain D is the unit disk times the interval [-1, 1]. The step is -(J'J + damping * mean(diag(J'J)) * I)^-1 J'r,
-    where r are the residuals and J is their Jacobian. For points on an edge of D, the step is modified such that it
-    does not leave D.
+    where r are the residuals and J is the Jacobian. For points on an edge of D, the step is modified such that it does
+    not leave D.
 
     Args:
         point: Points of D, shape (..., 3).
@@ -148,12 +150,12 @@ def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array | 
     if np.count_nonzero(is_on_circle | is_at_end):
         normal_matrix, gradient = _restrict_to_edges(point, normal_matrix, gradient, trace, is_on_circle, is_at_end)
     gradient_column = gradient[..., None]  # shape (..., 3, 1)
-    descent = np.linalg.solve(normal_matrix, gradient_column)[..., 0]  # negative step, shape (..., 3)
-    return into_domain(np.asarray(point - descent))
+    negative_step = np.linalg.solve(normal_matrix, gradient_column)[..., 0]  # shape (..., 3)
+    return into_domain(np.asarray(point - negative_step))
 
 
 def _is_outside_scaled_domain(point: Array, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Check which points lie outside the scaled disk, and which points lie outside the scaled interval.
+    """Return which points lie outside the scaled disk, and which points lie outside the scaled interval.
 
     Args:
         point: Points, shape (..., 3). The first two coordinates belong to the disk, and the third to the interval.
@@ -226,7 +228,7 @@ def _restrict_to_edges(
 
 
 def _outer_product(vector: Array, factor: Array) -> Array:
-    """Compute the outer product v v' of each vector v, and multiply it by the factor of the vector.
+    """Multiply the outer product v v' of each vector v by a factor.
 
     Args:
         vector: Vectors v, shape (..., 3).

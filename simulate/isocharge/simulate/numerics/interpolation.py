@@ -139,7 +139,7 @@ def lagrange_values(nodes: Array, weights: Array, points: Array) -> Array:
 
 @lru_cache(maxsize=32)
 def derivative_matrix(order: int) -> Array:
-    """Return the matrix that converts the values of a polynomial at the nodes into the derivatives at the same nodes.
+    """Return the matrix that converts the values of a polynomial at the nodes into its derivatives at the nodes.
 
     The symbols x_i and w_i denote the nodes that `lobatto_nodes` returns, and their barycentric weights. The matrix
     element in row i and column j is (w_j / w_i) / (x_i - x_j) if i and j are different (Berrut and Trefethen 2004).

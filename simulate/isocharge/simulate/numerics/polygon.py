@@ -98,12 +98,12 @@ def to_corners(z: Complexes) -> Array:
 
 
 def min_edge_cross_product(corners: Complexes, points: Complexes) -> Array:
-    """Compute the smallest cross product of each point with the edges of a convex polygon.
+    """Compute the smallest cross product that each point has with an edge of a convex polygon.
 
-    The cross product of an edge vector and the vector from the start of the edge to the point is computed for each
-    edge. The cross product equals the length of the edge times the signed distance of the point from the line through
-    the edge. The cross product is positive if the point lies on the left of the edge. The smallest cross product is
-    therefore positive for points inside the polygon, and negative for points outside.
+    For each edge, the cross product of two vectors is computed: the edge vector, and the vector from the start of the
+    edge to the point. The cross product equals the length of the edge times the signed distance of the point from the
+    line through the edge. The cross product is positive if the point lies on the left of the edge. The smallest cross
+    product is therefore positive for points inside the polygon, and negative for points outside.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n,).
@@ -125,15 +125,15 @@ def shared_area(first: Complexes, second: Complexes) -> float:
         first: Corners x + iy, shape (n,).
         second: Corners x + iy, shape (m,).
     """
-    common = shapely.intersection(shapely.Polygon(to_corners(first)), shapely.Polygon(to_corners(second)))
-    return float(common.area)
+    intersection = shapely.intersection(shapely.Polygon(to_corners(first)), shapely.Polygon(to_corners(second)))
+    return float(intersection.area)
 
 
 def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float) -> Array:
-    """Compute the area of the intersection of a polygon with each of several disks.
+    """Compute the area that a polygon has in common with each of several disks.
 
-    Each edge of the polygon forms a triangle with the centre of the disk. The area of the intersection is the sum over
-    all edges of the signed area that the triangle and the disk have in common. The part of an edge inside the circle
+    Each edge of the polygon forms a triangle with the centre of the disk. The signed areas that the triangles and the
+    disk have in common add up to the common area of the polygon and the disk. The part of an edge inside the circle
     contributes the area of a triangle. Each part of an edge outside the circle contributes the area of a circular
     sector.
 

@@ -1,9 +1,9 @@
-"""Division of unions of polygons into trapezoids for numerical integration, and computation of outlines of traces.
+"""Division of a union of polygons into trapezoids for numerical integration, and computation of trace outlines.
 
 A polygon is an array of its corners x + iy in anticlockwise order. The library shapely (GEOS) computes unions and
 intersections of polygons, but cannot divide a union into trapezoids.
 
-The outline of a trace is not computed by shapely. The function `shapely.buffer` silently cuts off sharp bends, and
+The outline of a trace is computed without shapely. The function `shapely.buffer` silently cuts off sharp bends, and
 converts a trace that crosses itself into a ring. The result of the function `trace_outline` allows callers to detect
 sharp bends and crossings.
 """
@@ -107,8 +107,8 @@ def _region(polygons: Sequence[Complexes]) -> shapely.Geometry:
 
     A polygon that touches or crosses itself is first converted into a valid region.
     """
-    valid = shapely.make_valid([shapely.Polygon(to_corners(corners)) for corners in polygons])
-    return shapely.union_all(valid)
+    valid_regions = shapely.make_valid([shapely.Polygon(to_corners(corners)) for corners in polygons])
+    return shapely.union_all(valid_regions)
 
 
 def _strip_ends(polygons: Sequence[Complexes]) -> Array:
@@ -175,9 +175,9 @@ def trace_outline(path: Complexes, width: float) -> Complexes:
     """Compute the outline of a trace that follows a path with a constant width.
 
     The outline has straight ends and mitred bends. At each point of the path, the outline has one corner on the left
-    side and one corner on the right side. The displacement from the point to the left corner is called the mitre.
-    Between two sections with the unit normals n and m, the mitre is (width / 2) (n + m) / (1 + dot(n, m)). The product
-    dot(n, m) is the cosine of the angle by which the path bends.
+    side and one corner on the right side. The displacement from a point of the path to the left corner is called the
+    mitre. Between two sections with the unit normals n and m, the mitre is (width / 2) (n + m) / (1 + dot(n, m)). The
+    product dot(n, m) is the cosine of the angle by which the path bends.
 
     Args:
         path: Points of the path x + iy, shape (n,), mm.

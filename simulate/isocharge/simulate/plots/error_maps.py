@@ -1,4 +1,4 @@
-"""Pictures that show the lower limit of the position error over the film, for an identification or a design."""
+"""Pictures of an identification or a design that show the lower limit of the position error over the film."""
 
 from typing import Any
 
@@ -162,9 +162,9 @@ def error_maps_picture(design: Design) -> Figure:
         draw_working_area(axes, case.radius)
         axes.set(xlim=limits, ylim=limits, xlabel="x, mm", ylabel="y, mm", aspect="equal")
     label = "lower limit of the position error (rms), mm"
-    bar = figure.colorbar(shades, ax=list(all_axes), label=label, shrink=0.85, extend="max")
-    bar.ax.yaxis.set_major_formatter(ScalarFormatter())
-    bar.ax.yaxis.set_minor_formatter(ScalarFormatter())
+    colour_bar = figure.colorbar(shades, ax=list(all_axes), label=label, shrink=0.85, extend="max")
+    colour_bar.ax.yaxis.set_major_formatter(ScalarFormatter())
+    colour_bar.ax.yaxis.set_minor_formatter(ScalarFormatter())
     nuisances = "without nuisances" if case.nuisances == NO_NUISANCES else "with nuisances"
     figure.suptitle(f"{case.force:g} N, {case.probe.notation}, noise {case.noise.name}, {nuisances}")
     return figure

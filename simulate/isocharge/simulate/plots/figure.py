@@ -97,7 +97,7 @@ def shades(count: int) -> Array:
 
 
 def check_picture(path: Path) -> None:
-    """Raise an error if a picture cannot be written to a path, before the picture is computed.
+    """Raise an error if a picture cannot be written to a path. Call this function before computing the picture.
 
     Args:
         path: Path of the picture.
@@ -131,7 +131,7 @@ def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
 
 
 def save_picture(figure: Figure, path: Path) -> None:
-    """Write a figure to a file, in the format that the suffix of the path states.
+    """Write a figure to a file. The suffix of the path determines the format.
 
     If an error occurs, no file is written.
 

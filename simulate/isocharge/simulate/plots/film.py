@@ -134,8 +134,8 @@ def draw_charge_map(axes: Any, charge_map: ChargeMap, number: int, force: float 
     contact = np.stack([x.ravel(), y.ravel(), np.full(x.size, force)], axis=1)
     values = charge_map.charges(contact)[:, number].reshape(x.shape)
     axes.contourf(x, y, values, levels=30, cmap="YlGnBu")
-    lines = axes.contour(x, y, values, levels=12, colors=INK, linewidths=0.8)
-    axes.clabel(lines, fmt="%.0f", fontsize=7)
+    contour_lines = axes.contour(x, y, values, levels=12, colors=INK, linewidths=0.8)
+    axes.clabel(contour_lines, fmt="%.0f", fontsize=7)
 
 
 def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
@@ -187,7 +187,7 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
 
 
 def _polar_grid(radius: float, rings: int, angles: int) -> tuple[Array, Array]:
-    """Return the points of a polar grid on a disk, whose rings have equal areas between them.
+    """Return the points of a polar grid on a disk. The areas between neighbouring rings are equal.
 
     Args:
         radius: Radius of the disk, mm.

@@ -40,7 +40,7 @@ def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
 
 
 def _draw_region(axes: Any, sensor: Sensor, mirror: MirrorRegion) -> Any:
-    """Draw a map of the share of presses that cannot be noticed, with the clamp, the working area and the electrodes.
+    """Draw a map of the share of unnoticeable presses, with the clamp, the working area and the electrodes.
 
     Args:
         axes: Axes of matplotlib.
@@ -70,7 +70,7 @@ def _draw_region(axes: Any, sensor: Sensor, mirror: MirrorRegion) -> Any:
 
 
 def _draw_distance(axes: Any, mirror: MirrorRegion) -> None:
-    """Draw the share of presses that cannot be noticed as a function of their distance from the centre.
+    """Draw the share of unnoticeable presses as a function of their distance from the centre.
 
     Args:
         axes: Axes of matplotlib.

@@ -162,7 +162,7 @@ class Film:
 
     @property
     def is_axisymmetric(self) -> bool:
-        """Whether a rotation of the film about its centre does not change the properties of the film."""
+        """Whether the properties of the film remain unchanged if the film is rotated about its centre."""
         return not self.is_anisotropic and self.oval == 0.0 and self.coat is None
 
     def __post_init__(self) -> None:

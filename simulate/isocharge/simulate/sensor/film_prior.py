@@ -1,10 +1,10 @@
 """Unknown parameters of a real film, and the prior distribution of these parameters.
 
 The prior distribution is centred on the film that a sensor file describes. Before any measurement, the properties of
-the film, the piezoelectric coefficients and the gains are known only to within some percent. The positions of the
+the film, the piezoelectric coefficients and the gains are known only to within a few percent. The positions of the
 electrodes are known to within tenths of a millimetre, and the pretension is almost unknown. Calibrations start from
-this prior distribution. Virtual films are drawn from the same distribution, and so are the films with which networks
-for all films are trained.
+this prior distribution. Virtual films are drawn from the same distribution. The films with which networks for all films
+are trained are also drawn from it.
 
 `PARAMETERS` declares the parameters that every film has. The parameter vector also contains one gain for each
 electrode. Each parameter except the pretension is a deviation from the sensor file, so it is zero for the described
@@ -110,7 +110,7 @@ class FilmParameter:
     file_factor: float = 1.0
 
     def mean(self, prior: "FilmPrior") -> float:
-        """Return the mean of the prior distribution of the parameter, which is zero for the described film.
+        """Return the mean of the prior distribution. It is zero, which is the value of the described film.
 
         Args:
             prior: Prior distribution. Only subclasses use it.
@@ -128,7 +128,7 @@ class FilmParameter:
         return self.mean(prior) - max_deviation, self.mean(prior) + max_deviation
 
     def physical_value(self, components: Components) -> float:
-        """Return the physical value of the parameter of a sensor or a probe, such as Young's modulus.
+        """Return the physical value of the parameter, such as Young's modulus, for a sensor or a probe.
 
         Args:
             components: Objects of the sensor, and the probe.
@@ -185,7 +185,7 @@ class PretensionParameter(FilmParameter):
     """Declaration of the pretension, which is uniformly distributed between zero and the largest pretension."""
 
     def mean(self, prior: "FilmPrior") -> float:
-        """Return the mean of the pretension, which is half of the largest pretension, MPa."""
+        """Return the mean of the pretension (MPa), which is half of the largest pretension."""
         return 0.5 * prior.spread.pretension
 
     def std(self, prior: "FilmPrior") -> float:
@@ -205,10 +205,10 @@ class PretensionParameter(FilmParameter):
 
 
 class ProbeRadiusParameter(FilmParameter):
-    """Declaration of the radius of the probe, whose bounds are proportional to the described radius."""
+    """Declaration of the radius of the probe. The bounds of the radius are proportional to the described radius."""
 
     def std(self, prior: "FilmPrior") -> float:
-        """Return the standard deviation of the radius, mm, which is at most 0.3 times the described radius."""
+        """Return the standard deviation of the radius (mm), which is at most 0.3 times the described radius."""
         return min(prior.spread.probe_radius, 0.3 * prior.probe.radius)
 
     def bounds(self, prior: "FilmPrior") -> tuple[float, float]:
@@ -334,12 +334,12 @@ class FilmPrior:
 
     @cached_property
     def _components(self) -> Components:
-        """Objects of the described sensor, and the described probe, whose attributes the parameters change."""
+        """Objects that have attributes which the parameters change: parts of the described sensor, and the probe."""
         return _components_of(self.sensor, self.probe)
 
     @property
     def described(self) -> Array:
-        """Parameters of the film exactly as the sensor file describes it, shape (n_parameter,).
+        """Parameters of the film that the sensor file describes, shape (n_parameter,).
 
         In contrast to `mean`, the pretension is that of the sensor file.
         """
@@ -437,7 +437,7 @@ class FilmPrior:
                 f"({_centres(sensor)})"
             )
         # All other properties that are not parameters must be equal, too.
-        for what, value, expected in (
+        for property_name, value, expected in (
             ("readout", (sensor.readout, sensor.surface), (described.readout, described.surface)),
             ("film radius (mm)", round(sensor.film.radius, 6), round(described.film.radius, 6)),
             ("film poisson", round(sensor.film.poisson, 9), round(described.film.poisson, 9)),
@@ -449,9 +449,12 @@ class FilmPrior:
             ("asymmetry of the film", sensor.film.asymmetries, described.film.asymmetries),
         ):
             if value != expected:
-                raise SensorError(f"{sensor.name}: {what}: expected those of {described.name}, {expected}, got {value}")
+                raise SensorError(
+                    f"{sensor.name}: {property_name}: expected those of {described.name}, {expected}, got {value}"
+                )
 
-        # Only d31 and d32 may have different signs. Their logarithm does not exist then, which is a ValueError.
+        # Only d31 and d32 may have another sign than in the described sensor. The logarithm of the ratio of both values
+        # does not exist in this case, and `from_physical_value` raises a ValueError.
         components = _components_of(sensor, probe)
         try:
             values = [
@@ -466,12 +469,12 @@ class FilmPrior:
 
 
 def _components_of(sensor: Sensor, probe: Circle) -> Components:
-    """Return the objects of a sensor, and the probe, whose attributes the parameters change."""
+    """Return the objects that have attributes which the parameters change: parts of a sensor, and the probe."""
     return {"film": sensor.film, "piezo": sensor.piezo, "calibration": sensor.calibration, "probe": probe}
 
 
 def _rounded_corners(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
-    """Return the corners of the parts of each electrode by the name of the electrode, mm, rounded to a nanometre."""
+    """Return a dictionary from electrode names to the corners of all parts, rounded to a nanometre, mm."""
     return {
         electrode.name: [(round(x, 6), round(y, 6)) for part in electrode.parts for x, y in part]
         for electrode in sensor.electrodes
@@ -479,7 +482,7 @@ def _rounded_corners(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
 
 
 def _centres(sensor: Sensor) -> str:
-    """Return a text that lists the centres of at most `MAX_SHOWN_CENTRES` electrodes, for an error message."""
+    """List the centres of at most `MAX_SHOWN_CENTRES` electrodes in a text for an error message."""
     centres = []
     for electrode in sensor.electrodes[:MAX_SHOWN_CENTRES]:
         x, y = electrode.centre

@@ -1,4 +1,4 @@
-"""Description of a sensor, which consists of a film with electrodes, their readout and their calibration.
+"""Description of a sensor: a film with electrodes, their readout and their calibration.
 
 The origin of the coordinates is the centre of the film. The x axis is the drawn direction (1) of the film, and the y
 axis is the transverse direction (2). The film is seen from the side of the probe. Force and deflection are positive in
@@ -102,7 +102,7 @@ class Electrode:
 
     @classmethod
     def of_square(cls, name: str, centre: tuple[float, float], side: float) -> "Electrode":
-        """Create a square electrode with sides along the axes.
+        """Create a square electrode whose sides are parallel to the axes.
 
         Args:
             name: Name of the electrode.
@@ -185,7 +185,7 @@ class Electrode:
 
     @property
     def _is_convex(self) -> bool:
-        """Whether the collecting area is the whole pad, and the pad is convex."""
+        """Whether the pad is convex and the collecting area is the whole pad."""
         return not (self.more or self.back) and is_convex(np.array(self.corners))
 
     @property
@@ -207,7 +207,7 @@ class Electrode:
         return low, high
 
     def overlaps(self, other: "Electrode", within: float = 0.0) -> bool:
-        """Return whether the metal of this electrode and that of another electrode overlap on the front.
+        """Return whether the metal of this electrode overlaps the metal of another electrode on the front.
 
         Args:
             other: The other electrode.
@@ -219,11 +219,14 @@ class Electrode:
         other_low, other_high = other.boxes
         are_near_along_axis = (low[:, None] <= other_high + within) & (other_low - within <= high[:, None])
         pairs_of_near_parts = np.argwhere(are_near_along_axis.all(axis=2))
-        return any(overlap(self.metal[own], other.metal[others], within) for own, others in pairs_of_near_parts)
+        return any(
+            overlap(self.metal[own_index], other.metal[other_index], within)
+            for own_index, other_index in pairs_of_near_parts
+        )
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Centre (x, y) of the electrode, which is the mean of the corners of its pad, mm."""
+        """Centre (x, y) of the electrode, mm. It is the mean of the corners of the pad."""
         x, y = np.mean(self.corners, axis=0)
         return float(x), float(y)
 
@@ -279,9 +282,9 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Sensor:
-    """Description of a film with electrodes, with the readout and the calibration of the electrodes.
+    """Description of a film with electrodes, including the readout and the calibration of the electrodes.
 
-    The module `sensor_file` reads and writes the file of a sensor.
+    The module `sensor_file` reads and writes the files that describe sensors.
 
     Attributes:
         name: Name of the sensor.
@@ -506,14 +509,14 @@ def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -
     x, y = centre
     if electrode.square:
         (left, _), (right, _), *_ = electrode.corners
-        extent = f"half side {_short(0.5 * (right - left))} mm"
+        extent = f"half side {_short_text(0.5 * (right - left))} mm"
     else:
         farthest = np.linalg.norm(placed_corners - centre, axis=1).max()
-        extent = f"corners up to {_short(farthest)} mm from it"
+        extent = f"corners up to {_short_text(farthest)} mm from it"
     hint = "; end its traces before the rim" if electrode.more else ""
     raise SensorError(
-        f"electrode {electrode.name!r} lies outside the film: centre ({_short(x)}, {_short(y)}) mm, {extent}, "
-        f"film radius {_short(film.radius)} mm{hint}"
+        f"electrode {electrode.name!r} lies outside the film: centre ({_short_text(x)}, {_short_text(y)}) mm, "
+        f"{extent}, film radius {_short_text(film.radius)} mm{hint}"
     )
 
 
@@ -541,6 +544,6 @@ def check_polygon(where: str, polygon: Corners) -> None:
         )
 
 
-def _short(value: float) -> str:
-    """Return a number as text with at most six significant digits, for error messages."""
+def _short_text(value: float) -> str:
+    """Return a number as text with at most six significant digits. The text is for error messages."""
     return str(float(f"{value:.6g}"))

@@ -180,14 +180,14 @@ def load_sensor(sensor: str | Path) -> Sensor:
     if not path.is_file():
         names = ", ".join(built_in_sensors())
         raise SensorError(f"no sensor {str(sensor)!r}: it is neither a built-in name ({names}) nor a file")
-    described = sensor_from_dict(read_toml(path, "a sensor file", SensorError, dict[str, Any]), str(path))
-    if len(described.electrodes) == 1:
+    loaded_sensor = sensor_from_dict(read_toml(path, "a sensor file", SensorError, dict[str, Any]), str(path))
+    if len(loaded_sensor.electrodes) == 1:
         log.warning(
             "%s: one electrode: its charge can be computed, but one charge does not determine x, y and force; three "
             "electrodes or more do",
             path,
         )
-    return described
+    return loaded_sensor
 
 
 def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
@@ -223,7 +223,7 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
 
 
 def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
-    """Convert a sensor into the tables of a sensor file, which can be written as JSON or TOML.
+    """Convert a sensor into the tables of a sensor file. The tables can be written as JSON or TOML.
 
     The function `sensor_from_dict` converts the tables back into the same sensor, except for rounding errors.
 
@@ -457,7 +457,7 @@ def _expansion(table: FilmTable) -> tuple[float, float] | None:
 
 
 def _electrodes(table: Mapping[str, float | Point | PolygonTable], roles: Mapping[str, Role]) -> Iterator[Electrode]:
-    """Create the electrodes of the section `electrodes` of a sensor file, and yield one after the other.
+    """Yield the electrodes that the section `electrodes` of a sensor file describes, one after the other.
 
     A value of the section is a table of polygons, the centre of a square, or a number that applies to all electrodes.
 

@@ -1,1 +1,1 @@
-"""Solver of presses, which computes the equilibrium of the film under a probe and estimates its error."""
+"""Computation of the equilibrium of a film under a probe, and estimates of the errors of the computed charges."""

@@ -1,14 +1,14 @@
-"""Solution of the linear system of a mesh by static condensation of the elements and a sparse direct solver.
+"""Direct solver for the linear equations of a mesh, with static condensation of the interior nodes.
 
-A node in the interior of an element belongs to no other element. Therefore the unknowns of interior nodes are
-eliminated element by element with dense matrices. The nodes on the sides of all elements form the skeleton of the mesh.
-Only the unknowns of the skeleton are factorised together. For elements of order 4, the elimination reduces the number
-of unknowns by a factor of 2.3. The numbers of the unknowns and the sparsity pattern depend only on the template, so
-they are computed once for each template.
+A node in the interior of an element belongs to no other element. The unknowns of interior nodes are therefore
+eliminated separately for each element, with dense matrices. The nodes on the sides of all elements form the skeleton of
+the mesh. Only the matrix of the skeleton unknowns is factorised as a whole. For elements of order 4, the elimination of
+the interior nodes reduces the number of unknowns by a factor of 2.3. The numbering of the unknowns and the sparsity
+pattern of the matrix depend only on the template. Both are therefore computed once for each template.
 
-The unknowns of a node are U1, U2 and W. With bending, each node also has the auxiliary unknown of `mechanics.energy`.
-On the rim, U1, U2 and W are zero. On the line of symmetry of a half template, U2 is zero for even fields, and all other
-unknowns are zero for odd fields.
+The unknowns of a node are U1, U2 and W. If the theory includes bending, each node also has the auxiliary unknown of the
+class `mechanics.energy.Bending`. On the rim, U1, U2 and W are zero. On the line of symmetry of a half template, U2 is
+zero if the field is even, and all unknowns except U2 are zero if the field is odd.
 """
 
 from functools import lru_cache
@@ -73,7 +73,9 @@ class Assembly:
         self._reorder()
 
     def _skeleton_constraint(self, node_constraint: csr_array) -> csc_array:
-        """Return the matrix that computes all skeleton unknowns from the unknowns of nodes that are not hanging nodes.
+        """Return the matrix that computes all skeleton unknowns from the skeleton unknowns of the regular nodes.
+
+        All nodes except the hanging nodes are called regular nodes.
 
         Args:
             node_constraint: Matrix that computes the values at all nodes from the values at nodes that are not hanging
@@ -85,10 +87,10 @@ class Assembly:
         return skeleton_constraint[:, is_regular].tocsc()
 
     def _set_pattern(self, skeleton_numbers: Integers) -> None:
-        """Compute the sparsity pattern of the skeleton matrix, and the positions of the element entries in its data.
+        """Compute the sparsity pattern of the skeleton matrix, and the position of each element entry in its data.
 
-        The data of a sparse matrix are the entries of its pattern in the compressed sparse column format. An entry that
-        belongs to a fixed unknown gets the position after the last entry of the pattern.
+        The data of a sparse matrix are the entries of its pattern, ordered column by column (compressed sparse column
+        format). Entries in the rows or columns of fixed unknowns get the position after the last entry of the pattern.
 
         Args:
             skeleton_numbers: Number of each outer unknown in the skeleton, shape (n_element, n_outer). Fixed unknowns
@@ -105,10 +107,10 @@ class Assembly:
         # Combine the row and the column of each entry into one code. In the compressed sparse column format, the
         # entries are ordered by their columns and then by their rows, which is the order of the codes.
         entry_codes = column[is_free] * size + row[is_free]
-        codes, position = np.unique(entry_codes, return_inverse=True)
+        codes, pattern_position = np.unique(entry_codes, return_inverse=True)
         position_of_fixed = codes.size
         positions = np.full(shape, position_of_fixed, dtype=np.intp)
-        positions[is_free] = position
+        positions[is_free] = pattern_position
         self._entry_positions = positions.ravel()
 
         # Compute the row of each entry of the pattern, and the position of the first entry of each column.
@@ -119,8 +121,8 @@ class Assembly:
     def _reorder(self) -> None:
         """Renumber the skeleton unknowns by the minimum-degree method, so that the factorisation has little fill-in.
 
-        If there are hanging nodes, only the columns of the constraint are renumbered, because the factorised matrix
-        does not contain the unknowns of hanging nodes.
+        If there are hanging nodes, only the columns of the matrix `constraint` are renumbered, because the factorised
+        matrix does not contain the unknowns of hanging nodes.
         """
         # SuperLU returns its column order only after a factorisation. The factorised matrix has the pattern of the
         # skeleton matrix and a dominant diagonal, because such a matrix needs no pivoting.
@@ -134,13 +136,13 @@ class Assembly:
         # Permute a matrix whose entries are their own positions, and read the new position of each entry from it. The
         # last position, which is for fixed unknowns, does not change.
         pattern.data = np.arange(pattern.nnz)
-        permuted = pattern[:, order][order]
-        permuted.sort_indices()
-        position_of_fixed = permuted.nnz
-        new_position = np.append(np.argsort(permuted.data), position_of_fixed)
+        permuted_pattern = pattern[:, order][order]
+        permuted_pattern.sort_indices()
+        position_of_fixed = permuted_pattern.nnz
+        new_position = np.append(np.argsort(permuted_pattern.data), position_of_fixed)
         self._entry_positions = new_position[self._entry_positions]
-        self._indices = permuted.indices
-        self._indptr = permuted.indptr
+        self._indices = permuted_pattern.indices
+        self._indptr = permuted_pattern.indptr
         self.skeleton = self.skeleton[order]
 
     def factor(self, matrix: Array) -> "Factor":
@@ -264,8 +266,8 @@ def _factorise(matrix: csc_matrix, column_order: str) -> SuperLU:
 def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:
     """Return which unknowns are free. All other unknowns are fixed at zero.
 
-    The clamp fixes U1, U2 and W on the rim. On the line of symmetry, U2 is fixed for even fields, and all unknowns
-    except U2 are fixed for odd fields.
+    The clamp fixes U1, U2 and W on the rim. On the line of symmetry, U2 is fixed if the field is even, and all unknowns
+    except U2 are fixed if the field is odd.
 
     Args:
         mesh: Template of the mesh.

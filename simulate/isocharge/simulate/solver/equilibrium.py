@@ -1,8 +1,9 @@
-"""Equilibrium of the film under a press, and functions that compute its deflection and stress at given points.
+"""Equilibrium of the film under a press, and functions that compute the deflection and the stress of the film.
 
 Before a press is solved, the press and the film are rotated such that the press lies on the positive x axis. The
-functions that evaluate an equilibrium rotate the results back. If the film is axisymmetric, an equilibrium is valid for
-all directions of the press. An equilibrium is also valid for all electrode layouts and all piezoelectric coefficients.
+functions that evaluate an equilibrium rotate their results back into the axes of the film. If the film is axisymmetric,
+the same equilibrium is valid for presses in all directions from the centre. An equilibrium is also valid for all
+electrode layouts and all piezoelectric coefficients.
 """
 
 from dataclasses import dataclass
@@ -87,7 +88,7 @@ class Equilibrium:
 
 
 def deflection(equilibrium: Equilibrium, points: Array) -> Array:
-    """Compute the deflection of the film from its flat shape at given points.
+    """Compute the deflection of the film at given points, relative to the flat film.
 
     The result includes the deflection that a static pressure causes.
 
@@ -158,7 +159,9 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
 
 
 def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute the scaled touch stress at the nodes of every element. The press is rotated onto the x axis.
+    """Compute the scaled touch stress at the nodes of every element.
+
+    The stress components refer to the frame in which the press lies on the positive x axis.
 
     Args:
         equilibrium: The solved press.
@@ -173,7 +176,9 @@ def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array
 
 
 def _induced_stress(equilibrium: Equilibrium, surface: Surface) -> Array:
-    """Compute the scaled stress at the nodes that the probe and the static pressure add to the pretension.
+    """Compute the scaled induced stress at the nodes of every element.
+
+    The induced stress is the stress that the probe and the static pressure add to the pretension.
 
     Args:
         equilibrium: The solved press.
@@ -194,8 +199,8 @@ def _induced_stress(equilibrium: Equilibrium, surface: Surface) -> Array:
 def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     """Compute the smallest and the largest principal stress in the film, including the pretension.
 
-    The smallest stress is computed for the mid-surface only. If the theory includes bending, the largest stress is
-    computed for the mid-surface and for both outer surfaces.
+    The smallest stress is the minimum over the mid-surface. If the theory includes bending, the largest stress is the
+    maximum over the mid-surface and both outer surfaces.
 
     Args:
         equilibrium: The solved press.

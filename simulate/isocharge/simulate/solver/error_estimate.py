@@ -1,12 +1,13 @@
-"""Estimates of the error of a charge due to the mesh and due to the theory, and warnings about omitted effects.
+"""Estimates of the errors that the mesh and the theory cause in a charge, and warnings about omitted effects.
 
-In the inner part of the film, the error of the mesh is estimated from the shapes of the elements and from the share of
-the highest polynomial modes in the slopes of the deflection. This estimate is not reliable for presses near the rim,
-and for large footprints that are not circular. In both cases, elements that are too coarse may lie far from the
-elements with the largest stress. Such a press is therefore solved on meshes of increasing order until the charges of
-two meshes agree. The same method is used if the required accuracy is better than the default accuracy. An increase of
-the order by one reduces the error by a factor of three to ten. Therefore the difference between two meshes is an upper
-bound of the error of the finer mesh.
+In the inner part of the film, the error that the mesh causes is estimated from the shapes of the elements, and from the
+contribution of the highest polynomial modes to the slopes of the deflection. The estimate is not reliable for presses
+near the rim or for large footprints that are not circular. Under such presses, elements that are too coarse may lie far
+from the elements with the largest stress. These presses are therefore solved on meshes of increasing polynomial order,
+until two successive meshes result in nearly the same charges. Presses are also solved on several meshes if the required
+accuracy is better than the default accuracy. If the polynomial order of the elements increases by one, the error
+decreases by a factor of three to ten. The difference between the charges of two successive meshes is therefore an upper
+bound of the error on the finer mesh.
 """
 
 from typing import Any
@@ -65,9 +66,9 @@ GROUPS = ("squared_amplitude", "load", "tension", "bending", "poisson")
 def shape_error(mesh: PlacedMesh) -> float:
     """Predict the relative error of a charge from the shapes of the elements.
 
-    The elements approximate the conformal map by polynomials. Because of this approximation, the area of the mesh
-    differs from the area of the film. The predicted error is the square root of the relative difference between the two
-    areas. The largest error of a charge is about a third of the predicted error
+    The elements approximate the conformal map by polynomials, so the area of the mesh differs slightly from the area of
+    the film. The predicted error is the square root of the relative difference between the area of the mesh and the
+    area of the film. The largest error of a charge is about a third of the predicted error
     (`tests/benchmarks/bench_hard_cases.py`).
 
     Args:
@@ -88,8 +89,8 @@ def shape_error(mesh: PlacedMesh) -> float:
 def highest_mode_share(mesh: PlacedMesh, slope: Array) -> float:
     """Compute the share of the highest polynomial modes in the slopes of the deflection.
 
-    The slopes in each element are expanded in products of Legendre polynomials. If the share of the polynomials of the
-    highest degree is small, the mesh is fine enough.
+    The slopes in each element are expanded in products of Legendre polynomials. A small share of the polynomials of the
+    highest degree indicates that the mesh is fine enough.
 
     Args:
         mesh: Mesh of the press.
@@ -121,10 +122,11 @@ def highest_mode_share(mesh: PlacedMesh, slope: Array) -> float:
 
 
 def mesh_error(equilibrium: Equilibrium) -> float:
-    """Estimate the relative error of a charge that is caused by the mesh.
+    """Estimate the relative error that the mesh causes in a charge.
 
-    If the press was solved on two meshes, the estimate is the difference between both meshes. Otherwise the error is
-    predicted from the shapes of the elements and from the share of the highest modes.
+    If the press was solved on two meshes, the estimate is the relative difference between the results on both meshes.
+    If the press was solved on one mesh, the error is predicted from the shapes of the elements and from the share of
+    the highest polynomial modes in the slopes.
 
     Args:
         equilibrium: The solved press.
@@ -141,7 +143,7 @@ def mesh_error(equilibrium: Equilibrium) -> float:
 
 
 def estimated_error(equilibrium: Equilibrium) -> float:
-    """Estimate the relative error of a charge that is caused by the mesh and by the omitted terms of the theory.
+    """Estimate the relative error that the mesh and the omitted terms of the theory cause in a charge.
 
     Args:
         equilibrium: The solved press.
@@ -158,9 +160,10 @@ def estimated_error(equilibrium: Equilibrium) -> float:
 def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     """Compute the largest relative difference between two equilibria of the same press.
 
-    The function compares the deflections at the probe, and the charges of square patches on a biaxial film and on a
-    uniaxial film. The patches lie on rings around the centre of the film, and on a ring around the footprint. The
-    difference between two charges of a patch is divided by the largest charge on the ring of the patch.
+    The function compares the deflections at the probe, and the charges that square patches of the film would collect.
+    The charges are compared for a biaxial film and for a uniaxial film. The patches lie on rings around the centre of
+    the film, and on a ring around the footprint. The difference between the two charges of a patch is divided by the
+    largest charge of all patches on the same ring.
 
     Args:
         one: First equilibrium.
@@ -190,7 +193,7 @@ def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
 
 
 def _patch_charges(equilibrium: Equilibrium, centres: Array) -> Array:
-    """Compute the charges per area of square patches for a biaxial and for a uniaxial film.
+    """Compute the charge per area of each square patch, for a biaxial film and for a uniaxial film.
 
     Args:
         equilibrium: The solved press.

@@ -2,16 +2,19 @@
 
 If a probe presses beside the centre, the film is steeper between the probe and the near rim than elsewhere. The
 material point under the probe moves outwards, because the steeper part of the film would otherwise stretch more than
-the rest. A stage that moves exactly vertically does not follow this movement. The film therefore slips outwards under
-the probe, and friction pulls the film inwards. A probe that hangs freely follows the movement and has no side force.
+the rest. A probe on a stage that moves exactly vertically does not follow the movement of the material point. The film
+therefore slips outwards under the probe, and friction pulls the film inwards. A probe that hangs freely follows the
+movement of the material point, and exerts no side force.
 
 The model is Coulomb friction during one press with increasing force (Johnson 1985, section 7.1). The holding force is
-the side force that would keep the material point in place. The largest possible friction is the coefficient of friction
-times the force of the press. If the holding force is smaller than the largest friction, the film sticks to the probe,
-and the side force is the holding force. Otherwise the film slips, and the side force is the largest friction. The
-friction acts in the direction opposite to the slip. The side force is distributed over the footprint like the pressure.
+the side force that would keep the material point under the probe in place. The largest possible friction is the
+coefficient of friction times the force of the press. If the holding force is smaller than the largest friction, the
+film sticks to the probe, and the side force is the holding force. If the holding force is larger, the film slips, and
+the side force is the largest friction. The friction acts in the direction opposite to the slip. The side force is
+distributed over the footprint like the pressure.
 
-While the probe is lifted, the slip and the side force have the opposite sign. The model does not describe the lifting.
+While the probe is lifted, the directions of the slip and of the side force are reversed. The model does not describe
+the lifting.
 """
 
 import numpy as np
@@ -30,10 +33,10 @@ MAX_FRICTION = 1.0
 
 
 def holding_force(solved: Equilibrium) -> tuple[float, float]:
-    """Compute the side force that prevents the mean in-plane displacement of the footprint, to first order.
+    """Compute, to first order, the side force that cancels the mean in-plane displacement of the footprint.
 
     The compliance of the film is the mean displacement of the footprint under a unit side load. The holding force
-    causes a mean displacement that is opposite to the mean displacement caused by the press.
+    causes a mean displacement that is equal and opposite to the mean displacement caused by the press.
 
     Args:
         solved: Press without a side force, solved with a theory that includes stretching.

@@ -1,4 +1,4 @@
-"""Checks of a press before the solve, and choice of the theory and of the coarsest mesh that is accurate enough."""
+"""Checks of a press before the solve, and choice of the theory and the mesh."""
 
 import math
 from collections.abc import Iterator
@@ -109,7 +109,7 @@ class SolveSettings:
 
 
 def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float) -> None:
-    """Raise an error if a press cannot exist, or if its strains exceed the range of Saint-Venant-Kirchhoff elasticity.
+    """Raise an error if a press cannot exist, or if the strains are too large for Saint-Venant-Kirchhoff elasticity.
 
     Args:
         film: The film.
@@ -173,7 +173,7 @@ def check_side_force(side_force: tuple[float, float], force: float) -> None:
 
 
 def layer_for(film: Film, force: float) -> float:
-    """Compute the total width of the thin rings at the rim.
+    """Compute the total width of the thin rings of elements at the rim of the film.
 
     Args:
         film: The film.
@@ -224,7 +224,7 @@ class LoadCase:
         start: PlacedMesh | None,
         side_force: tuple[float, float] = (0.0, 0.0),
     ) -> Self:
-        """Check a press, and choose the theory and the width of the thin rings if their settings are "auto".
+        """Check a press. Choose the theory and the width of the thin rings where the settings are "auto".
 
         Args:
             film: The film.
@@ -324,9 +324,9 @@ def place_coated(
 def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None) -> float:
     """Choose the total width of the thin rings at the rim.
 
-    The width is `LAYER_WIDTH` bending lengths. If the mesh of a starting equilibrium has thin rings of a similar width
-    and may have the same elements, the width of its thin rings is used instead. The field of the starting equilibrium
-    can then be the first iterate of the solve.
+    The default width is `LAYER_WIDTH` bending lengths. The width of the thin rings of the starting mesh is used instead
+    if both widths are similar and both meshes may have the same elements. With equal widths, the field of the starting
+    equilibrium can be the first iterate of the solve.
 
     Args:
         film: The film.
@@ -373,7 +373,7 @@ def choose_mesh(case: LoadCase) -> PlacedMesh:
 
 
 def needs_second_mesh(case: LoadCase) -> bool:
-    """Return whether a press must be solved on two meshes in order to estimate its error.
+    """Return whether a press must be solved on two meshes in order to estimate the error of the charges.
 
     The docstring of the module `error_estimate` states the reasons.
 
@@ -387,7 +387,7 @@ def needs_second_mesh(case: LoadCase) -> bool:
 
 
 def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
-    """Create the exception for a press that is so close to the rim that its mesh is too distorted.
+    """Create the exception for a press so close to the rim that the mesh is too distorted.
 
     Args:
         case: The press.
@@ -404,8 +404,8 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     """Generate the resolutions that are tried for a press, from coarse to fine.
 
     A small probe needs more rings. A press close to the rim needs more rings and more elements around the innermost
-    circle, because the conformal map stretches the template. In the inner half of the film, the first resolution is
-    sufficient.
+    circle, because the conformal map stretches the template. For presses in the inner half of the film, the first
+    resolution is sufficient.
 
     Args:
         case: The press and the required accuracy.
@@ -445,7 +445,8 @@ def _thin_ring_count(placement: Placement, layer: float) -> int:
 
     Each thin ring is a third as wide as the previous thin ring. In the template plane, the boundary layer of bending is
     widest next to the probe. The boundary layer is narrowest on the opposite side of the film, where the conformal map
-    compresses it. The widths of the thin rings cover the range between the largest and the smallest width.
+    compresses it. The widths of the thin rings cover the range between the largest and the smallest width of the
+    boundary layer.
 
     Args:
         placement: Placement of the mesh under the press.

@@ -1,10 +1,11 @@
-"""Newton's method for the equilibrium of the film, and the direct solution of the linear theories.
+"""Newton's method for the equilibrium of the film, and direct solution of the linear film theories.
 
 A flat film without pretension has no transverse stiffness, so Newton's method fails without modifications. Three
-modifications make the method reliable. First, the initial iterate has the shape of Schwerin's solution. Second, a line
-search on the energy determines the length of each step. Third, a stabilising tension is added to the tangent matrix,
-but not to the residual. With this tension, each step is a descent direction. The tension is proportional to the
-residual and vanishes near the equilibrium, so the convergence remains quadratic there.
+modifications make the method reliable. First, the iteration starts from a deflection with the shape of Schwerin's
+solution. Second, a line search on the energy determines the length of each step. Third, a stabilising tension is added
+to the tangent matrix, but not to the residual. Because of the stabilising tension, each Newton step is a descent
+direction of the energy. The tension is proportional to the residual and vanishes near the equilibrium, so Newton's
+method still converges quadratically.
 
 The iteration stops after `MAX_ITERATIONS` steps, or if the steps no longer become smaller (`PATIENCE`).
 """
@@ -130,7 +131,7 @@ def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Ar
 def parabolic_start(radius: np.ndarray, groups: DimensionlessGroups) -> Array:
     """Compute the first iterate of Newton's method for a film under static pressure without a probe.
 
-    The deflection is a paraboloid with the height that the static pressure approximately causes.
+    The deflection is a paraboloid whose height approximates the deflection under the static pressure.
 
     Args:
         radius: Distances of the nodes from the centre of the film, shape (n_node,), in film radii.
@@ -151,8 +152,8 @@ def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
 
     The first solve computes the deflection W under the load. The deflection causes the in-plane displacement U. In a
     linear theory, the induced stress does not affect the deflection. The tangent of the flat film does not couple W and
-    U. Therefore each further solve computes U and, by iterative refinement, a correction of W. The energy norm of the
-    correction is a measure of the error of W.
+    U. Each further solve therefore computes the in-plane displacement U and a correction of W (iterative refinement).
+    The energy norm of the correction is a measure of the error of W.
 
     Args:
         elastic: Discrete model of the film.
@@ -182,12 +183,12 @@ def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
 
 
 def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
-    """Compute the transverse residual without the forces of the induced stress.
+    """Compute the transverse residual without the transverse forces that the induced stress causes.
 
-    For a deflection without in-plane displacement, the transverse forces of the induced stress are cubic functions of
-    the deflection, and all other transverse forces are linear functions. Compared with the flat film, a deflection that
-    is multiplied by a factor a therefore changes the residual by r(a) = k a + c a^3. The linear part k = (8 r(a) - r(2
-    a)) / (6 a) follows from the changes for the factors a and 2 a.
+    Without in-plane displacement, the transverse forces of the induced stress are cubic functions of the deflection.
+    All other transverse forces are linear functions of the deflection. If the deflection is multiplied by a factor a,
+    the residual therefore differs from that of the flat film by r(a) = k a + c a^3. The linear part is k = (8 r(a)
+    - r(2 a)) / (6 a), which follows from the differences for the factors a and 2 a.
 
     Args:
         elastic: Discrete model of the film.
@@ -212,8 +213,8 @@ def solve_newton(
 ) -> NewtonResult:
     """Solve for the equilibrium of the film by Newton's method.
 
-    Each iteration factorises the tangent and takes one Newton step. The factorised tangent is then reused for further
-    steps as long as these steps reduce the residual sufficiently.
+    Each iteration factorises the tangent and takes one Newton step. The factorised tangent is reused for further steps
+    as long as these steps reduce the residual sufficiently.
 
     Args:
         elastic: Discrete model of the film.
@@ -278,7 +279,7 @@ class _Iterate:
         return cls(elastic, free, field, elastic.residual(field))
 
     def after(self, step: Array) -> Self:
-        """Return the next iterate, in which a step of shape (n_node, 3) is added to the field."""
+        """Return the iterate whose field is the present field plus a step of shape (n_node, 3)."""
         return type(self).of(self.elastic, self.free, self.field + step)
 
     @cached_property
@@ -296,14 +297,14 @@ class _Iterate:
         return float(max(transverse_ratio, in_plane_ratio))
 
     def result(self, converged: bool, iterations: int, message: str) -> NewtonResult:
-        """Return the result of a solve that ends with this iterate."""
+        """Return the result of a solve whose last iterate is this object."""
         return NewtonResult(self.field, converged, iterations, self.relative_residual, message)
 
 
 def _stalled(step_sizes: list[float]) -> bool:
     """Return whether the sizes of the steps no longer decrease.
 
-    This stagnation occurs if the film has no stiffness in some direction.
+    The sizes stagnate, for example, if the film has no stiffness in some direction.
 
     Args:
         step_sizes: Sizes of all previous steps, in the order of the steps.
@@ -316,9 +317,9 @@ def _stalled(step_sizes: list[float]) -> bool:
 
 
 def _step_size(elastic: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
-    """Compute the size of a step, which is its energy norm relative to the work of the load.
+    """Compute the size of a step as its energy norm relative to the work of the load.
 
-    The size is the square root of the ratio of the energy of the step to the work of the load.
+    The energy of the step is divided by the work of the load. The size is the square root of the quotient.
 
     Args:
         elastic: Discrete model of the film.
@@ -332,10 +333,11 @@ def _step_size(elastic: ElasticFilm, field: Array, step: Array, residual: Array)
 
 
 def _stabilising_tension(elastic: ElasticFilm, relative_residual: float) -> float:
-    """Compute the tension that is added to the tangent, because a flat film without pretension has no stiffness.
+    """Compute the tension that is added to the tangent in order to stabilise Newton's method.
 
-    The tension is proportional to the relative residual. The tension does not exceed `STABILISING_TENSION` times the
-    tension that the load induces. The tension is zero if the relative residual is at most `UNSTABILISED_BELOW`.
+    A flat film without pretension has no transverse stiffness. The tension is proportional to the relative residual.
+    The tension does not exceed `STABILISING_TENSION` times the tension that the load induces. The tension is zero if
+    the relative residual is at most `UNSTABILISED_BELOW`.
 
     Args:
         elastic: Discrete model of the film.
@@ -355,10 +357,10 @@ def _induced_tension(elastic: ElasticFilm) -> float:
 
 
 def _take_full_step(iterate: _Iterate, step: Array) -> _Iterate | None:
-    """Return the iterate after the full Newton step if this step at least halves the residual, and None otherwise.
+    """Return the iterate after the full Newton step, or None if the step does not at least halve the residual.
 
     The step may increase the energy. An increase of the energy is allowed, because the flat equilibrium of a compressed
-    film can have a slightly higher energy than its wrinkled equilibrium.
+    film can have a slightly higher energy than the wrinkled equilibrium.
 
     Args:
         iterate: Present iterate.
@@ -374,8 +376,9 @@ def _take_full_step(iterate: _Iterate, step: Array) -> _Iterate | None:
 def _chord_steps(iterate: _Iterate, factor: TangentFactor, previous_residual: float, tolerance: float) -> _Iterate:
     """Take further steps with the factorised tangent of the last Newton step, as long as they reduce the residual.
 
-    This is the chord method. A step with a reused tangent costs a seventh of a Newton step. If the last step multiplied
-    the residual by a factor s, the next step with the same tangent multiplies the residual by about 2 s (Kelley 1995).
+    This is the chord method. A step with a reused tangent takes about a seventh of the time of a Newton step. If the
+    last step multiplied the residual by a factor s, the next step with the same tangent multiplies the residual by
+    about 2 s (Kelley 1995).
 
     Args:
         iterate: Iterate after the Newton step.
@@ -400,9 +403,9 @@ def _chord_steps(iterate: _Iterate, factor: TangentFactor, previous_residual: fl
 def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
     """Return the Newton step if it is a descent direction of the energy, and a modified step otherwise.
 
-    The residual is the gradient of the energy. A step is therefore a descent direction if its product with the residual
-    is negative. A modified step is computed after a tension is added to the tangent. The tension is doubled until the
-    modified step is a descent direction, or until `MAX_DESCENT_TRIALS` tensions were tried.
+    The residual is the gradient of the energy. A step is therefore a descent direction if its scalar product with the
+    residual is negative. The modified step is computed with a tension that is added to the tangent. The tension is
+    doubled until the modified step is a descent direction, or until `MAX_DESCENT_TRIALS` tensions were tried.
 
     Args:
         iterate: Present iterate.
@@ -428,9 +431,9 @@ def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
 def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
     """Halve a step until it lowers the energy sufficiently.
 
-    According to the condition of Armijo, the energy must decrease by at least `ARMIJO_SHARE` times the decrease that
-    the slope of the energy along the step predicts. If the change of the energy may be caused by rounding errors, the
-    step must lower the residual instead.
+    According to Armijo's condition, the energy must decrease by at least `ARMIJO_SHARE` times the decrease that the
+    slope of the energy along the step predicts. If the change of the energy may be caused by rounding errors, the step
+    must lower the residual instead.
 
     Args:
         iterate: Present iterate.

@@ -1,4 +1,4 @@
-"""Solver of a press, which computes the equilibrium of the film under a probe.
+"""Computation of the equilibrium of a film under a probe.
 
 The solver chooses the mesh, and solves the press with the selected theory. If the solve with the full load fails, the
 load is applied in steps.
@@ -107,7 +107,7 @@ def needed_resolution(
 ) -> Resolution:
     """Return the resolution that the function `press` would choose for a press.
 
-    The press is only solved if the solutions on two meshes must be compared.
+    The press is solved only if the solutions on two meshes must be compared.
 
     Args:
         film: The clamped film.
@@ -129,11 +129,12 @@ def needed_resolution(
 
 
 def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equilibrium:
-    """Solve a press on meshes of increasing order until the charges of two meshes agree within half of the accuracy.
+    """Solve a press on meshes of increasing order until the charges on two meshes agree.
 
-    The order is increased at most `MAX_EXTRA_ORDERS` times. If no equilibrium is found on the first or the second mesh,
-    the status of the result is "failed". If no equilibrium is found on a later mesh, the result is the equilibrium on
-    the previous mesh. If the equilibria on the last two meshes are different, the status of the result is "failed".
+    The charges agree if their relative difference is at most half of the required accuracy. The order is increased at
+    most `MAX_EXTRA_ORDERS` times. If no equilibrium is found on the first or the second mesh, the status of the result
+    is "failed". If no equilibrium is found on a later mesh, the result is the equilibrium on the previous mesh. If the
+    charges on the last two meshes differ by more than `DIFFERENT_EQUILIBRIUM`, the status is "failed", too.
 
     Args:
         case: The press and the required accuracy.
@@ -148,15 +149,15 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
     for _ in range(MAX_EXTRA_ORDERS):
         resolution = solved.mesh.resolution
         finer_mesh = case.place(replace(resolution, order=resolution.order + 1))
-        finer = _solve(case, finer_mesh, solved)
-        iterations = solved.iterations + finer.iterations
-        if finer.status != "converged":
+        finer_equilibrium = _solve(case, finer_mesh, solved)
+        iterations = solved.iterations + finer_equilibrium.iterations
+        if finer_equilibrium.status != "converged":
             only_one_mesh_is_solved = solved.proven_error is None
             if only_one_mesh_is_solved:  # the error of this mesh is unknown
-                return replace(finer, iterations=iterations)
+                return replace(finer_equilibrium, iterations=iterations)
             break
-        error = relative_difference(solved, finer)
-        solved = replace(finer, iterations=iterations, proven_error=error)
+        error = relative_difference(solved, finer_equilibrium)
+        solved = replace(finer_equilibrium, iterations=iterations, proven_error=error)
         if error <= 0.5 * case.accuracy:
             break
 
@@ -217,7 +218,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 
 
 def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
-    """Solve the film before the contact, and store the solution as the attribute `rest` of the equilibrium of a press.
+    """Solve the film before the contact, and add the solution to an equilibrium as the attribute `rest`.
 
     Before the contact, only the static pressure acts on the film.
 
@@ -246,7 +247,7 @@ def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
 
 
 def _static_start(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
-    """Return the first iterate of the solve of a film under static pressure, shape (n_node, 3).
+    """Return the first iterate for a film under static pressure, shape (n_node, 3).
 
     Args:
         mesh: Mesh of the film.
@@ -257,9 +258,9 @@ def _static_start(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
 
 
 def _elastic_film(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
-    """Create the discrete model of the film for a press with another force.
+    """Create the discrete model of the film for a press whose force is replaced by another force.
 
-    The side force is multiplied by the ratio of the other force to the force of the press.
+    The side force is changed in proportion to the force.
 
     Args:
         case: The press.
@@ -285,8 +286,9 @@ def _solve_nonlinear(
 ) -> NewtonResult:
     """Solve a press with a nonlinear theory by Newton's method.
 
-    If the starting equilibrium has the same mesh, its field is the first iterate. Otherwise the first iterate is the
-    field of `schwerin_start`. If Newton's method fails, the load is applied in steps.
+    If the starting equilibrium has the same elements, `_first_field` computes the first iterate from the starting
+    field. Without such an equilibrium, the first iterate is an approximate deflection under the probe and the static
+    pressure. If Newton's method fails, the load is applied in steps.
 
     Args:
         case: The press and the settings of its solve.
@@ -314,11 +316,11 @@ def _solve_nonlinear(
 def _solve_by_load_steps(
     case: LoadCase, failed: NewtonResult, geometry: Geometry, solver: Assembly, first_field: Array
 ) -> NewtonResult:
-    """Solve a press with increasing forces, after the solve with the full force has failed.
+    """Solve a press for increasing forces, because the solve with the full force has failed.
 
-    Each solve starts from the field of the largest force with an equilibrium. After each successful solve, the force is
-    multiplied by a factor, which is two at the beginning. If a solve fails, the factor is replaced by its square root.
-    If the solve with the first force fails, no further force is tried.
+    Each solve starts from the field under the largest force for which an equilibrium was found. After each successful
+    solve, the force is multiplied by a factor. The factor is two at the beginning. If a solve fails, the square root of
+    the factor is used instead. If the solve with the first force fails, no further force is tried.
 
     Args:
         case: The press.
@@ -362,7 +364,7 @@ def _first_field(start: Equilibrium | None, template: Template, default: Array) 
     """Return the first iterate of Newton's method, shape (n_node, 3).
 
     If the mesh of the starting equilibrium has the same elements, the first iterate is the field of the starting
-    equilibrium. If the elements differ only in their order, the field is interpolated.
+    equilibrium. If the elements differ only in the polynomial order, the field is interpolated.
 
     Args:
         start: Equilibrium of a similar press; None if there is no such equilibrium.
@@ -387,7 +389,7 @@ def _first_field(start: Equilibrium | None, template: Template, default: Array) 
 
 
 def _interpolate_to_order(field: Array, field_template: Template, template: Template) -> Array:
-    """Interpolate a nodal field to the same elements with another order.
+    """Interpolate a nodal field to the nodes of the same elements with another polynomial order.
 
     Args:
         field: Values at the nodes of `field_template`, shape (n_field_node, 3).
@@ -399,10 +401,10 @@ def _interpolate_to_order(field: Array, field_template: Template, template: Temp
     """
     # Weights of the nodes of an element for the values at its new nodes, shape (n_local, n_field_local)
     weights = tensor_values(field_template.resolution.order, template.xi, template.eta)
-    interpolated = np.empty((template.n_node, 3))
+    new_field = np.empty((template.n_node, 3))
     # A node of several elements is assigned several times. The field is continuous, so the values are equal.
-    interpolated[template.nodes] = weights @ field[field_template.nodes]
-    return interpolated
+    new_field[template.nodes] = weights @ field[field_template.nodes]
+    return new_field
 
 
 def _failure_reason(solved: Equilibrium, tolerance: float) -> str:

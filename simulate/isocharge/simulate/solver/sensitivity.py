@@ -1,19 +1,19 @@
-"""First-order change of an equilibrium by imperfections of the film, such as anisotropy and an oval clamp.
+"""Effect of small imperfections of the film, such as anisotropy or an oval clamp, on an equilibrium.
 
 The displacements u of an equilibrium satisfy R(u, m) = 0, where R is the residual and m is the value of an
-imperfection. The tangent is K = dR/du. A small imperfection changes the displacements by
+imperfection. The tangent is K = dR/du. The derivative of the displacements with respect to m is
 
     du/dm = -K^-1 dR/dm.
 
-The solution of this equation costs one back substitution with the factorised tangent.
+If the tangent is already factorised, the derivative costs only one back substitution.
 
 An imperfection may have two axes, like an ellipse. Let alpha be the angle between one axis of the imperfection and the
-direction of the press. The change of the equilibrium is then the sum of two fields with the factors cos(2 alpha) and
-sin(2 alpha). With respect to a reflection in the line through the centre of the film and the press, the first field is
-even and the second field is odd. Both fields are solved on the meshed half of the film, with different displacement
-components fixed on the line of symmetry.
+direction of the press. To first order, the change of the equilibrium is a sum of two fields, which have the factors
+cos(2 alpha) and sin(2 alpha). With respect to a reflection in the line through the centre of the film and the press,
+the first field is even and the second field is odd. Both fields are solved on the meshed half of the film, but
+different displacement components are fixed on the line of symmetry.
 
-The derivative dR/dm and the change of the stress are computed as central differences.
+The derivative dR/dm and the change of the stress are computed by central differences.
 """
 
 from collections.abc import Callable, Sequence
@@ -153,8 +153,8 @@ An imperfection with two axes has an even field and an odd field, in this order.
 def _side_load_imperfection(direction: tuple[float, float]) -> AddImperfection:
     """Create a function that adds a side load to a press.
 
-    The unit of the side load is E h a A^2. In this product, E, h and a are Young's modulus, the thickness and the
-    radius of the film, and A is the amplitude of the press.
+    The unit of the side load is E h a A^2, with Young's modulus E, the thickness h, the film radius a and the amplitude
+    A.
 
     Args:
         direction: Unit vector (x, y) of the side load.
@@ -190,10 +190,10 @@ IS_ODD = np.array([field.odd for fields in FIELDS.values() for field in fields])
 
 
 def stress_changes(solved: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute the changes of the scaled stress at the nodes that are caused by all imperfections in `FIELDS`.
+    """Compute how all imperfections in `FIELDS` change the scaled stress at the nodes.
 
-    The changes are computed at fixed points of a film whose press is rotated onto the x axis. If the clamp becomes
-    oval, the nodes move. The change of the stress by the movement of the nodes is subtracted.
+    The changes refer to fixed points of the film, after the press has been rotated onto the x axis. If the clamp
+    becomes oval, the nodes move. Stress changes that result only from the movement of the nodes are subtracted.
 
     Args:
         solved: Press with a circular probe on an axisymmetric film, solved with a theory that includes stretching.
@@ -207,10 +207,10 @@ def stress_changes(solved: Equilibrium, surface: Surface = "middle") -> Array:
 
 
 def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute the changes of the scaled stress at the nodes that are caused by the forces in `SIDE_FORCE_FIELDS`.
+    """Compute how the side forces in `SIDE_FORCE_FIELDS` change the scaled stress at the nodes.
 
-    The changes are computed for a scaled side load of one. The function `scaling.side_force_unit` computes the side
-    force that belongs to this side load.
+    The changes are computed for a scaled side load of one. The function `scaling.side_force_unit` returns the
+    corresponding side force in N.
 
     Args:
         solved: Press with a circular probe on an axisymmetric film, solved with a theory that includes stretching.
@@ -224,7 +224,7 @@ def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array
 
 
 def tension_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
-    """Compute the changes of the scaled stress at the nodes that are caused by the tensions in `TENSION_FIELDS`.
+    """Compute how the tensions in `TENSION_FIELDS` change the scaled stress at the nodes.
 
     The changes are computed for one unit of tension. The unit is the sum of E A^2 and the mean pretension, where E is
     Young's modulus and A is the amplitude of the press.
@@ -241,7 +241,7 @@ def tension_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
 
 
 def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: Surface) -> Array:
-    """Compute the changes of the scaled stress at the nodes that are caused by several imperfections.
+    """Compute how several imperfections change the scaled stress at the nodes.
 
     Even and odd fields have different fixed displacements on the line of symmetry. Therefore the tangent is factorised
     once for all even fields, and once for all odd fields.
@@ -271,7 +271,7 @@ def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface:
 def _stress_change(
     solved: Equilibrium, add_imperfection: AddImperfection, factor: TangentFactor, surface: Surface
 ) -> Array:
-    """Compute the change of the scaled stress at the nodes that is caused by one imperfection.
+    """Compute how one imperfection changes the scaled stress at the nodes.
 
     Args:
         solved: The solved press.
@@ -283,26 +283,27 @@ def _stress_change(
         Change per unit of the imperfection, shape (n_element, n_local, 3).
     """
     # Add a positive and a negative step of the imperfection. The displacements are not in equilibrium yet.
-    positive = add_imperfection(solved, STEP)
-    negative = add_imperfection(solved, -STEP)
+    positive_press = add_imperfection(solved, STEP)
+    negative_press = add_imperfection(solved, -STEP)
 
     # Compute the change of the displacements that restores the equilibrium after one positive step. The change of the
     # residual by one step is half of the difference between both residuals.
-    positive_residual = ElasticFilm(positive.mesh.geometry, positive.groups).residual(positive.field)
-    negative_residual = ElasticFilm(negative.mesh.geometry, negative.groups).residual(negative.field)
+    positive_residual = ElasticFilm(positive_press.mesh.geometry, positive_press.groups).residual(positive_press.field)
+    negative_residual = ElasticFilm(negative_press.mesh.geometry, negative_press.groups).residual(negative_press.field)
     displacement_change = -0.5 * factor.solve(positive_residual - negative_residual)
 
     # Compute the derivative of the stress by a central difference.
-    positive_equilibrium = replace(positive, field=positive.field + displacement_change)
-    negative_equilibrium = replace(negative, field=negative.field - displacement_change)
+    positive_equilibrium = replace(positive_press, field=positive_press.field + displacement_change)
+    negative_equilibrium = replace(negative_press, field=negative_press.field - displacement_change)
     positive_stress = nodal_stress(positive_equilibrium, surface)
     negative_stress = nodal_stress(negative_equilibrium, surface)
     change = (positive_stress - negative_stress) / (2.0 * STEP)
 
     # The nodes of an oval film move with the rim. Subtract the change of the stress that the movement of the nodes
     # causes, so that the result holds for fixed points of the film.
-    if positive.mesh.oval != 0.0:
-        node_shift = (positive.mesh.points - negative.mesh.points) / (2.0 * STEP)  # x + iy, shape (n_element, n_local)
+    if positive_press.mesh.oval != 0.0:
+        # Derivative of the positions x + iy of the nodes, shape (n_element, n_local)
+        node_shift = (positive_press.mesh.points - negative_press.mesh.points) / (2.0 * STEP)
         stress_gradient = solved.mesh.node_derivatives(nodal_stress(solved, surface))
         x_contribution = node_shift.real[..., None] * stress_gradient[..., 0, :]
         y_contribution = node_shift.imag[..., None] * stress_gradient[..., 1, :]

@@ -1,10 +1,11 @@
 """Largest stress of a film under a press, and the largest force for which this stress does not exceed a limit.
 
-The largest principal stress occurs under the probe, at the surface of the film. For presses within 0.7 film radii, the
-largest stress hardly depends on the position. The stress is therefore computed for a press at the centre. Closer to the
-rim, the largest stress is larger. The stress is 1.4 times as large for a press at 0.8 film radii as for a press at the
-centre, and 3.7 times as large for a press at 0.93 film radii. Under a small probe, the stress increases slightly more
-slowly with the force F than F^(2/3), which is the power law of a membrane.
+The largest principal stress occurs under the probe, at the surface of the film. For presses within 0.7 film radii of
+the centre, the largest stress hardly depends on the position of the press. The largest stress is therefore computed for
+a press at the centre. For presses closer to the rim, the largest stress increases. Compared with a press at the centre,
+it is 1.4 times as large for a press at 0.8 film radii, and 3.7 times as large for a press at 0.93 film radii. In a
+membrane, the stress is proportional to F^(2/3), where F is the force. Under a small probe, the stress increases
+slightly more slowly with the force.
 """
 
 from functools import lru_cache
@@ -41,7 +42,7 @@ def largest_stress(film: Film, probe: Probe, force: float) -> float:
 
 
 def stress_caution(film: Film, probe: Probe, force: float, limit: float = DEFAULT_STRESS_LIMIT) -> str:
-    """Return a warning if the stress under a press exceeds a limit, and an empty text otherwise.
+    """Return a warning if the stress under a press exceeds a limit, and an empty string otherwise.
 
     Args:
         film: The film.
@@ -63,7 +64,7 @@ def stress_caution(film: Film, probe: Probe, force: float, limit: float = DEFAUL
 
 
 def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tuple[float, float]) -> float:
-    """Compute the largest force of a range for which the stress does not exceed a limit.
+    """Compute the largest force within a range for which the stress in the film does not exceed a limit.
 
     The equation ln(stress / limit) = 0 is solved for the logarithm of the force by the secant method. The relative
     error of the force is below 0.1 %.
@@ -75,7 +76,7 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
         force_range: Smallest and largest force, N.
 
     Returns:
-        Force, N.
+        Force, N. If no force of the range exceeds the limit, the largest force of the range is returned.
 
     Raises:
         SceneError: If even the smallest force exceeds the limit, or a press cannot exist.

@@ -1,13 +1,13 @@
 """Factorisation of the tangent of an equilibrium, including the stiffness of trapped air.
 
-The air behind the film resists a deflection of the film that compresses the air. The stiffness matrix of the air is c v
-v', where c is a number. The vector v contains the weights with which the deflections of the nodes contribute to the
-displaced volume. The matrix c v v' couples all nodes, but its rank is only one. Therefore the system (K + c v v') x = b
+The trapped air behind the film resists deflections that compress the air. The stiffness matrix of the air is c v v',
+where c is a number. The vector v contains the weights with which the deflections of the nodes contribute to the
+displaced volume. The matrix c v v' couples all nodes, but has only rank one. Therefore the system (K + c v v') x = b
 can be solved with the factorisation of the sparse matrix K (Sherman and Morrison 1950). The solution is
 
     x = K^-1 b - y c (v' K^-1 b) / (1 + c v' y),   y = K^-1 v.
 
-Fields that are odd about the line of symmetry do not change the volume of the air. Their matrix is K.
+Fields that are odd about the line of symmetry do not change the volume of the air. For these fields, the matrix is K.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from isocharge.simulate.solver.assembly import Assembly, Factor
 
 
 class TangentFactor(Protocol):
-    """Factorisation with which linear systems with the tangent are solved."""
+    """Interface of a factorised tangent matrix, with which linear systems are solved."""
 
     def solve(self, right: Array) -> Array:
         """Solve for the displacements at the nodes.
@@ -59,7 +59,7 @@ class _AirFactor:
 
 
 def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, added_tension: float = 0.0) -> TangentFactor:
-    """Factorise the tangent of the film at a given field, including the stiffness of trapped air.
+    """Factorise the tangent of the film for given displacements, including the stiffness of trapped air.
 
     The tangent is K + c v v', where K is the matrix of the film, v contains the integration weights of the displaced
     volume, and c is the stiffness of the air. The formula of Sherman and Morrison needs only the factorisation of K.

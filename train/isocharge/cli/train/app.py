@@ -1,4 +1,4 @@
-"""Command group `isocharge train`, which imports the module of a command when the command is called."""
+"""Command group `isocharge train`. The module of a command is imported when the command is called."""
 
 from isocharge.cli.shared.lazy import LazyCommand, lazy_group
 
@@ -10,7 +10,7 @@ train_app = lazy_group(
         ),
         "press": LazyCommand(
             "isocharge.cli.train.press:press_command",
-            "Guide presses at a port, and write them to a file.",
+            "Record presses at a port, and write them to a file.",
             extra="train",
         ),
         "calibrate": LazyCommand(

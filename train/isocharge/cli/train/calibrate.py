@@ -1,4 +1,4 @@
-"""`isocharge train calibrate`: calibrate a film by measured presses, and write a model of this film."""
+"""`isocharge train calibrate`: calibrate a film with measured presses, and write a model of this film."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -105,11 +105,11 @@ def calibrate_command(
 ) -> None:
     """Calibrate a film: estimate its parameters from measured presses, and write a model of this film.
 
-    Three presses are useful, and eight are recommended. The position of each press must be known, or its force, or
+    Three presses are useful, and eight are recommended. For each press, the position or the force must be known, or
     both. The option --next proposes presses, even before the first press. The command names the parameters that the
     presses do not determine.
 
-    `isocharge train press` guides presses at a port, and writes their file.
+    The command `isocharge train press` records presses at a port, and writes PRESSES.csv.
 
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
@@ -139,11 +139,11 @@ def calibrate_command(
             _write(result, output)
 
     # The next presses are chosen for the calibrated film, or for all possible films if nothing was calibrated.
-    proposed: list[ProposedPress] = []
+    proposed_presses: list[ProposedPress] = []
     if next_count:
         film = None if result is None else result.posterior
-        proposed = next_presses(problem, next_count, film, position_std_mm=position_std_mm, force_std=force_std)
-    _print_result(result, proposed, json=json)
+        proposed_presses = next_presses(problem, next_count, film, position_std_mm=position_std_mm, force_std=force_std)
+    _print_result(result, proposed_presses, json=json)
 
 
 def calibrate_into(presses: MeasuredPresses, problem: CalibrationProblem, output: Path, *, json: bool) -> None:
@@ -175,24 +175,24 @@ def _fit(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationRe
     return result
 
 
-def _print_result(result: CalibrationResult | None, proposed: list[ProposedPress], *, json: bool) -> None:
+def _print_result(result: CalibrationResult | None, proposed_presses: list[ProposedPress], *, json: bool) -> None:
     """Print the result of a calibration, if there is one, and the proposed presses.
 
     For each proposed press, the function prints the errors of position and force that would remain after this press.
 
     Args:
         result: Result of the calibration; None if only presses are proposed.
-        proposed: Presses that should be made next.
+        proposed_presses: Presses that should be made next.
         json: Whether to print JSON instead of sentences.
     """
     if json:
         result_fields = {} if result is None else result_table(result)
-        show_json(result_fields | {"next": [vars(press) for press in proposed]})
+        show_json(result_fields | {"next": [vars(press) for press in proposed_presses]})
         return
     if result is not None:
         for sentence in result.summary:
             show(sentence)
-    for press in proposed:
+    for press in proposed_presses:
         show(
             f"press {press.force_N:.2f} N at ({press.x_mm:.1f}, {press.y_mm:.1f}) mm: "
             f"leaves {press.position_mm:.3f} mm, {press.force_percent:.2f} %"
@@ -200,7 +200,7 @@ def _print_result(result: CalibrationResult | None, proposed: list[ProposedPress
 
 
 def _with_temperature(presses: MeasuredPresses, temperature_C: float | None) -> MeasuredPresses:
-    """Set the temperature of all presses, unless the presses already have temperatures or no temperature is given."""
+    """Set the temperature of all presses, unless they have temperatures already or the given temperature is None."""
     if temperature_C is None or presses.knows_temperature:
         return presses
     return replace(presses, temperature_C=np.full(len(presses), temperature_C))
@@ -248,7 +248,7 @@ def _check_usage(
 
 
 def _check_side_forces(file: Path | None, friction: float, side_force: float, *, is_moved: bool) -> None:
-    """Raise an error if an option for side forces is given without presses or a model to which it could apply.
+    """Raise an error if an option for side forces is given without presses or a model to which it applies.
 
     Args:
         file: File of presses.

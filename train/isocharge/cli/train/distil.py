@@ -33,7 +33,7 @@ def distil_command(
     fresh: FreshOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Train a small network on the answers of MODEL, for microcontrollers: about 5,000 weights and biases.
+    """Train a small network for microcontrollers, with about 5,000 weights and biases, on the answers of MODEL.
 
     The small network, called the student, has the inputs and outputs of MODEL: contact, standard deviations and misfit.
     The student is trained on simulated presses within the working area and the range of forces of MODEL. The command
@@ -67,7 +67,7 @@ def distil_command(
     data = student_data(model_folder, presses)
 
     def train(run: ResumableRun) -> Fitted:
-        """Train the student, and save the state in the run."""
+        """Train the student, and save the state of the training in the run."""
         return fit(data, fit_config, run=run)
 
     train_and_release(train, fit_identity(data, fit_config), version_folder, options, release)

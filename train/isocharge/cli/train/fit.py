@@ -90,7 +90,7 @@ def fit_command(
         typer.Option(
             "--films",
             help="With --sensor: train one network for all films that the sensor may have, which `isocharge train "
-            "calibrate` uses. This takes about ten minutes on 2 cores. (default: only the film as described)",
+            "calibrate` uses. This takes about seven minutes on 2 cores. (default: only the film as described)",
         ),
     ] = False,
     position_std_mm: PositionStdOption = 0.1,
@@ -109,13 +109,13 @@ def fit_command(
     With measured presses and --sensor, the film is calibrated, as `isocharge train calibrate` does. If there is no
     network for all films of this sensor, the presses correct the simulated charges instead. In this case, a fifth of
     the presses is held out to measure the errors. With measured presses and no --sensor, a network is trained on the
-    presses alone. Without --sensor, the sensor can be any sensor with three to eight channels, and every other column
-    of the file is a channel. The errors are measured by cross-validation, in which all presses at a place are left out
-    together.
+    presses alone. Without --sensor, any sensor with three to eight channels is possible. Each column of the file whose
+    name has no other meaning is a channel. The errors are measured by cross-validation, in which all presses at a place
+    are left out together.
 
     With --films, the network is trained on many films. The pretension, stiffness, piezoelectric coefficients, gains and
-    electrode positions of these films are drawn at random. With --films, the model folder also contains films.npz,
-    which is the network for all these films.
+    electrode positions of these films are drawn at random. With --films, the model folder also contains films.npz, the
+    file of the network for all films.
 
     A run that was stopped leaves models/NAME/VERSION.part. The same command continues a stopped run and makes the same
     model.
@@ -181,7 +181,7 @@ def _release_films_model(film_prior: FilmPrior, films_config: FilmsConfig, optio
     warn_of_stress(film_prior.sensor.film, [film_prior.probe], max_force)
 
     def train(run: ResumableRun) -> FilmsModel:
-        """Train the network on all cores of this machine, and save the state in the run."""
+        """Train the network on all cores of this machine, and save the state of the training in the run."""
         with local_workers(worker_count(None)) as executor:
             return fit_films(film_prior, films_config, executor=executor, run=run)
 
@@ -203,7 +203,7 @@ def _release_presses_model(
     sensor_name = options.model_folder.resolve().name  # the sensor has no other name than that of the model
 
     def train(run: ResumableRun) -> Fitted:
-        """Train the network, and save the state in the run."""
+        """Train the network, and save the state of the training in the run."""
         return fit_presses(presses, sensor_name, fit_config, probes=notations, run=run)
 
     train_and_release(train, presses_identity(presses, fit_config), version_folder, options, release)
@@ -223,14 +223,14 @@ def _release_data_model(data: TrainingData, fit_config: FitConfig, options: Rele
     warn_of_stress(data.sensor.film, probes, max_force)
 
     def train(run: ResumableRun) -> Fitted:
-        """Train the network, and save the state in the run."""
+        """Train the network, and save the state of the training in the run."""
         return fit(data, fit_config, run=run)
 
     train_and_release(train, fit_identity(data, fit_config), version_folder, options, release)
 
 
 def _read_or_simulate_data(dataset: Path | None, sensor: str | None, notations: list[str], radius: str) -> TrainingData:
-    """Return training data that are read from a dataset folder, or simulated on a sensor.
+    """Read training data from a dataset folder, or simulate training data for a sensor.
 
     Args:
         dataset: Dataset folder; None to simulate presses.
@@ -313,7 +313,7 @@ def _read_rig(
 
 
 def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | None:
-    """Return the calibration problem for the film of measured presses.
+    """Return the calibration problem of the film on which measured presses were made.
 
     Args:
         rig: The presses, the sensor and the probe.
@@ -360,7 +360,7 @@ def refuse_training_options(config: Path | None, version: int, radius: str) -> N
 def _film_prior(
     dataset: Path | None, sensor: str | None, notations: list[str], radius: str, config: Path | None
 ) -> FilmPrior:
-    """Check the other options, and return the distribution of the films of a sensor for `--films`.
+    """For `--films`, check the other options, and return the distribution of the films of a sensor.
 
     Args:
         dataset: Dataset or file of presses, which must be None.

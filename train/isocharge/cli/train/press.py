@@ -1,4 +1,4 @@
-"""`isocharge train press`: guide presses at a port, and write the file of measured presses."""
+"""`isocharge train press`: record presses at a port, and write the file of measured presses."""
 
 import shlex
 import sys
@@ -116,7 +116,7 @@ def press_command(
         bool, typer.Option("--json", help="Print one JSON object for each press on stdout. (default: none)")
     ] = False,
 ) -> None:
-    """Guide presses on a film at a port, and write them to a file of measured presses.
+    """Record presses on a film at a port, and write them to a file of measured presses.
 
     The command proposes a press, records the press when the charges are steady, and asks whether it was made at the
     proposed place. After each press, the command reports how accurately the film is known. The session ends when the
@@ -262,20 +262,20 @@ def _ignore_press(session: PressSession, press: SteadyPress) -> None:
 
 
 def _print_press(session: PressSession, press: SteadyPress) -> None:
-    """Print one line of JSON with the last press, and with the accuracy with which the film is then known."""
+    """Print one line of JSON with the last press and the remaining errors."""
     show_json(_press_table(session, press) | {"next": None})
 
 
 def _print_press_and_proposal(session: PressSession, press: SteadyPress) -> None:
-    """Print one line of JSON with the last press, with the accuracy, and with the press that is proposed next."""
+    """Print one line of JSON with the last press, the remaining errors, and the press that is proposed next."""
     proposed = None if session.enough else vars(session.proposed)
     show_json(_press_table(session, press) | {"next": proposed})
 
 
 def _press_table(session: PressSession, press: SteadyPress) -> dict[str, object]:
-    """Return the values of a line of JSON about the last press of a session.
+    """Return the values to print as one line of JSON about the last press.
 
-    Further values state the accuracy with which the film is known after this press.
+    Some of the values state how accurately the film is known after this press.
 
     Args:
         session: The session, which contains the press.

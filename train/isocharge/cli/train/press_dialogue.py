@@ -38,9 +38,9 @@ OnTaken = Callable[[PressSession, SteadyPress], None]
 
 
 class Screen:
-    """Messages on stderr for the person who presses.
+    """Printer of messages on stderr for the person who presses.
 
-    The messages are sentences and, while a press settles, the charges about once per second.
+    The messages are sentences. While a press settles, the charges are also shown, about once per second.
     """
 
     def __init__(self, electrodes: tuple[str, ...]) -> None:
@@ -61,8 +61,8 @@ class Screen:
     def show_phase(self, watched: WatchResult) -> None:
         """Print the instruction of the present phase, and the charges while a press settles.
 
-        Within one phase, the time between two lines is at least `LINE_INTERVAL_s`. Nothing is printed in phases without
-        an instruction, such as that of a steady press.
+        Within one phase, the time between two lines is at least `LINE_INTERVAL_s`. In a phase without an instruction,
+        for example the phase of a steady press, nothing is printed.
 
         Args:
             watched: Result of the press watch for the last reading: phase, time for which the press is held, charges.
@@ -151,7 +151,7 @@ class Dialogue:
             ) from end
 
     def _follow_press(self, row_number: int, contact: Array) -> None:
-        """Wait for the press of one row of the list of a machine, and record the press.
+        """Wait for the press that belongs to one row of a machine's list, and record the press.
 
         A refused press is left out, because the machine has already moved on to the next row.
 
@@ -243,8 +243,8 @@ class Dialogue:
     def _act_on(self, answer: Answer, press: SteadyPress | None, proposed: Array) -> bool:
         """Carry out the command of an answer: quit, skip the proposal, record the steady press, or remove a press.
 
-        A press can only be recorded if it is steady. If there is a steady press, the command that removes the last
-        press discards the steady press.
+        A press can only be recorded if it is steady. While a press is steady, the command to remove the last press
+        discards the steady press.
 
         Args:
             answer: The command, which was read from the typed line.
@@ -297,13 +297,13 @@ class Dialogue:
         return True
 
     def _say_summary(self) -> None:
-        """Print the sentences about the accuracy with which the film is known."""
+        """Print sentences that state how accurately the film is known."""
         for sentence in self._session.summary:
             self._screen.say(f"   {sentence}")
 
 
 def _count_rows_made(session: PressSession, contacts: Array) -> int:
-    """Return the number of rows in the list of a machine up to and including the last press of the session.
+    """Count the rows in a machine's list up to and including the last press of the session.
 
     The number is 0 if the session has no press, or if its last press is not in the list. If several rows are equal to
     the last press, the last of these rows counts.

@@ -22,7 +22,7 @@ class PressEvents:
 
     The object is a context manager that starts and stops the reading threads.
 
-    The port is also read while a person answers a question and while a fit runs, so that no reading is lost. Therefore,
+    No reading is lost, because the port is also read while a person answers a question and while a fit runs. Therefore,
     the watch also detects that a probe is lifted while a question is open.
     """
 
@@ -65,7 +65,7 @@ class PressEvents:
     def next(self) -> WatchResult | str:
         """Wait for the next reading or typed line.
 
-        Readings from before the last call of `arm` are discarded.
+        Readings that were made before the last call of `arm` are discarded.
 
         Returns:
             Result of the watch for a reading, or the typed line.
@@ -86,9 +86,9 @@ class PressEvents:
     def _read_port(self) -> None:
         """Read the port until its end, and put the events of the readings into the queue.
 
-        The press watch finds steady presses in the readings. After a call of `arm` in another thread, the press watch
-        begins again. Each event is stored with the number of earlier calls of `arm`. The method `next` can therefore
-        discard the events from before the last call. The method runs in its own thread.
+        The press watch finds steady presses in the readings. If another thread calls `arm`, the press watch begins
+        again. Each event is stored with the number of earlier calls of `arm`. The method `next` can therefore discard
+        the events before the last call of `arm`. The method runs in its own thread.
         """
         arm_count = self._arm_count  # number of calls for which the watch is armed
         try:

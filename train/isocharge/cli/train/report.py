@@ -66,7 +66,7 @@ def report_command(
 
     All methods predict the same presses with noise. If DATASET was measured, the methods are tested on a fifth of its
     presses, to which no method was fitted. In this case, no noise is added to the charges, and all results that need a
-    simulation are left out. The option --probe states the probe that made the presses of PRESSES.csv.
+    simulation are left out. The option --probe states the probe with which the presses of PRESSES.csv were made.
 
     The report takes some minutes for a dataset of 24,000 presses. Durations are measured, so do not run other programs
     at the same time. If the report is interrupted, its finished solves and limits remain in DIR.part, and the same
@@ -106,7 +106,7 @@ def report_command(
 def _find_students(student_names: list[str] | None, model_names: list[str]) -> list[Path]:
     """Return the version folders of the small models to compare.
 
-    If no small models are named, the small model of each compared model is searched for under its usual name.
+    Without names, the model NAME-student of each compared model NAME is returned if it exists.
 
     Args:
         student_names: Names or paths from `--student`; None for the models named MODEL-student that exist.

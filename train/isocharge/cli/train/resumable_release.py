@@ -37,7 +37,7 @@ VersionOption = Annotated[
 
 
 class WriteRelease(Protocol[TrainedToRelease]):
-    """Function that writes a version folder from the result of a training, like `isocharge.train.release`."""
+    """Function that writes the result of a training as a version folder, such as `isocharge.train.release`."""
 
     def __call__(self, trained: TrainedToRelease, folder: Path, /, *, version: int, command: str) -> Release:
         """Write the version folder.
@@ -67,7 +67,7 @@ class ReleaseOptions:
     json: bool
 
     def check_version_folder(self, electrodes: tuple[str, ...]) -> Path:
-        """Return the version folder that the command writes.
+        """Check that the command can write the version folder, and return its path.
 
         Args:
             electrodes: Names of the electrodes of the new model.
@@ -118,7 +118,7 @@ def _errors_sentence(metadata: ModelMetadata) -> str:
 
 
 def _measured_presses_words(metadata: ModelMetadata) -> str:
-    """Return the words that describe the measured presses on which the errors of a model were measured.
+    """Return words about the measured presses on which the errors of a model were measured.
 
     The text is empty if the presses were simulated.
 

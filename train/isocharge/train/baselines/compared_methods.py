@@ -44,7 +44,10 @@ class GivenMethod(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
 
 class Regressor(Protocol):
-    """Interface of the methods, which also derive from `BaseEstimator` of scikit-learn, so that they can be cloned."""
+    """Interface of all compared methods.
+
+    The methods also derive from `BaseEstimator` of scikit-learn, so that they can be cloned.
+    """
 
     def fit(self, charge: Array, contact: Array) -> Any:
         """Fit the method to presses.
@@ -58,7 +61,7 @@ class Regressor(Protocol):
         """
 
     def predict(self, charge: Array) -> Array:
-        """Estimate contacts (x, y, F), shape (n, 3), mm and N. A press without an estimate has the contact NaN."""
+        """Estimate contacts (x, y, F), shape (n, 3), mm and N. Without an estimate, the contact is NaN."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +153,7 @@ class ComparedMethod:
         return np.column_stack([charge, force]) if self.given_force else charge
 
     def fit(self, task: FittingTask) -> "ComparedMethod":
-        """Fit the method with each set of candidate parameters, and return the one with the smallest validation error.
+        """Fit the method with each set of candidate parameters, and return the fit with the smallest validation error.
 
         The validation error is the root mean square of the position errors on the validation presses.
 
@@ -216,8 +219,8 @@ class ComparedMethod:
 def describe_parameter(name: str, value: object) -> str:
     """Return a text that describes a parameter of a pipeline.
 
-    A mapping of factors is described without the name of the parameter. A number is described with the last part of the
-    name.
+    A mapping of factors is described by its entries, without the name of the parameter. A number is described by the
+    last part of the name and the value.
 
     Args:
         name: Name of the parameter, after the names of the steps: "step__parameter".
@@ -310,10 +313,11 @@ def compared_methods(task: FittingTask, charge_map: ChargeMap | None = None) -> 
 
 
 def polynomial_ridge(task: FittingTask) -> ComparedMethod:
-    """Return ridge regression on all monomials of the logarithms of the charges up to a certain degree.
+    """Return ridge regression on monomials of the logarithms of the charges.
 
-    The candidates for the degree are the two largest of `POLYNOMIAL_DEGREES` with at most `MAX_MONOMIALS` monomials.
-    There are also two candidates for the penalty on the coefficients.
+    All monomials up to a certain degree are used. The candidates for the degree are the two largest of
+    `POLYNOMIAL_DEGREES` with at most `MAX_MONOMIALS` monomials. There are also two candidates for the penalty on the
+    coefficients.
 
     Args:
         task: Presses for the fit.
@@ -394,7 +398,7 @@ def _axis_scale_candidates(task: FittingTask) -> dict[str, Sequence[Any]]:
 
 
 def _interpolated_table(task: FittingTask) -> ComparedMethod:
-    """Return the lookup table whose entries have affine maps, as a method with candidates for its parameters.
+    """Return a lookup table with an affine map in each entry, and with candidates for its parameters.
 
     Args:
         task: Presses and conditions for the fit.
@@ -409,8 +413,8 @@ def _interpolated_table(task: FittingTask) -> ComparedMethod:
 def _nearest_neighbours(task: FittingTask) -> ComparedMethod:
     """Return a regressor that adds the mean residual of the nearest neighbours to a linear regression.
 
-    The neighbours are the presses whose charges are most similar. The candidates are several numbers of neighbours, and
-    several scales of the axes along which the distances of charges are measured.
+    The neighbours are the presses whose charges are most similar. There are candidates for the number of neighbours,
+    and for the scales of the axes along which distances are measured.
 
     Args:
         task: Presses and conditions for the fit.

@@ -1,8 +1,8 @@
 """Maximum a posteriori estimate of a contact by the Gauss-Newton method on a charge map.
 
-The residuals are (Q - Q(c)) / sigma(Q), where Q are the measured charges, Q(c) are the charges of a contact c, and
-sigma is the standard deviation of the noise. The prior is uniform over the disk and in the logarithm of the force. The
-only effect of this prior is that the contact is restricted to the domain. A search starts at the press with the nearest
+The residuals are (Q - Q(c)) / sigma(Q). Q are the measured charges, Q(c) are the charges of a contact c, and sigma(Q)
+is the standard deviation of the noise. The prior is uniform over the disk and in the logarithm of the force. The only
+effect of this prior is that the contact is restricted to the domain. A search starts at the press with the nearest
 charges. If the residuals of the result are too large, the search starts again at the press with the next nearest
 charges.
 """
@@ -54,7 +54,7 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         self.seed = seed
 
     def fit(self, charge: Array, contact: Array) -> "GaussNewton":
-        """Fit a charge map unless a charge map is given, and choose the starts of the searches.
+        """Choose the starts of the searches. If no charge map is given, fit a charge map to the presses first.
 
         Args:
             charge: Charges without noise, shape (n, n_electrode), pC.
@@ -90,9 +90,9 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
     def _search(self, charge: Array) -> Array:
         """Estimate the contacts of one batch of presses.
 
-        The residuals of a press are (Q - Q(c)) / sigma, with its charges Q, the charges Q(c) of the estimated contact
-        c, and the standard deviations sigma of the noise. If the sum of the squared residuals of a press is above
-        `RESTART_THRESHOLD`, the search is repeated from another start.
+        The residuals of a press with the charges Q are (Q - Q(c)) / sigma. Q(c) are the charges of the estimated
+        contact c, and sigma are the standard deviations of the noise. If the sum of the squared residuals of a press is
+        above `RESTART_THRESHOLD`, the search is repeated from another start.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.

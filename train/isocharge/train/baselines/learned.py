@@ -35,7 +35,7 @@ N_POSITION_AND_FORCE_AXES = 3
 
 
 def on_logarithms(domain: Domain, **steps: Any) -> TransformedTargetRegressor:
-    """Return a regressor from charges, shape (n, n_electrode), pC, to contacts, shape (n, 3), mm and N.
+    """Return a regressor that estimates contacts, shape (n, 3), mm and N, from charges, shape (n, n_electrode), pC.
 
     Args:
         domain: Contacts that can occur.
@@ -48,7 +48,7 @@ def on_logarithms(domain: Domain, **steps: Any) -> TransformedTargetRegressor:
 
 
 def whitening() -> Pipeline:
-    """Return a transformer from charges, shape (n, n_electrode), pC, to whitened logarithms of the same shape."""
+    """Return a transformer that computes whitened logarithms of charges, shape (n, n_electrode), pC."""
     return Pipeline([("logarithms", Logarithms()), ("whitening", PCA(whiten=True))])
 
 
@@ -80,7 +80,7 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def transform(self, charge: Array) -> Array:
-        """Transform charges, shape (n, n_electrode), pC; the result has the same shape."""
+        """Transform charges, shape (n, n_electrode), pC. The result has the same shape."""
         if self.scale_ is None:
             return np.asarray(np.log(np.maximum(charge, LOWEST_CHARGE)))
         return np.asarray(np.arcsinh(charge / self.scale_))

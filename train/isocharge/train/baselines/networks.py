@@ -1,4 +1,4 @@
-"""Networks for the comparison of methods: the released model, and networks of several sizes that are trained anew.
+"""Networks for the comparison of methods: the released model, and newly trained networks of several sizes.
 
 The other methods of the comparison only estimate the contact. The networks are therefore also compared without their
 outputs for standard deviations and misfit.
@@ -50,7 +50,7 @@ class OnnxContact(GivenMethod):
         return np.asarray(contact, dtype=float)
 
     def single(self, charge: Array) -> Callable[[], object]:
-        """Return a function without arguments that computes the contact of one press, in order to time the computation.
+        """Return a function without arguments that computes the contact of one press, for measuring its duration.
 
         Memory for the charges and the contact is bound to the session before the first call, as in `Predictor`.
 
@@ -78,7 +78,7 @@ class OnnxContact(GivenMethod):
 
 
 class TrainedNetwork(OnnxContact):
-    """Perceptron of one size that is trained for the comparison, and that estimates only the contact.
+    """Perceptron that is trained for the comparison, and that estimates only the contact.
 
     Args:
         data: Sensor and domain. The presses in these data are replaced by the presses of `fit`.
@@ -118,15 +118,15 @@ class TrainedNetwork(OnnxContact):
             This estimator.
         """
         misfit_hidden = tuple(SMALL_MISFIT_WIDTH for _ in self.hidden)  # both perceptrons need equally many layers
-        sizes = NetworkConfig(hidden=self.hidden, misfit_hidden=misfit_hidden)
-        training = TrainingConfig(
+        network_config = NetworkConfig(hidden=self.hidden, misfit_hidden=misfit_hidden)
+        training_config = TrainingConfig(
             steps=self.steps, misfit_steps=1, misfit_charges=1000, hold_out=0.05, seed=self.seed, noise=self.noise
         )
         presses = LabelledPresses(contact, charge, self.data.presses.measured)
         data = replace(self.data, presses=presses)
-        trained = train_network(data, FitConfig(sizes, training))
+        training_result = train_network(data, FitConfig(network_config, training_config))
 
-        network_without_stds = fold_contact_mean(trained.network)
+        network_without_stds = fold_contact_mean(training_result.network)
         self.graph = write_contact_graph(network_without_stds)
         return self
 
@@ -147,7 +147,7 @@ class ReleasedModel(GivenMethod):
         return contact
 
     def answer(self, charge: Array) -> tuple[Array, Array, Array]:
-        """Estimate contacts, their standard deviations and the misfits of charges.
+        """From charges, estimate contacts and their standard deviations, and compute misfits.
 
         The misfit is the distance of the charges from the nearest single contact that the model covers, in standard
         deviations of the noise.
@@ -186,7 +186,10 @@ class ReleasedModel(GivenMethod):
         return (self.folder / "model.onnx").read_bytes()
 
     def contact_only(self) -> OnnxContact:
-        """Return the part of the graph that computes the contact, because other methods do not estimate more."""
+        """Return the part of the graph that computes the contact.
+
+        The part is compared with other methods, which estimate only the contact.
+        """
         extractor = Extractor(onnx.load_model_from_string(self.graph))
         part = extractor.extract_model([INPUT], ["contact"])
         return OnnxContact(part.SerializeToString())

@@ -1,11 +1,11 @@
 """Methods of Mirbagheri et al., 2007, as regressors: triangulation, the linear band and the lookup table.
 
-Linear band: up to 0.5 N, each charge Q is assumed to be proportional to the force F, Q = F s(x, y), with one slope s
-for each electrode. The slopes are interpolated between the presses by a polynomial in the position, and are tabulated
-on a fine grid. For given charges, the grid point is chosen whose slopes have the most similar ratios. Near this grid
-point, the equation Q = F (s + ds/dx dx + ds/dy dy) is linear in F, F dx and F dy. The equations of all electrodes are
-solved for these three unknowns. On a slack film, the charges are proportional to F^(2/3), which causes errors of this
-method.
+Linear band: for forces F up to 0.5 N, each charge Q is assumed to be proportional to the force, Q = F s(x, y). Each
+electrode has its own slope s. The slopes are interpolated between the presses by a polynomial in the position, and are
+tabulated on a fine grid. For given charges, the method chooses the grid point at which the ratios of the slopes are
+most similar to the ratios of the charges. Near this grid point, the equation Q = F (s + ds/dx dx + ds/dy dy) is linear
+in F, F dx and F dy. The equations of all electrodes are solved for these three unknowns. The method is inaccurate on
+slack films, because their charges are proportional to F^(2/3).
 
 Lookup table: an entry consists of a contact, the mean features of the presses at this contact, and an affine map. The
 affine map is fitted to the presses with the most similar features. A large number of such presses averages the noise,
@@ -84,7 +84,7 @@ MIN_DIVISOR = 1e-9
 
 
 class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """Regressor that assumes charges that are proportional to the force.
+    """Regressor that assumes that the charges are proportional to the force.
 
     The charges are Q = F s(x, y), with one slope s for each electrode. The docstring of the module describes the
     method.
@@ -101,8 +101,9 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
     def fit(self, charge: Array, contact: Array) -> "LinearBand":
         """Fit polynomials of x and y to the logarithms of the slopes s = Q / F, and tabulate the slopes on a grid.
 
-        The charges Q are assumed to be proportional to the force F up to `MAX_BAND_FORCE`. The presses with forces up
-        to this limit are called the band, and only these presses are used. The polynomials are fitted by least squares.
+        For forces F up to `MAX_BAND_FORCE`, the charges Q are assumed to be proportional to F. The presses with forces
+        up to this limit are called the band, and only these presses are used. The polynomials are fitted by least
+        squares.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
@@ -136,10 +137,10 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         return self
 
     def _tabulate(self, coefficients: Array) -> None:
-        """Tabulate the charges per force on a grid, and compute a linear estimator of the contact near each grid point.
+        """Tabulate the slopes on a grid, and compute a linear estimator of the contact near each grid point.
 
-        Let s be the charge per force of an electrode at a grid point. At the shift (dx, dy) from the grid point, the
-        charge of the electrode is
+        Let s be the slope of an electrode at a grid point, which is its charge per force. At the shift (dx, dy) from
+        the grid point, the charge of the electrode is
 
             Q = F (s + ds/dx dx + ds/dy dy),
 
@@ -156,23 +157,23 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
         # The columns of the linear map are s, ds/dx and ds/dy. The derivative ds/dx is s d(ln s)/dx, and d(ln s)/dx is
         # computed by central differences.
-        charge_per_force = np.exp(self._polynomials(grid) @ coefficients)  # s, shape (n_grid, n_electrode)
-        columns = [charge_per_force]
+        slope = np.exp(self._polynomials(grid) @ coefficients)  # s, shape (n_grid, n_electrode)
+        columns = [slope]
         for step in DIFFERENCE_STEP * np.eye(2):  # a step along x, and a step along y
             log_difference = (self._polynomials(grid + step) - self._polynomials(grid - step)) @ coefficients
-            columns.append(charge_per_force * log_difference / (2.0 * DIFFERENCE_STEP * self.radius))
+            columns.append(slope * log_difference / (2.0 * DIFFERENCE_STEP * self.radius))
         linear_map = np.stack(columns, axis=2)  # shape (n_grid, n_electrode, 3)
 
         self.grid_position_ = grid * self.radius
         self.pseudoinverse_ = np.linalg.pinv(linear_map)  # shape (n_grid, 3, n_electrode)
-        self.ratio_tree_ = cKDTree(unit_vectors(charge_per_force))
+        self.ratio_tree_ = cKDTree(unit_vectors(slope))
 
     def predict(self, charge: Array) -> Array:
         """Estimate contacts from charges.
 
         The ratios of the charges are compared with the ratios at all grid points, and the grid point with the most
-        similar ratios is chosen. The linear map of this grid point then estimates the force F and the shift (dx, dy)
-        from the grid point.
+        similar ratios is chosen. The linear estimator of this grid point gives the force F and the shift (dx, dy) from
+        the grid point.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
@@ -187,8 +188,8 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
         # The linear map is only valid near the grid point, so the shift is limited to twice the spacing of the grid.
         max_shift = 4.0 * self.radius / (GRID_POINTS - 1)
-        divisor = np.maximum(force, MIN_DIVISOR)  # noise can make the estimated force zero or negative
-        shift = np.clip(force_times_shift / divisor, -max_shift, max_shift)
+        positive_force = np.maximum(force, MIN_DIVISOR)  # noise can make the estimated force zero or negative
+        shift = np.clip(force_times_shift / positive_force, -max_shift, max_shift)
         position = self.grid_position_[grid_index] + shift
         return np.column_stack([position, np.maximum(force, MIN_FORCE)])
 
@@ -295,7 +296,7 @@ class AffineTable(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
 
 def affine_maps(offset: Array, target: Array) -> Array:
-    """Fit an affine map to the neighbours of each entry by least squares, with a ridge on the slopes.
+    """For each entry, fit an affine map to its neighbours by least squares, with a ridge on the slopes.
 
     The map M of an entry solves the normal equations (X' X + R) M = X' T. The rows of X are (offset, 1) of the
     neighbours, and the rows of T are their targets. R is a diagonal matrix, which is zero for the constant. The

@@ -1,1 +1,1 @@
-"""Computation of the Bayes limit by integration of the posterior of a contact."""
+"""Computation of the Bayes limit, the smallest mean squared error that any estimator of contacts can reach."""

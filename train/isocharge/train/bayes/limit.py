@@ -1,6 +1,7 @@
-"""Bayes limit, which is the error of the posterior mean. No estimator has a smaller mean squared error.
+"""Bayes limit, which is the error of the posterior mean.
 
-The limit depends on the film, the probe, the noise and the range of presses.
+No estimator has a smaller mean squared error than the posterior mean. The limit depends on the film, the probe, the
+noise and the range of presses.
 
 Example:
     problem = BayesProblem(load_sensor("three-25um-biaxial"), Circle(1.0), radius=8.0, force_range=(0.05, 2.0))
@@ -61,7 +62,7 @@ def bayes_estimate(
     charge_map: ForwardMap | ChargeSpline | None = None,
     executor: Executor | None = None,
 ) -> tuple[Array, Array]:
-    """Compute the posterior mean of the contact from the noisy charges of each press.
+    """Compute the posterior mean of the contact of each press from its noisy charges.
 
     The prior of the contact is uniform over the disk of the problem and in the logarithm of the force. The computation
     takes roughly ten milliseconds for each press.
@@ -104,7 +105,7 @@ def bayes_limit(
     """Compute the Bayes limit of a problem.
 
     Presses are drawn from the prior of the problem, and noise is added to their charges. The limit is the error of the
-    posterior means of these charges.
+    posterior means that are computed from these charges.
 
     Args:
         problem: Sensor, probe, prior and noise.

@@ -1,4 +1,4 @@
-"""Posterior of a contact given charges with noise, which is computed by numerical integration.
+"""Posterior distribution of a contact for given noisy charges, computed by numerical integration.
 
 The mean of the posterior has the smallest mean squared error of all estimators. The prior is uniform over a disk and in
 the logarithm of the force. Given a contact (x, y, F), the charge Q_e of each electrode e has a normal distribution
@@ -8,11 +8,11 @@ the normalisation of the distribution:
     p(Q | x, y, ln F) = prod_e exp(-(Q_e - q_e)^2 / (2 sigma_e^2)) / sigma_e,   sigma_e = sigma(q_e).
 
 The integral over the positions is a sum over square cells. A cell is dropped only if no contact in the cell can explain
-the charges. The method therefore works for posteriors of any shape, including those with several maxima. Each other
-cell is divided into four cells until the cells are small compared with the width of the posterior. In each cell, the
-integral over the logarithm of the force is computed by Gauss-Legendre quadrature over an interval around the most
-likely force. With cells of 1.25 standard deviations, the midpoint rule has a relative error of 1e-5 for a normal
-distribution (Trefethen and Weideman 2014). Only cells at the edge of the disk must be smaller.
+the charges. The method therefore works for posteriors of any shape, including posteriors with several maxima. Every
+remaining cell is divided into four cells until the cells are small compared with the width of the posterior. In each
+cell, the integral over the logarithm of the force is computed by Gauss-Legendre quadrature over an interval around the
+most likely force. With cells of 1.25 standard deviations, the midpoint rule has a relative error of 1e-5 for a normal
+distribution (Trefethen and Weideman 2014). Only posteriors that reach the edge of the disk need smaller cells.
 """
 
 from collections.abc import Iterator
@@ -70,7 +70,7 @@ With this number of nodes and `FORCE_HALF_WIDTH_STD`, the relative error of the 
 
 @dataclass(frozen=True)
 class Cells:
-    """Square cells in the plane of the positions. Each cell belongs to one press.
+    """Square cells that cover positions (x, y) of contacts. Each cell belongs to one press.
 
     Attributes:
         press: Number of the press of each cell, in ascending order, shape (n,).
@@ -86,7 +86,7 @@ class Cells:
 
     @classmethod
     def roots(cls, radius: float) -> "Cells":
-        """Return the first cells of one press, which cover a disk with the given radius, mm."""
+        """Return undivided cells for one press, which together cover a disk with the given radius in mm."""
         side = 2.0 * radius / CELLS_ACROSS
         centre = _grid(CELLS_ACROSS, side)
         centre = centre[_overlaps_disk(centre, side, radius)]
@@ -100,14 +100,14 @@ class Cells:
         return Cells(self.press[rows], self.root[rows], self.centre[rows], self.side)
 
     def divided(self, radius: float) -> "Cells":
-        """Divide each cell into four cells, and drop the cells outside the disk with this radius, mm."""
+        """Divide each cell into four cells, and drop the new cells outside the disk with the given radius in mm."""
         quarters = self._quarters(0.25)  # the centres of four equal parts
         return quarters[_overlaps_disk(quarters.centre, quarters.side, radius)]
 
     def finer(self, radius: float) -> Iterator["Cells"]:
-        """Yield finer cells for the integration: first those inside the disk, and then those at its edge.
+        """Yield smaller cells for the integration: first the cells inside the disk, and then the cells at its edge.
 
-        A cell inside the disk is replaced by four cells, whose centres are the points of Gauss-Legendre quadrature. A
+        A cell inside the disk is replaced by four cells, whose centres are points of a Gauss-Legendre quadrature. A
         cell on the edge of the disk is divided into sixteen cells.
 
         Args:
@@ -119,7 +119,7 @@ class Cells:
         yield self[is_on_edge].divided(radius).divided(radius)
 
     def _quarters(self, offset: float) -> "Cells":
-        """Replace each cell by four cells whose sides are half as long.
+        """Replace each cell by four cells with sides of half the length.
 
         Args:
             offset: Distance of the new centres from the centre of the cell along x and y, in sides of the cell.
@@ -129,14 +129,14 @@ class Cells:
         return Cells(np.repeat(self.press, 4), np.repeat(self.root, 4), centre, 0.5 * self.side)
 
     def on_edge(self, radius: float) -> Booleans:
-        """Return which cells can extend beyond the disk with this radius, mm, shape (n,)."""
+        """Return whether each cell may extend beyond the disk with the given radius in mm, shape (n,)."""
         half_diagonal = np.sqrt(0.5) * self.side
         return np.asarray(np.hypot(self.centre[:, 0], self.centre[:, 1]) + half_diagonal > radius)
 
     def inside(self, radius: float) -> tuple[Array, Array]:
-        """Compute the part of each cell that lies in the disk.
+        """Compute how much of each cell lies in the disk, and the centroid of this part.
 
-        Cells that the edge of the disk crosses are sampled by a grid of points. All other cells lie inside completely.
+        Cells that may extend beyond the disk are sampled by a grid of points. All other cells lie inside completely.
 
         Args:
             radius: Radius of the disk, mm.
@@ -166,19 +166,25 @@ class Cells:
 
 
 def _grid(count: int, step: float) -> Array:
-    """Return a square grid of count x count points about the origin with the spacing `step`, shape (count^2, 2)."""
+    """Return a square grid of count x count points around the origin with the spacing `step`, shape (count^2, 2)."""
     line = step * (np.arange(count) - 0.5 * (count - 1))
     return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
 
 
 def _overlaps_disk(centre: Array, side: float, radius: float) -> Booleans:
-    """Return which squares with centres of shape (n, 2), mm, overlap the disk around the origin, shape (n,)."""
+    """Return whether each square overlaps a disk around the origin, shape (n,).
+
+    Args:
+        centre: Centres of the squares, shape (n, 2), mm.
+        side: Side of all squares, mm.
+        radius: Radius of the disk, mm.
+    """
     nearest_point = np.maximum(np.abs(centre) - 0.5 * side, 0.0)  # of each square to the origin, up to signs
     return np.asarray(np.hypot(nearest_point[:, 0], nearest_point[:, 1]) < radius)
 
 
 class _RootCells(NamedTuple):
-    """First cells of a press, with properties of the charges in these cells.
+    """Undivided cells of a press, with properties of the charges in these cells.
 
     Attributes:
         cells: The n cells.
@@ -194,7 +200,7 @@ class _RootCells(NamedTuple):
 
 @dataclass(frozen=True)
 class Posterior:
-    """Posterior of the contact of a press, given its charges.
+    """Posterior distribution of the contact of a press for given charges.
 
     Attributes:
         charges: Map from contacts to charges.
@@ -214,7 +220,8 @@ class Posterior:
     def mean_and_std(self, charge: Array, executor: Executor | None = None) -> tuple[Array, Array]:
         """Compute the mean and the standard deviation of the posterior.
 
-        The mean of the force is E[1/F] / E[1/F^2], the estimate with the smallest mean squared relative error.
+        Instead of the mean of the force, E[1/F] / E[1/F^2] is returned. This estimate has the smallest mean squared
+        relative error.
 
         Args:
             charge: Charges with noise, shape (n, n_electrode), pC.
@@ -246,7 +253,7 @@ class Posterior:
 
     @cached_property
     def _roots(self) -> _RootCells:
-        """First cells of a press, with the terms of the charges at their centres and the largest slopes in them."""
+        """Undivided cells of a press, with properties of the charges in these cells."""
         cells = Cells.roots(self.radius)
         # The slopes are computed at 3 x 3 points of each cell: at its centre, its corners and the centres of its sides.
         n_point = 9
@@ -261,14 +268,15 @@ class Posterior:
         return _RootCells(cells, self._terms(cells), largest_slope)
 
     def _terms(self, cells: Cells) -> Array:
-        """Compute the terms of the charges at the centres of cells, shape (n, n_term, n_electrode)."""
+        """Compute the terms of the charges at the centre of each cell, shape (n, n_term, n_electrode)."""
         return self.charges.scaled_charges(onto_disk(cells.centre, self.radius))
 
     def _integrate(self, charge: Array) -> Array:
         """Compute the mean and the standard deviation of the posterior of each press.
 
-        The integral over the position is a sum over square cells. Each cell is weighted by the area of its part in the
-        disk of the prior. The integral over the force is computed by quadrature at the centroid of each cell.
+        The integral over the position is a sum over square cells. The weight of each cell is the area of the part that
+        lies in the disk of the prior. The integral over the force is computed by quadrature at the centroid of this
+        part.
 
         Args:
             charge: Charges with noise, shape (n, n_electrode), pC.
@@ -298,11 +306,11 @@ class Posterior:
         return _posterior_moments(press, position, log_force, log_weight)
 
     def _integration_cells(self, charge: Array) -> Iterator[Cells]:
-        """Yield cells that cover the posterior of each press, and are small compared with the width of the posterior.
+        """Yield cells that cover the posterior of each press and are small compared with its width.
 
-        In each round, all cells have the same side, and the cells that cannot explain the charges of their press are
-        dropped. If the remaining cells of a press are small enough, these cells are yielded. If not, each of them is
-        divided into four cells for the next round.
+        In each round, all cells have the same side, and a cell is dropped if no contact in it can explain the charges
+        of its press. If the remaining cells of a press are small enough, they are yielded. Otherwise, each remaining
+        cell is divided into four cells for the next round.
 
         Args:
             charge: Charges with noise, shape (n_press, n_electrode), pC.
@@ -315,7 +323,7 @@ class Posterior:
         terms = roots.terms[root]
         for division in range(MAX_DIVISIONS + 1):
             cell_charge = charge[cells.press]
-            log_force = self._profile.best(terms, cell_charge, self.noise)
+            log_force = self._profile.best_log_force(terms, cell_charge, self.noise)
             chi2, slope = self._chi2_and_slope(terms, log_force, cell_charge, roots.largest_slope[cells.root])
             smallest_chi2 = np.full(n_press, np.inf)
             np.minimum.at(smallest_chi2, cells.press, chi2)  # the smallest value among the cells of each press
@@ -359,7 +367,7 @@ class Posterior:
         return np.asarray(largest_inverse_std * cells.side <= MAX_SIDE_STD)
 
     def _finished_cells(self, cells: Cells, excess_chi2: Array, n_press: int) -> Iterator[Cells]:
-        """Yield the cells over which the integral is computed, for presses whose cells are small enough.
+        """For presses with small enough cells, yield the cells over which the integral is computed.
 
         Improbable cells are dropped. The cells of a press are refined once more if its posterior reaches the edge of
         the disk, where the prior ends.
@@ -408,11 +416,12 @@ class Posterior:
         return chi2, np.linalg.norm(deviation_slope, axis=1)
 
     def _inverse_std(self, cells: Cells, terms: Array, log_force: Array) -> Array:
-        """Compute the inverse of the smallest standard deviation of the position if the force is unknown.
+        """Compute the inverse of the standard deviation of the position along its most certain direction.
 
-        The derivatives of the charges are divided by the standard deviations of the noise. The part of the derivatives
-        that a change of the force can also cause is removed. The inverse of the standard deviation along the most
-        certain direction is the largest singular value of the remaining derivatives with respect to the position.
+        The force is assumed to be unknown. The derivatives of the charges are divided by the standard deviations of the
+        noise. The part of the derivatives that a change of the force can also cause is removed. The inverse of the
+        standard deviation along the most certain direction is the largest singular value of the remaining derivatives
+        with respect to the position.
 
         Args:
             cells: Cells at whose centres the contact is assumed.
@@ -454,7 +463,7 @@ class Posterior:
         # The interval of integration lies about the best force, within the forces of the prior. Its half width is a
         # multiple of the standard deviation of ln F, which is the inverse of the norm of d(Q / sigma) / d ln F.
         terms = self.charges.scaled_charges(position)
-        best_log_force = self._profile.best(terms, charge, self.noise)
+        best_log_force = self._profile.best_log_force(terms, charge, self.noise)
         best_charge = self._profile.charge(best_log_force, terms)
         whitened_slope = self._profile.slope(best_log_force, best_charge) / self.noise.sigma(best_charge)
         half_width = FORCE_HALF_WIDTH_STD / np.linalg.norm(whitened_slope, axis=1)
@@ -479,8 +488,9 @@ class Posterior:
 def _posterior_moments(press: Integers, position: Array, log_force: Array, log_weight: Array) -> Array:
     """Compute the mean and the standard deviation of (x, y, F) for every press.
 
-    Both are computed from weighted sums over all positions of the press and over all forces at each position. Instead
-    of the mean of the force, E[1/F] / E[1/F^2] is returned, which has the smallest mean squared relative error.
+    The mean and the standard deviation are weighted sums over all positions of the press and over all forces at each
+    position. Instead of the mean of the force, E[1/F] / E[1/F^2] is returned. This estimate has the smallest mean
+    squared relative error.
 
     Args:
         press: Number of the press of each position, ascending, shape (n_position,).

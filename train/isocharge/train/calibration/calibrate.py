@@ -1,4 +1,4 @@
-"""Estimation of the parameters of a film, and of their remaining uncertainty, from measured presses."""
+"""Estimation of the parameters of a film and their uncertainty from measured presses."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -71,11 +71,11 @@ CLOSE_MM = 1.0
 
 
 def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
-    """Estimate the parameters of the film on which presses were made.
+    """Estimate the parameters of a film from presses on this film.
 
     First, the presses are checked, and the parameters of the film are fitted to the presses. An error is raised if no
     film explains the presses. The stated errors of the estimate are increased if the presses scatter more than
-    expected, or if there are only a few presses.
+    expected. The stated errors are also increased if there are only a few presses.
 
     Args:
         presses: The presses in the order in which they were made, with position, force or both, and the standard
@@ -115,7 +115,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
 
 
 def _checked_presses(presses: MeasuredPresses, problem: CalibrationProblem) -> tuple[MeasuredPresses, list[str]]:
-    """Check presses before a fit, and remove the presses outside the domain of the films.
+    """Check presses before a fit, and remove presses outside the domain of the films.
 
     Args:
         presses: The presses, with the electrodes in the order of the problem.
@@ -146,10 +146,10 @@ def _checked_presses(presses: MeasuredPresses, problem: CalibrationProblem) -> t
 def _fit_with_friction(
     problem: CalibrationProblem, data: PressData, posterior: FilmPosterior, at_C: float | None
 ) -> tuple[FilmPosterior, SideForceMap]:
-    """Estimate a film from presses with friction, and compute the effect of side forces on this film.
+    """Estimate a film from presses with friction, and compute how side forces change the charges of this film.
 
     The effect of friction on the charges depends on the parameters of the film and on the coefficient of friction.
-    Therefore, this effect and the parameters are computed in turn until the parameters hardly change, but at most
+    Therefore, the effect and the parameters are computed alternately until the parameters hardly change, but at most
     `MAX_FRICTION_ROUNDS` times.
 
     Args:
@@ -238,9 +238,9 @@ def _scaled_by_scatter(posterior: FilmPosterior) -> tuple[FilmPosterior, list[st
 
 
 def _check_enough_measured(presses: MeasuredPresses, problem: CalibrationProblem) -> None:
-    """Raise PressError if all positions and forces are unknown and a press has at most three charges.
+    """Raise PressError if all positions and forces are unknown and the sensor has at most three electrodes.
 
-    Three charges determine only the position and the force of a press, but no property of the film.
+    Three charges determine only the position and the force of a press. They determine no property of the film.
     """
     if np.isnan(presses.contact).all() and len(problem.electrodes) <= 3:
         raise PressError(
@@ -253,9 +253,9 @@ def _check_enough_measured(presses: MeasuredPresses, problem: CalibrationProblem
 def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> None:
     """Raise PressError if no film explains the presses, or if only an improbable film explains them.
 
-    A few presses with a common mistake, such as a wrong unit, may agree with a film that is possible but unusual. For
-    an unusual film, PressError is therefore also raised if the correction of a common mistake makes the presses agree
-    far better with a film.
+    If all presses contain a common mistake, such as a wrong unit, a possible but unusual film may explain them.
+    Therefore, PressError is also raised if the film is unusual and the correction of a common mistake makes the presses
+    agree far better with a film.
 
     Args:
         presses: The presses to which the film was fitted.
@@ -294,11 +294,11 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
 
 
 def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> FilmPosterior:
-    """Increase the covariance of an estimate, because a wrong press among only a few presses cannot be recognised.
+    """Increase the covariance of an estimate, because a wrong press cannot be recognised among only a few presses.
 
-    If a press was recorded wrongly, the estimate is assumed to be no better than the estimate before the presses. The
-    returned covariance is a weighted mean of the covariances before and after the presses. The weight of the covariance
-    before the presses is the probability that a press was recorded wrongly.
+    If a press was recorded wrongly, the presses are assumed to contain no information. The returned covariance is a
+    weighted mean of the covariances before and after the presses. The weight of the covariance before the presses is
+    the probability that a press was recorded wrongly.
 
     Args:
         posterior: The estimate after the presses.
@@ -393,10 +393,10 @@ def _position_cautions(presses: MeasuredPresses) -> Iterator[str]:
 
 
 def _parameters_at_bounds(problem: CalibrationProblem, posterior: FilmPosterior) -> list[str]:
-    """Return the names of the parameters whose estimates lie on or close to a bound.
+    """Return the names of the parameters whose estimates lie on a bound or close to it.
 
-    A lower bound that is not negative, such as a pretension of zero, is a physical limit. Parameters at such a lower
-    bound are not returned.
+    A lower bound of zero or more, such as a pretension of zero, is a physical limit. Parameters at such a lower bound
+    are not returned.
 
     Args:
         problem: The calibration problem, which defines the bounds of the parameters.

@@ -3,8 +3,8 @@
 The file contains the value and the standard deviation of each parameter of the film. The section `correlations`
 contains the correlations of all parameters, rounded to six digits. If the film has a discrepancy, the section
 `discrepancy` contains the coefficients of the film. The section `discrepancy` also contains the standard deviations and
-the correlations of the parameters and coefficients together. If temperatures were measured, the section `temperature`
-contains the change of the pretension with temperature.
+the correlations of all parameters and coefficients. If temperatures were measured, the section `temperature` states how
+the pretension changes with temperature.
 
 If the standard deviation of an unknown is zero, its correlations with other unknowns are not defined, and zeros are
 written for them. Older versions of this module wrote null for undefined correlations. The reader replaces such a null
@@ -53,7 +53,7 @@ TEMPERATURES_C = (-100.0, 200.0)
 
 
 class _Estimate(Struct, frozen=True):
-    """Estimate of a quantity in the file: its value and its standard deviation."""
+    """Estimate of a quantity in the file, with its value and its standard deviation."""
 
     value: Finite
     std: NotNegative
@@ -63,7 +63,7 @@ Correlation = Annotated[float, Meta(ge=-1.0 - CORRELATION_TOLERANCE, le=1.0 + CO
 
 
 class _Temperature(Struct, frozen=True):
-    """Section `temperature` of the file, about the change of the pretension with temperature."""
+    """Section `temperature` of the file, which states how the pretension changes with temperature."""
 
     at_C: Annotated[float, Meta(ge=TEMPERATURES_C[0], le=TEMPERATURES_C[1])]
     pretension_per_K: _Estimate
@@ -71,7 +71,7 @@ class _Temperature(Struct, frozen=True):
 
 
 class _Discrepancy(Struct, frozen=True):
-    """Section `discrepancy` of the file, about the coefficients of the film."""
+    """Section `discrepancy` of the file, which contains the coefficients of the film."""
 
     coefficients: list[Finite]
     std: list[NotNegative]
@@ -107,7 +107,9 @@ def film_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, Any]:
 
 
 def _parameter_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, dict[str, float]]:
-    """Return the value and the standard deviation of each parameter by its name, in the units of the file.
+    """Return the value and the standard deviation of each parameter, by the name of the parameter.
+
+    The values have the units of the file.
 
     Args:
         prior: Distribution of the films, with the names and units of the parameters.
@@ -269,7 +271,7 @@ def _film_correlations(path: Path, section: _Discrepancy, film_std: Array, param
 def _read_temperature(
     path: Path, section: _Temperature, film_correlations: Array, film_std: Array
 ) -> tuple[Array, Warming]:
-    """Read the change of the pretension with temperature from the section `temperature`.
+    """Read from the section `temperature` how the pretension changes with temperature.
 
     Args:
         path: The file, for error messages.
@@ -300,7 +302,7 @@ def _read_temperature(
 
 
 def _read_parameters(path: Path, content: _CalibrationFile, prior: FilmPrior) -> tuple[Array, Array]:
-    """Read the parameters of a film and their standard deviations, and check that all values are within limits.
+    """Read the parameters of a film and their standard deviations, and check that all values are within their limits.
 
     Args:
         path: The file, for error messages.
@@ -388,7 +390,7 @@ def _read_coefficients(
 
 
 def _with_temperature(path: Path, section: _Temperature, correlations: Array, std: Array) -> Array:
-    """Extend the correlations of a film by a last row and column for the change of the pretension with temperature.
+    """Extend the correlations of a film by one row and one column for the change of the pretension per kelvin.
 
     Args:
         path: The file, for error messages.
@@ -498,7 +500,7 @@ def _correlation_array(path: Path, key: str, rows: list[list[Correlation]], may_
 def _positive_semidefinite(path: Path, correlations: Array) -> Array:
     """Replace small negative eigenvalues of a correlation matrix by zero.
 
-    Rounding errors of the correlations cause such eigenvalues.
+    Small negative eigenvalues are caused by the rounding of the correlations.
 
     Args:
         path: The file, for the error message.

@@ -1,4 +1,4 @@
-"""Functions of the chi-square distribution, which are used to test the residuals of presses.
+"""Functions of the chi-square distribution, used to test the residuals of presses.
 
 `scipy.stats` has the same functions, but importing it is slow.
 """

@@ -1,12 +1,12 @@
-"""Detection of a closed back, which traps air behind the film, from the presses of a calibration.
+"""Detection of a closed back from the presses of a calibration. A closed back traps air behind the film.
 
 A calibration assumes a vented back, which lets air flow out of the space behind the film. If the back is closed, the
-trapped air carries a part of the load. The electrodes away from the probe then collect much less charge than those of
-any film with a vented back. Therefore, a calibration of such presses either estimates a large discrepancy or refuses
-the presses.
+trapped air carries a part of the load. The electrodes away from the probe then collect much less charge than on any
+film with a vented back. Therefore, a calibration with such presses either estimates a large discrepancy or refuses the
+presses.
 
 If no film with a vented back agrees with the presses, the presses are also compared with a few films that have a closed
-back. The charges of the films with a closed back are simulated directly, which takes a few seconds.
+back. The charges of the films with a closed back are simulated directly. This simulation takes a few seconds.
 """
 
 from dataclasses import replace

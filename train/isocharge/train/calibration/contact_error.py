@@ -1,7 +1,8 @@
-"""Errors of estimated contacts due to the uncertainty of a film, and the choice of presses that reduce these errors.
+"""Errors that the uncertainty of a film causes in estimated contacts, and choice of presses that reduce these errors.
 
 Let dp be the difference between the parameters that an estimator assumes and the real parameters of the film. The
-estimator then finds a contact whose error dc compensates the change of the charges best:
+difference dp changes the charges that the estimator expects at each contact. The error dc of the estimated contact
+compensates this change as well as possible:
 
     dc = -G dp,   G = (J' W J)^-1 J' W P.
 
@@ -10,12 +11,13 @@ the parameters, and W is the inverse of the noise covariance. If the parameters 
 have the covariance G C G'. Noise alone causes errors with the covariance (J' W J)^-1, which is the Cramer-Rao limit.
 
 In the code, the inverse of a prior covariance of the contact is added to J' W J. According to this prior, the contact
-lies in the working area and in the range of forces. Because of this prior, the errors are finite even at the folds of
-the charge map, where J' W J is singular.
+lies in the working area and in the range of forces. At folds of the charge map, the matrix J' W J is singular, but with
+this prior the errors are finite.
 
 The information that a press adds about the film depends on the contact of the press, but hardly on its charges.
 Therefore, the best next press can be chosen before any charge is measured. Several presses are chosen one after the
-other, and each choice takes the previous choices into account (a greedy A-optimal design, Pukelsheim 1993).
+other, and each choice takes the previous choices into account. The result is a greedy A-optimal design (Pukelsheim
+1993).
 """
 
 from dataclasses import dataclass
@@ -88,7 +90,7 @@ class ContactError:
 
 @dataclass(frozen=True)
 class ContactSensitivity:
-    """Linearised effects of noise, and of errors in the unknowns of the film, on estimated contacts.
+    """Linearised effects that noise and errors in the unknowns of the film have on estimated contacts.
 
     The unknowns of the film are its parameters, followed by its coefficients if there are any. Parameters are in units
     of their prior standard deviations.
@@ -115,7 +117,7 @@ class ContactSensitivity:
 
     @classmethod
     def at(cls, problem: CalibrationProblem, unknowns: Array) -> "ContactSensitivity":
-        """Compute the linearised effects of noise and film errors at contacts that are spread over the domain.
+        """Linearise the charges of a film at contacts that are spread over the domain.
 
         Args:
             problem: The calibration problem, with the films and the noise.
@@ -151,7 +153,7 @@ class ContactSensitivity:
         )
 
     def contact_error(self, covariance: Array) -> ContactError:
-        """Compute the errors of contacts that the uncertainty of the film causes.
+        """Compute the contact errors that are caused by the uncertainty of the film.
 
         Args:
             covariance: Covariance of the unknowns of the film, shape (n_unknown, n_unknown).
@@ -159,7 +161,7 @@ class ContactSensitivity:
         return ContactError.of(self.contact_covariance(covariance))
 
     def contact_covariance(self, covariance: Array) -> Array:
-        """Compute the covariances of estimated contacts that the uncertainty of the film causes.
+        """Compute the part of the covariance of each estimated contact that is caused by the uncertainty of the film.
 
         Args:
             covariance: Covariance of the unknowns of the film, shape (n_unknown, n_unknown).
@@ -175,10 +177,10 @@ class ContactSensitivity:
         return ContactError.of(self.noise_covariance)
 
     def error_weights(self) -> Array:
-        """Return a matrix S for which trace(S C) is the mean squared error of the contacts.
+        """Return a matrix S such that trace(S C) is the mean squared error of the contacts.
 
-        Here C is any covariance of the film's unknowns. The mean squared error is an average over all contacts, and
-        includes the errors of both position and force. These errors are divided by the position error and the force
+        The matrix C is any covariance of the film's unknowns. The mean squared error is an average over all contacts,
+        and includes the errors of both position and force. These errors are divided by the position error and the force
         error that noise alone causes. Therefore, the mean squared error is dimensionless.
 
         Returns:
@@ -193,9 +195,9 @@ class ContactSensitivity:
 
 
 def spread_contacts(domain: Domain, count: int) -> Array:
-    """Return contacts that are evenly spread over a domain, in the position and in the logarithm of the force.
+    """Return contacts whose positions and logarithmic forces are evenly spread over a domain.
 
-    The forces are assigned to the positions in a random order. Therefore, the force does not depend on the position.
+    The forces are assigned to the positions in a random order. Therefore, the forces do not depend on the positions.
 
     Args:
         domain: Range of positions and forces in which the contacts lie.
@@ -211,7 +213,7 @@ def spread_contacts(domain: Domain, count: int) -> Array:
 
 
 def _whitened_slopes(problem: CalibrationProblem, unknowns: Array, contact: Array) -> tuple[Array, Array]:
-    """Compute the derivatives of the charges of a film, divided by the standard deviation of the noise of each charge.
+    """Compute the derivatives of the charges of a film, divided by the standard deviations of the noise.
 
     Args:
         problem: The calibration problem, with the films and the noise.
@@ -237,7 +239,7 @@ def information_of(
     position_std_mm: float = POSITION_STD_MM,
     force_std: float = FORCE_STD,
 ) -> Array:
-    """Compute the Fisher information that each press adds about the unknowns of a film.
+    """Compute the Fisher information of each press about the unknowns of a film.
 
     Args:
         problem: The calibration problem, with the films and the noise.
@@ -257,12 +259,12 @@ def information_of(
 def _information_roots(
     problem: CalibrationProblem, unknowns: Array, contact: Array, position_std_mm: float, force_std: float
 ) -> Array:
-    """Compute a matrix R for each press such that R' R is the Fisher information of the press about a film.
+    """For each press, compute a matrix R for which R' R is the Fisher information of the press about a film.
 
-    Each row of R is the derivative of one residual with respect to the unknowns of the film. The first residuals are
-    those of the charges. The last three residuals are those of the measured contact (x, y, ln F). If the unknowns
-    change, the contact that fits best moves, and the derivatives include the effect of this movement. The arguments are
-    those of `information_of`.
+    Each row of R is the derivative of one residual with respect to the unknowns of the film. The first residuals belong
+    to the charges. The last three residuals belong to the measured contact (x, y, ln F). If the unknowns change, the
+    best contact moves, and the derivatives include the effect of this movement. The arguments are those of
+    `information_of`.
 
     Returns:
         Matrices R, shape (n, n_electrode + 3, n_unknown).
@@ -283,7 +285,7 @@ def _information_roots(
 
 @dataclass(frozen=True)
 class ProposedPress:
-    """A proposed press, and the errors that are expected after this press.
+    """A proposed press, with the errors that are expected after this press.
 
     Attributes:
         x_mm: Position along x, mm.
@@ -316,9 +318,9 @@ def next_presses(
 ) -> list[ProposedPress]:
     """Choose the next presses, in the order in which they should be made.
 
-    The presses are chosen one after the other from many candidates. Each round chooses the candidate that reduces the
-    expected mean squared error of contacts most. The expected error assumes that all previously chosen presses are
-    made.
+    The presses are chosen one after the other from many candidates. Each round chooses the candidate with the largest
+    reduction of the expected mean squared error of contacts. The expected error assumes that all previously chosen
+    presses are made.
 
     Args:
         problem: The calibration problem, with the films and the noise.
@@ -356,7 +358,7 @@ def next_presses(
 
 
 def _best_candidate(information_roots: Array, covariance: Array, error_weights: Array) -> tuple[int, Array]:
-    """Return the candidate that reduces the mean squared error most, and the covariance after this press.
+    """Choose the candidate with the largest reduction of the mean squared error, and update the covariance.
 
     A press with the Fisher information R' R reduces the covariance C of the unknowns by the matrix
     D = (R C)' (1 + R C R')^-1 (R C). The mean squared error decreases by trace(S D), where S contains the error
@@ -385,10 +387,10 @@ def _best_candidate(information_roots: Array, covariance: Array, error_weights: 
 
 
 def _candidates(radius: float, force_range: tuple[float, float], avoid_mm: Array) -> Array:
-    """Return the candidates for the next press: all combinations of an allowed position and a candidate force.
+    """Return the candidates for the next press, which combine each allowed position with each candidate force.
 
-    The positions are distributed evenly over the working area. Positions and forces are rounded to values that a person
-    can easily set.
+    The positions are distributed evenly over the working area. The positions and forces are rounded to values that a
+    person can easily set.
 
     Args:
         radius: Largest distance of a press from the centre, mm.
@@ -407,8 +409,8 @@ def _candidates(radius: float, force_range: tuple[float, float], avoid_mm: Array
 
     # A rounded position may lie outside the working area.
     is_inside = np.hypot(positions[:, 0], positions[:, 1]) <= radius
-    offset = positions[:, None] - avoid_mm  # shape (n_position, n_avoided, 2)
-    avoided_distance = np.hypot(offset[..., 0], offset[..., 1])
+    displacement = positions[:, None] - avoid_mm  # shape (n_position, n_avoided, 2)
+    avoided_distance = np.hypot(displacement[..., 0], displacement[..., 1])
     is_allowed = (avoided_distance > AVOIDED_DISTANCE_MM).all(axis=1)
     positions = positions[is_inside & is_allowed]
     if not len(positions):

@@ -1,9 +1,9 @@
-"""Adjustment of the contacts of presses to both the measurements of the rig and the charges.
+"""Adjustment of the contacts of presses to measured charges and to measurements of the rig.
 
-A rig measures the position and the force of a press with some uncertainty. The position or the force may also be
-unknown. Each measured charge and each measurement of the rig has one residual, which depends on the contact and on the
-film. For a given film, the adjusted contact of a press is the contact with the smallest sum of squared residuals. The
-residuals at the adjusted contact show how well the film explains the press.
+A rig measures the position and the force of a press with some uncertainty. The position or the force of a press may
+also be unknown. Each measured charge and each measurement of the rig has one residual. The residuals depend on the
+contact and on the film. For a given film, the adjusted contact of a press is the contact with the smallest sum of
+squared residuals. The residuals at the adjusted contact show how well the film explains the press.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +28,7 @@ MIN_CHANGE = 1e-5
 
 
 class AdjustedContacts(NamedTuple):
-    """Contacts of presses that are adjusted to one film.
+    """Contacts of presses after the adjustment to one film.
 
     Attributes:
         contact: Contacts (x, y, ln F), shape (n, 3).
@@ -46,11 +46,11 @@ class AdjustedContacts(NamedTuple):
 
 
 def derivatives_with_adjusted_contacts(unknown_slopes: Array, contact_slopes: Array) -> Array:
-    """Compute the derivatives of residuals if the contacts are adjusted again after each change of the unknowns.
+    """Compute derivatives of residuals with respect to the unknowns, including the effect of adjusted contacts.
 
     If the unknowns change slightly, the adjusted contact moves to the new minimum of the sum of squared residuals. This
-    movement compensates a part of the derivatives at fixed contacts. The compensated part is subtracted (variable
-    projection, Golub and Pereyra 1973).
+    movement compensates a part of the change of the residuals. Therefore, the compensated part of the derivatives is
+    subtracted (variable projection, Golub and Pereyra 1973).
 
     Args:
         unknown_slopes: Derivatives of the residuals with respect to the unknowns at fixed contacts, shape (n,
@@ -73,7 +73,7 @@ def with_force(contact: Array) -> Array:
 
 
 def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> AdjustedContacts:
-    """Find the contacts that agree best with both the measured charges and the contacts that the rig measured.
+    """Find the contacts that agree best with the measured charges and with the measurements of the rig.
 
     For each press, the sum of the squared residuals is minimised over the contact (x, y, ln F). The search uses scaled
     contacts. In these coordinates, the positions of the domain fill the unit disk, and ln F lies in [-1, 1].
@@ -94,11 +94,11 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
 class _ContactResiduals(NamedTuple):
     """Residuals of presses on one film as a function of their contacts, in the form that `minimise` expects.
 
-    The charge of a press is the charge of the film without coefficients times a factor. The factor contains the effects
-    of the coefficients, which describe imperfections and the discrepancy. The factor changes slowly with the contact,
-    and its computation takes long. Therefore, the factor is approximated by a linear function of the contact. The
-    charges and the factors are interpolated between copies of the film with several pretensions, because the pretension
-    may differ from press to press.
+    The charge of a press is the product of a factor and the charge of the film without coefficients. The factor
+    contains the effects of the coefficients, which describe imperfections and the discrepancy. The factor changes
+    slowly with the contact, and its computation is slow. Therefore, the factor is approximated by a linear function of
+    the contact. The charges and the factors are interpolated between copies of the film with several pretensions,
+    because the pretension may differ from press to press.
 
     Attributes:
         domain: Range of contacts for which the charges of the films are known.
@@ -120,7 +120,7 @@ class _ContactResiduals(NamedTuple):
 
     @classmethod
     def of(cls, charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> "_ContactResiduals":
-        """Create the residuals, and compute all values that do not change during the search for the contacts.
+        """Prepare the residuals by computing all values that do not change during the search for the contacts.
 
         Args:
             charges: Model of the charges of all films.
@@ -147,7 +147,7 @@ class _ContactResiduals(NamedTuple):
         )
 
     def at(self, rows: Integers, scaled_contact: Array) -> tuple[Array, Array]:
-        """Compute the residuals of some presses, and the derivatives of these residuals.
+        """Compute the residuals of selected presses, and their derivatives with respect to the contacts.
 
         Args:
             rows: Indices of the presses, shape (m,).
@@ -177,7 +177,7 @@ class _ContactResiduals(NamedTuple):
 
 
 def neighbouring_films(charges: FilmCharges, unknowns: Array, data: PressData) -> tuple[list[Array], Array]:
-    """Return copies of a film with several pretensions, between which the charges of each press are interpolated.
+    """Return copies of a film with several pretensions, for an interpolation of the charges of each press.
 
     The pretension of a film may differ from press to press, for example because of the temperature. The returned copies
     of the film differ only in their pretension.
@@ -204,7 +204,7 @@ def neighbouring_films(charges: FilmCharges, unknowns: Array, data: PressData) -
 
 
 def _interpolated(film_values_and_slopes: list[tuple[Array, Array]], film_weights: Array) -> tuple[Array, Array]:
-    """Interpolate the values and derivatives at each press between films with several pretensions.
+    """Interpolate the values and derivatives for each press between films with several pretensions.
 
     Args:
         film_values_and_slopes: Values and derivatives on each of the k films, as `_values_and_slopes` returns them.
@@ -219,7 +219,7 @@ def _interpolated(film_values_and_slopes: list[tuple[Array, Array]], film_weight
 
 
 def weighted_sum(arrays: Sequence[Array], weights: Array) -> Array:
-    """Return the weighted sum of several arrays, in which each row has its own weights.
+    """Compute the weighted sum of several arrays. Each row has its own weights.
 
     Args:
         arrays: The k arrays, each of shape (n, ...).
@@ -268,7 +268,8 @@ def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> Ar
 
     If the rig measured the position of a press, the search begins at this position. If the position of a press is
     unknown, the search begins at the position where the ratios of the film's charges are most similar to the ratios of
-    the measured charges. The force is the measured force, or the middle of the range of forces if it is unknown.
+    the measured charges. The force is the measured force. If the force is unknown, the search begins at the middle of
+    the range of forces.
 
     Args:
         charges: Model of the charges of all films.
@@ -289,7 +290,8 @@ def _most_similar_positions(charges: FilmCharges, unknowns: Array, data: PressDa
     """Find the positions where the ratios of a film's charges are most similar to the ratios of the measured charges.
 
     For each press, `CANDIDATE_POSITIONS` positions are compared. The ratios of charges hardly depend on the stiffness
-    and the piezoelectric coefficients of the film, which may still be inaccurate at this stage of a calibration.
+    of the film and on its piezoelectric coefficients. The estimates of these properties may still be inaccurate at this
+    stage of a calibration.
 
     Args:
         charges: Model of the charges of all films.

@@ -1,4 +1,4 @@
-"""Cross-validation of a calibration: measurement of its errors on presses that were not used in the fit.
+"""Cross-validation of a calibration, which measures errors on presses that were not used in the fit.
 
 The pressed places are divided into folds. For each fold, the film is fitted again to the presses of all other folds.
 The network of the fitted film then estimates the contacts of the presses in the fold from their charges. The estimated
@@ -31,7 +31,7 @@ MAX_FITTED_PRESSES = 250
 
 @dataclass(frozen=True)
 class HeldOutAnswers:
-    """Measured presses, and contacts estimated by networks of films that were fitted without these presses.
+    """Presses, with contacts that were estimated without using these presses in the fit of the film.
 
     Attributes:
         presses: The measured presses.
@@ -58,7 +58,7 @@ def cross_validate(
     network_of: Callable[[FilmPosterior], Fitted],
     at_C: float | None = None,
 ) -> HeldOutAnswers | None:
-    """Estimate the contacts of measured presses with networks of films that were fitted without these presses.
+    """Estimate the contact of each press with the network of a film that was fitted without this press.
 
     The presses are divided into `FOLD_COUNT` folds by their places. For each fold, the film is fitted to the presses of
     all other folds. The network of this film then estimates the contacts of the presses in the fold.
@@ -111,7 +111,7 @@ def cross_validate(
 
 
 def _thinned(is_chosen: Booleans) -> Booleans:
-    """Select every k-th of the chosen presses, so that at most `MAX_FITTED_PRESSES` are selected.
+    """Select at most `MAX_FITTED_PRESSES` of the chosen presses, at equal distances in the list of presses.
 
     Args:
         is_chosen: Whether each press is one of the chosen presses, shape (n,).
@@ -120,7 +120,7 @@ def _thinned(is_chosen: Booleans) -> Booleans:
         Whether each press is selected, shape (n,).
     """
     chosen_rows = np.flatnonzero(is_chosen)
-    stride = max(1, math.ceil(len(chosen_rows) / MAX_FITTED_PRESSES))  # the number k
+    stride = max(1, math.ceil(len(chosen_rows) / MAX_FITTED_PRESSES))
     is_selected = np.zeros_like(is_chosen)
     is_selected[chosen_rows[::stride]] = True
     return is_selected

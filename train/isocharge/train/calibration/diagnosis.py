@@ -1,8 +1,8 @@
-"""Search for mistakes in the records of presses that no film explains.
+"""Search for mistakes in the records of presses, if no film explains these presses.
 
-The mistakes that are considered are swapped charge columns, rotated or mirrored axes of the rig, and wrong units. For
-each mistake, a corrected copy of the presses is compared with the charges of a few films. An error message names the
-mistakes whose correction makes the presses agree with a film. The presses themselves are never changed. Before the
+The search considers swapped charge columns, rotated or mirrored axes of the rig, and wrong units. For each mistake, a
+corrected copy of the presses is compared with the charges of a few films. If the correction of a mistake makes the
+presses agree with a film, an error message names the mistake. The presses themselves are never changed. Before the
 search, separate checks find positions outside the film, dead channels, and channels with the wrong sign.
 """
 
@@ -36,7 +36,7 @@ MIN_POSITION_RANGE_MM = 0.05
 
 
 class OtherUnit(NamedTuple):
-    """Wrong unit in which values may have been written by mistake.
+    """Wrong unit that may have been used by mistake.
 
     Attributes:
         values: Name of the values that have the unit.
@@ -159,14 +159,14 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
 
 def _smallest_film_ratios(presses: MeasuredPresses, charges: FilmCharges) -> Array:
-    """Return the smallest ratio of each channel's charge to the other channels' charges among a few films.
+    """Compute the charge of each channel relative to the other channels, and return the smallest value of a few films.
 
     Args:
         presses: The measured presses. The charges of the films are computed for presses with a known place and force.
         charges: Model of the charges of all films.
 
     Returns:
-        Ratios as `_charge_ratios` returns them, but limited to at most 1, shape (n_electrode,). All ratios are 1 if no
+        Ratios of charges as in `_charge_ratios`, but limited to at most 1, shape (n_electrode,). All ratios are 1 if no
         press has a known place and force.
     """
     placed_contact = presses.contact[presses.placed]
@@ -208,8 +208,8 @@ def _check_channel(name: str, charge: Array, ratio: float, smallest_film_ratio: 
 def _charge_ratios(charge: Array) -> Array:
     """Return the typical charge of each channel, divided by the typical charge of the other channels.
 
-    The typical charge of a channel is the median of the magnitudes of its charges. The typical charge of several
-    channels is the median of their typical charges.
+    The typical charge of one channel is the median of the magnitudes of its charges. The typical charge of several
+    channels is the median of the typical charges of these channels.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC; NaN where a charge was not measured.
@@ -226,7 +226,7 @@ def _charge_ratios(charge: Array) -> Array:
 
 
 def expected_charges(charges: FilmCharges, contact: Array) -> Array:
-    """Compute the charges of presses on a few films: the mean film of the prior with each pretension in `PRETENSIONS`.
+    """Compute the charges of presses on the mean film of the prior, for each pretension in `PRETENSIONS`.
 
     Args:
         charges: Model of the charges of all films, with their prior.
@@ -238,20 +238,20 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
     """
     prior = charges.prior
     contact_in_domain = charges.into_domain(contact)
-    expected = []
+    charges_by_film = []
     for pretension_share in PRETENSIONS:
         parameters = prior.mean.copy()
         parameters[prior.index("pretension")] = pretension_share * prior.spread.pretension
-        expected.append(charges.charges(parameters, contact_in_domain))
-    return np.array(expected)
+        charges_by_film.append(charges.charges(parameters, contact_in_domain))
+    return np.array(charges_by_film)
 
 
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     """Find the mistakes whose correction makes the presses agree far better with a film.
 
-    A mistake is returned if its correction reduces the misfit to less than `CLEARER` times the misfit of the presses as
-    they were written. The misfit after the correction must also be at most `MAX_MISFIT_RATIO` times the misfit after
-    the best correction.
+    A mistake is returned if its correction reduces the misfit to less than `CLEARER` times the misfit without
+    corrections. The misfit after the correction must also be at most `MAX_MISFIT_RATIO` times the misfit after the best
+    correction.
 
     Args:
         presses: The measured presses. A press whose place or force is unknown is not used.
@@ -261,10 +261,10 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
         One sentence for each mistake, with the best explanation first. The list is empty if no mistake explains the
         presses.
     """
-    placed = presses[presses.placed]
-    if not len(placed):
+    placed_presses = presses[presses.placed]
+    if not len(placed_presses):
         return []
-    corrections = list(_corrected_presses(placed, charges))
+    corrections = list(_corrected_presses(placed_presses, charges))
 
     # The charges of the films are computed for all corrected contacts in one call, because this is faster. The result
     # has the shape (n_film, n_correction * n, n_electrode), and is then split into one array for each correction.
@@ -289,27 +289,27 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
     """Return the misfit of all presses with a known place and force; see `charge_misfit`.
 
-    If the place and the force of no press are known, the misfit is 0.
-
-    Correctly recorded presses usually have a misfit of about 1. A misfit of 20 indicates a mistake in the records.
+    If there are no such presses, the misfit is 0. Correctly recorded presses usually have a misfit of about 1. A misfit
+    of 20 indicates a mistake in the records.
 
     Args:
         presses: The measured presses.
         charges: Model of the charges of all films.
     """
-    placed = presses[presses.placed]
-    if not len(placed):
+    placed_presses = presses[presses.placed]
+    if not len(placed_presses):
         return 0.0
-    return charge_misfit(charges, placed.contact, placed.charge_pC, expected_charges(charges, placed.contact))
+    film_charges = expected_charges(charges, placed_presses.contact)
+    return charge_misfit(charges, placed_presses.contact, placed_presses.charge_pC, film_charges)
 
 
 def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected: Array) -> float:
-    """Compute the misfit between measured charges and the charges of the most similar of several films.
+    """Compute the misfit between measured charges and the charges of the most similar film.
 
-    The misfit of one film is the sum of two terms, which are computed from the logarithms of measured divided by
-    expected charges. The first term is the mean squared deviation of these logarithms from their median, divided by
+    The misfit of one film is computed from the logarithms of the ratio of measured charge to expected charge. It is the
+    sum of two terms. The first term is the mean squared deviation of these logarithms from their median, divided by
     `SCATTER_STD` squared. The second term is the squared median of the logarithms, divided by `OFFSET_STD` squared. The
-    smallest misfit of all films is returned.
+    function returns the smallest misfit of all films.
 
     Args:
         charges: Model of the charges of all films, with their domain. The misfit is infinite if more than
@@ -333,7 +333,7 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
 
 
 def _log_charge(charge: Array) -> Array:
-    """Return the logarithms of charges. Charges below `MIN_CHARGE_pC` are first raised to this limit; NaN remains NaN.
+    """Return the logarithms of charges. Charges below `MIN_CHARGE_pC` are first set to this limit. NaN remains NaN.
 
     Args:
         charge: Charges, an array of any shape, pC.
@@ -356,7 +356,7 @@ class Correction(NamedTuple):
 
 
 def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[Correction]:
-    """Yield a corrected copy of the presses for each mistake that is considered.
+    """Yield a corrected copy of the presses for each possible mistake.
 
     The mistakes are swapped charge columns, rotated or mirrored axes of the rig, and wrong units.
 
@@ -435,7 +435,7 @@ UNUSUAL_FILM = "only a film that differs unusually from its description has such
 
 
 def large_residual(residual_over_noise: float) -> str:
-    """Return the reason why presses that differ too much from the best film of a fit are refused.
+    """Return the reason for refusing presses that differ too much from the best film of a fit.
 
     Args:
         residual_over_noise: Root-mean-square residual of the best film, in units of the noise.
@@ -444,7 +444,7 @@ def large_residual(residual_over_noise: float) -> str:
 
 
 def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: str) -> PressError:
-    """Create the error that is raised if no film of the sensor explains the presses.
+    """Create the error for presses that no film of the sensor explains.
 
     The message names up to three mistakes that would explain the presses. If no mistake is found, the message asks the
     user to check the setup.

@@ -1,17 +1,18 @@
-"""Discrepancy of a film: smooth differences between its real charges and the charges that its parameters imply.
+"""Discrepancy of a film: smooth differences between the real charges and the charges that the parameters imply.
 
-A real film has properties that no parameter describes. The effects of such properties on the charges are modelled by a
-Gaussian process of finite rank for each electrode (Kennedy and O'Hagan 2001). The process is a sum of products of
-Chebyshev polynomials T, which is added to the logarithm of the charge Q_e of the electrode e:
+A real film has properties that no parameter describes. For each electrode, a Gaussian process of finite rank models the
+effects of such properties on the charges (Kennedy and O'Hagan 2001). The process is a sum of products of Chebyshev
+polynomials T, which is added to the logarithm of the charge Q_e of the electrode e:
 
     ln Q_e = ln Q_e(map) + sum c_eijm T_i(x / r) T_j(y / r) T_m(l),    i + j + m <= DEGREE, m <= FORCE_DEGREE.
 
 Here (x, y) is the position, r is the radius of the domain, and l is the logarithm of the force, scaled to [-1, 1]. The
 coefficient c_eijm has the prior mean zero and the prior standard deviation s FADING^(i + j + m), where s is the size of
-the discrepancy. The module `hypotheses` considers several sizes, and computes their probabilities from the presses.
+the discrepancy. The module `hypotheses` considers several sizes of the discrepancy, and computes their probabilities
+from the presses.
 
-A further part of the discrepancy is the same for all electrodes. This common part is needed because the charges of all
-electrodes are smaller where a film is stiffer than its parameters imply. The standard deviation of the common part is
+A further part of the discrepancy is the same for all electrodes. This common part is needed, for example, because all
+charges are smaller where a film is stiffer than its parameters imply. The standard deviation of the common part is
 `COMMON` times the standard deviation of the part of each electrode.
 """
 
@@ -47,7 +48,7 @@ area, the error of this approximation is below the noise."""
 
 
 def terms(contact: Array, domain: Domain) -> Array:
-    """Compute the terms of the discrepancy, whose weighted sum is added to the logarithm of a charge.
+    """Compute the terms of the discrepancy. A weighted sum of these terms is added to the logarithm of a charge.
 
     Each term is the product T_i(x / r) T_j(y / r) T_m(l) FADING^(i + j + m). Here T is a Chebyshev polynomial, r is the
     radius of the domain, and l is the logarithm of the force, scaled to [-1, 1]. The factor FADING^(i + j + m) is the
@@ -87,5 +88,5 @@ def _degrees() -> Integers:
 
 
 def term_count() -> int:
-    """Return the number of terms of the discrepancy of each electrode."""
+    """Return the number of terms in the discrepancy of each electrode."""
     return len(_degrees())

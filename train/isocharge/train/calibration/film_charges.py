@@ -2,9 +2,8 @@
 
 A film is described by a vector of unknowns. The first unknowns are the parameters of `FilmPrior`. The parameters may be
 followed by coefficients, which describe modes of imperfections, traces and the discrepancy. The coefficient of a mode
-is in units of the standard deviation of the mode. The coefficients of traces describe only traces that are missing in
-the sensor file.
-`UnknownLayout` defines the order of the unknowns.
+is in units of the standard deviation of the mode. The coefficients of traces describe only traces that the sensor file
+does not contain. `UnknownLayout` defines the order of the unknowns.
 """
 
 from dataclasses import dataclass, replace
@@ -50,7 +49,7 @@ MAX_CACHED_MODES = 2
 
 @dataclass(frozen=True)
 class FilmCharges(FilmMaps):
-    """Model of the charges of all films of a prior, including imperfections, traces and the discrepancy."""
+    """Model that computes the charges of all films of a prior, including imperfections, traces and the discrepancy."""
 
     @cached_property
     def modes(self) -> tuple[str, ...]:
@@ -64,14 +63,14 @@ class FilmCharges(FilmMaps):
 
     @cached_property
     def _mode_stds(self) -> Array:
-        """Standard deviation of each mode among typical films, in the unit of the mode, shape (n_mode,)."""
+        """Standard deviation of the size of each mode among typical films, in the unit of the mode, shape (n_mode,)."""
         return np.array([MODES[name].std for name in self.modes])
 
     @cached_property
     def _is_uneven_tension(self) -> Booleans:
         """Whether each mode is an uneven tension, shape (n_mode,).
 
-        The second-order effect of an uneven tension is the effect of a lower mean tension.
+        In second order, an uneven tension has the same effect as a lower mean tension.
         """
         return np.array([MODES[name].is_uneven_tension for name in self.modes], dtype=bool)
 
@@ -86,7 +85,7 @@ class FilmCharges(FilmMaps):
         return trace_lines(self.prior.sensor)
 
     def trace_widths(self, unknowns: Array, covariance: Array) -> dict[str, tuple[float, float]]:
-        """Return the total width of the traces that are missing in the sensor file, for each electrode.
+        """Estimate, for each electrode, the total width of its traces that the sensor file does not contain.
 
         Args:
             unknowns: Parameters and coefficients of a film, shape (n_parameter + n_coefficient,).
@@ -117,12 +116,12 @@ class FilmCharges(FilmMaps):
         return FunctionMap(charges, forward_map.electrodes, self.domain)
 
     def factor(self, unknowns: Array, contact: Array, charge: Array | None = None) -> Array:
-        """Compute the factors by which modes, traces and the discrepancy change the charges of a film.
+        """Compute the factors by which modes, traces and the discrepancy multiply the charges of a film.
 
         Modes are imperfections of the film, such as an uneven tension. Traces are metal lines that lead to the
         electrodes and also collect charge. The discrepancy multiplies each charge by a factor whose logarithm is a
-        polynomial of the contact. Modes and traces are left out if all their coefficients are negligible, because the
-        computation of their charges is slow.
+        polynomial of the contact. The computation of the charges of modes and traces is slow. Therefore, these charges
+        are omitted if all their coefficients are negligible.
 
         Args:
             unknowns: Parameters and coefficients of the film, as in `film`.
@@ -148,7 +147,7 @@ class FilmCharges(FilmMaps):
         return factor
 
     def _imperfection_factor(self, unknowns: Array, contact: Array, charge: Array) -> Array:
-        """Compute the factors by which modes and traces change the charges of a film.
+        """Compute the factors by which modes and traces multiply the charges of a film.
 
         Modes and traces add charges. Therefore, the factor is 1 plus the ratio of the added charges to the charges
         without modes and traces. An uneven tension has an additional second-order effect, which multiplies this factor.
@@ -188,11 +187,11 @@ class FilmCharges(FilmMaps):
         return float(unknowns[self.layout.parameter("pretension")])
 
     def _mode_charges(self, parameters: Array, contact: Array, charge: Array) -> ModeCharges:
-        """Return the effects of the modes on the charges of presses, from the cache if possible.
+        """Return the effects of the modes on the charges of presses, using cached results if possible.
 
         The modes depend only on the film and the probe. The charges of the modes also depend on the electrodes and
-        gains of the sensor, and on the contacts. Therefore, a cached result is returned if film, probe, sensor and
-        contacts are the same. If only the film and the probe are the same, the cached modes are used to compute the
+        gains of the sensor, and on the contacts. Therefore, a cached result is returned if it has the same film, probe,
+        sensor and contacts. If a cached result has only the same film and probe, its modes are used to compute the
         charges.
 
         Args:
@@ -207,34 +206,36 @@ class FilmCharges(FilmMaps):
             return ModeCharges(None, sensor, contact, mode_jacobian=no_modes, log_unevenness=np.zeros_like(charge))
 
         film_and_probe = (sensor.film, forward_map.probe)
-        cached = self._cached_modes.get(film_and_probe)
-        if cached is not None and cached.sensor == sensor and np.array_equal(cached.contact, contact):
-            return cached
-        if cached is not None and cached.modes is not None:
-            modes = cached.modes
+        cached_charges = self._cached_modes.get(film_and_probe)
+        if cached_charges is not None:
+            has_same_contact = np.array_equal(cached_charges.contact, contact)
+            if cached_charges.sensor == sensor and has_same_contact:
+                return cached_charges
+        if cached_charges is not None and cached_charges.modes is not None:
+            modes = cached_charges.modes
         else:
             modes = self.family.imperfections.mode_map(forward_map, self.modes)
-        computed = self._computed_mode_charges(modes, forward_map, parameters, contact, charge)
-        self._cache_mode_charges(film_and_probe, computed)
-        return computed
+        mode_charges = self._computed_mode_charges(modes, forward_map, parameters, contact, charge)
+        self._cache_mode_charges(film_and_probe, mode_charges)
+        return mode_charges
 
-    def _cache_mode_charges(self, film_and_probe: tuple[Film, Probe], computed: ModeCharges) -> None:
+    def _cache_mode_charges(self, film_and_probe: tuple[Film, Probe], mode_charges: ModeCharges) -> None:
         """Store a result of `_mode_charges` in the cache, and remove the oldest result if the cache is full.
 
         Args:
             film_and_probe: Key of the result.
-            computed: The result.
+            mode_charges: The result.
         """
         is_full = len(self._cached_modes) >= MAX_CACHED_MODES
         if is_full and film_and_probe not in self._cached_modes:
             oldest_key = next(iter(self._cached_modes))
             del self._cached_modes[oldest_key]
-        self._cached_modes[film_and_probe] = computed
+        self._cached_modes[film_and_probe] = mode_charges
 
     def _computed_mode_charges(
         self, modes: ModeMap, forward_map: ForwardMap, parameters: Array, contact: Array, charge: Array
     ) -> ModeCharges:
-        """Compute the effects of known modes on the charges of presses.
+        """Compute the effects of given modes on the charges of presses.
 
         Args:
             modes: The modes of the film, for any electrodes and gains.
@@ -256,7 +257,7 @@ class FilmCharges(FilmMaps):
 
     @cached_property
     def _cached_modes(self) -> dict[tuple[Film, Probe], ModeCharges]:
-        """Cache of `_mode_charges`, by film and probe. The first entry of the cache is the oldest."""
+        """Cache of `_mode_charges`, by film and probe. The oldest entry is the first one."""
         return {}
 
     def _unevenness(self, pretension: float, mode_coefficients: Array) -> tuple[float, Array]:
@@ -294,7 +295,7 @@ class FilmCharges(FilmMaps):
         return differences(self.film(unknowns).charges, contact, CONTACT_STEPS)
 
     def into_domain(self, contact: Array) -> Array:
-        """Return the nearest contact of the domain for each of some contacts.
+        """Move each contact outside the domain to the nearest contact in the domain.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N. They may lie outside the domain.
@@ -309,7 +310,7 @@ class FilmCharges(FilmMaps):
     def unknown_slopes(self, unknowns: Array, contact: Array, contact_slopes: Array) -> Array:
         """Compute the derivatives of the charges with respect to the unknowns of the film.
 
-        The charges of a film with coefficients are the charges of the film without coefficients times a factor. The
+        The charges of a film with coefficients are the product of a factor and the charges without coefficients. The
         charges without coefficients obey scaling laws; see `parameter_jacobian`. The effect of modes on the factor is
         assumed not to depend on the piezoelectric coefficients, the positions of the electrodes, and the radius of the
         probe.
@@ -356,7 +357,7 @@ class FilmCharges(FilmMaps):
         return np.concatenate([film_jacobian, mode_jacobian, trace_jacobian, term_jacobian], axis=2)
 
     def _with_factor_slopes(self, film_jacobian: Array, unknowns: Array, contact: Array, charge: Array) -> Array:
-        """Add the effect of the factor of modes and traces to the derivatives of the charges.
+        """Add the terms that the factor of modes and traces contributes to the derivatives of the charges.
 
         The added terms are charge * d ln(factor), as in the product rule for factor * charge.
 
@@ -403,7 +404,8 @@ class FilmCharges(FilmMaps):
     def _term_jacobian(self, contact: Array, charge: Array) -> Array:
         """Compute the derivatives of the charges with respect to the coefficients of the discrepancy.
 
-        A coefficient changes the logarithm of the charge of its own electrode by the value of its term.
+        Each coefficient belongs to one term and one electrode. The derivative of the logarithm of the electrode's
+        charge with respect to the coefficient is the value of the term.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -421,7 +423,7 @@ class FilmCharges(FilmMaps):
         return jacobian.reshape(*charge.shape, -1)  # joins the axes of the coefficients
 
     def _without_terms(self, unknowns: Array) -> Array:
-        """Return a copy of the unknowns of a film in which the coefficients of the discrepancy are zero.
+        """Return a copy of a film's unknowns, with zeros for the coefficients of the discrepancy.
 
         Args:
             unknowns: Parameters and coefficients of the film.
@@ -431,7 +433,7 @@ class FilmCharges(FilmMaps):
         return film_without_terms
 
     def _stepped(self, unknowns: Array, name: str) -> tuple[Array, float]:
-        """Change one parameter by a small step. The step leads towards the prior mean, and thus away from the bounds.
+        """Change one parameter by a small step towards the prior mean, so that the parameter stays within its bounds.
 
         Args:
             unknowns: Parameters and coefficients of a film.
@@ -442,16 +444,17 @@ class FilmCharges(FilmMaps):
         """
         index = self.layout.parameter(name)
         step = -STEP if unknowns[index] > self.prior.mean[index] else STEP
-        stepped = unknowns.copy()
-        stepped[index] += step * self.prior.std[index]
-        return stepped, step
+        stepped_unknowns = unknowns.copy()
+        stepped_unknowns[index] += step * self.prior.std[index]
+        return stepped_unknowns, step
 
     def _load_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
         """Compute the derivatives of ln(factor) with respect to the pretension, ln E and ln h.
 
-        The factor is that of modes and traces, E is Young's modulus, and h is the thickness. The factor depends on
-        these parameters only through F / (E h a) and T / E, where F is the force, a is the radius of the film, and T is
-        the pretension. Therefore, all three derivatives follow from two finite differences, with respect to ln F and T.
+        The factor is the one by which modes and traces multiply the charges, E is Young's modulus, and h is the
+        thickness. The factor depends on these parameters only through F / (E h a) and T / E, where F is the force, a is
+        the radius of the film, and T is the pretension. Therefore, all three derivatives follow from two finite
+        differences, with respect to ln F and T.
 
         Args:
             unknowns: Parameters and coefficients of the film.
@@ -487,11 +490,11 @@ class FilmCharges(FilmMaps):
         return {name: derivative / positive_factor for name, derivative in derivatives.items()}
 
     def _trace_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
-        """Compute the derivatives of ln(factor of traces) with respect to the parameters outside `LOAD_PARAMETERS`.
+        """Compute the derivatives of the logarithm of the factor of traces with respect to some of the parameters.
 
-        The parameters are the piezoelectric coefficients, the shift and the rotation of the electrodes, and the radius
-        of the probe. These parameters change the charge of a trace and the charge of its electrode by different ratios,
-        because the trace and the electrode lie at different places.
+        The parameters are those in `SHARED` but not in `LOAD_PARAMETERS`: the piezoelectric coefficients, the shift and
+        the rotation of the electrodes, and the radius of the probe. These parameters change the charge of a trace and
+        the charge of its electrode by different ratios, because the trace and the electrode lie at different places.
 
         Args:
             unknowns: Parameters and coefficients of the film.

@@ -1,13 +1,12 @@
-"""Directions in which a calibrated film remains uncertain, for a service that follows changes of the film.
+"""Directions in which a calibrated film is uncertain. A service uses these directions to follow changes of the film.
 
 The directions are written to the file `film_directions.npz`; see `serve.model.film_directions`.
 
 A direction is a linear combination of the unknowns of the film. Let C = R R' be the covariance of the unknowns at a
 given pretension. Let M be the derivative of the misfits of touches with respect to the unknowns, in units of the noise.
-Each right singular vector of the matrix M R defines one direction. The directions are uncorrelated before any
-touch, and their effects on the misfits of touches are orthogonal. Such directions are known as likelihood-informed
-directions (Cui et al., 2014). Touches hardly determine a direction with a small singular value, so such directions are
-left out.
+Each right singular vector of the matrix M R defines one direction. The directions are uncorrelated before any touch,
+and their effects on the misfits of touches are orthogonal. Such directions are known as likelihood-informed directions
+(Cui et al., 2014). Directions with small singular values are left out, because touches hardly determine them.
 """
 
 import numpy as np
@@ -45,11 +44,11 @@ LEAST_VARIANCE = 1e-12
 
 
 def film_directions(result: CalibrationResult) -> FilmDirections:
-    """Compute the directions in which a calibrated film is uncertain at the later time when it is used.
+    """Compute the directions in which a calibrated film will be uncertain when it is used.
 
-    A direction is a linear combination of the unknowns of the film, whose standard deviation is 1. The direction that
-    causes the largest misfits comes first. Directions that cause only small misfits are left out. The directions
-    describe the uncertainty at a given pretension, because the service estimates the pretension separately.
+    A direction is a linear combination of the unknowns of the film. The combination has the standard deviation 1. The
+    direction that causes the largest misfits comes first. Directions that cause only small misfits are left out. The
+    directions describe the uncertainty at a given pretension, because the service estimates the pretension separately.
 
     Args:
         result: Result of the calibration of the film.
@@ -106,11 +105,11 @@ def _fitted_log_charge(result: CalibrationResult) -> Array | None:
 
 
 def _visible_directions(misfit_jacobian: Array, root: Array) -> Array:
-    """Find the combinations of independent variables that change the misfits of touches most.
+    """Find the combinations of independent variables with the largest effects on the misfits of touches.
 
     The combinations are the right singular vectors of M R, where M is the misfit Jacobian and R is the root. Their
-    effects on the misfits are orthogonal. A combination whose effect on the misfits is below `LEAST_MISFIT` is left
-    out.
+    effects on the misfits are orthogonal. A combination is left out if its effect on the misfits is below
+    `LEAST_MISFIT`.
 
     Args:
         misfit_jacobian: Derivatives of the misfits of each contact with respect to the unknowns, in units of the noise,
@@ -149,10 +148,10 @@ def _covariance_root(covariance: Array) -> Array:
 
 
 def _fitted_series(domain: Domain, contact: Array, log_changes: Array) -> Array:
-    """Fit a polynomial series in the contact to changes of ln Q.
+    """Fit a polynomial series in the contact to given changes of ln Q.
 
-    The degrees of the series are the first pair in `DEGREES` for which there are enough contacts. If there are too few
-    contacts for every pair, the last pair is used.
+    The degrees of the series are the first pair in `DEGREES` for which the number of contacts suffices. If it suffices
+    for no pair, the last pair is used.
 
     Args:
         domain: Range of positions and forces to which the variables of the series are scaled.

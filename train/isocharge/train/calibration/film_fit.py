@@ -1,8 +1,8 @@
 """Robust estimation of a film from measured presses.
 
-The least-squares problem is solved by `FitProblem`. If noise alone cannot explain the residuals of a press, the weight
-of this press is reduced, as for errors with Student's t distribution (Lange et al., 1989). Therefore, a single bad
-press hardly changes the estimated film. Presses whose residuals remain too large are left out and reported.
+The least-squares problem is solved by `FitProblem`. If noise alone cannot explain the residuals of a press, the press
+gets a smaller weight, as for errors with Student's t distribution (Lange et al., 1989). Therefore, a single bad press
+hardly changes the estimated film. If the residuals of a press remain too large, the press is left out and reported.
 """
 
 from dataclasses import dataclass, field, replace
@@ -57,7 +57,7 @@ PROBABLE = 0.5
 
 @dataclass(frozen=True)
 class FilmPosterior(FilmEstimate):
-    """Estimate of a film from presses, with the residuals of these presses.
+    """Estimate of a film from presses, with residuals of these presses.
 
     Attributes:
         contact: Contacts (x, y, F) of the presses, adjusted to this film, shape (n, 3), mm and N.
@@ -79,7 +79,7 @@ class FilmPosterior(FilmEstimate):
 
     @property
     def total(self) -> tuple[float, float]:
-        """Sum of the squared residuals, and sum of the degrees of freedom, of all presses that were not left out."""
+        """Sums of the squared residuals and of the degrees of freedom, over all presses that were not left out."""
         return float(self.chi2[~self.bad].sum()), float(self.degrees_of_freedom[~self.bad].sum())
 
     @property
@@ -88,7 +88,7 @@ class FilmPosterior(FilmEstimate):
         return self._probability_of_any("modes", "discrepancy") > PROBABLE
 
     def probability(self, effect: str) -> float:
-        """Return the probability that the session has an effect.
+        """Return the probability that the session has a given effect.
 
         Args:
             effect: Name of the effect, as in `Hypothesis.has`.
@@ -96,7 +96,7 @@ class FilmPosterior(FilmEstimate):
         return self._probability_of_any(effect)
 
     def _probability_of_any(self, *effects: str) -> float:
-        """Return the probability that the session has at least one of several effects.
+        """Return the probability that the session has at least one of the given effects.
 
         Args:
             effects: Names of the effects, as in `Hypothesis.has`.
@@ -120,7 +120,7 @@ class FilmPosterior(FilmEstimate):
         return replace(self, covariance=self.covariance * factor, joint=self.joint * factor, warming=warming)
 
     def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> FilmEstimate:
-        """Return the estimate for a later time; see `FilmEstimate.drifted`.
+        """Return the estimate of the film for a later time; see `FilmEstimate.drifted`.
 
         If the film probably has neither imperfections nor a discrepancy, the returned estimate contains only the
         parameters of the film, without coefficients.
@@ -148,10 +148,10 @@ def fit_film(
     *,
     friction: float = 0.0,
 ) -> FilmPosterior:
-    """Estimate a film from presses, without presses that were probably recorded wrongly.
+    """Estimate a film from presses, and leave out presses that were probably recorded wrongly.
 
-    First, the film is fitted to all presses. If some residuals are too large, the film is fitted again to only those
-    presses that agree with each other. Both fits assume that the parameters of the film alone explain the presses.
+    First, the film is fitted to all presses. If some residuals are too large, the film is fitted again, but only to
+    presses that agree with each other. These two fits assume that the parameters of the film explain the presses.
     Further fits also consider hypotheses. A hypothesis is a combination of other effects, such as imperfections of the
     film.
 
@@ -202,7 +202,7 @@ def refit_film(
     *,
     friction: float = 0.0,
 ) -> FilmPosterior:
-    """Estimate a film from presses, with a search that begins at a previous estimate from similar presses.
+    """Estimate a film from presses, beginning the search at a previous estimate from similar presses.
 
     The first fit assumes the most probable hypothesis of the previous estimate. This function takes less time than
     `fit_film`.
@@ -236,7 +236,7 @@ def refit_film(
 
 
 def _degrees_of_freedom(data: PressData) -> Array:
-    """Return the number of redundant measurements of each press, shape (n,).
+    """Return the number of redundant measurements in each press, shape (n,).
 
     Three of the measured charges and coordinates determine the contact of a press. All further measurements are
     redundant.
@@ -248,7 +248,7 @@ def _degrees_of_freedom(data: PressData) -> Array:
 
 
 def _is_suspicious(chi2: Array, degrees_of_freedom: Array) -> bool:
-    """Return whether the residuals of a single press, or of all presses together, are too large to be noise.
+    """Return whether residuals are too large to be noise, either in a single press or in all presses together.
 
     Args:
         chi2: Sum of squared residuals of each press, shape (n,).
@@ -265,7 +265,7 @@ def _is_suspicious(chi2: Array, degrees_of_freedom: Array) -> bool:
 def _agreeing_presses(
     problem: FitProblem, data: PressData, solved: SolvedFilm, degrees_of_freedom: Array
 ) -> tuple[Booleans, Array]:
-    """Find the film with which most presses agree, and the presses that agree with this film.
+    """Find a film with which most presses agree, and find the presses that agree with it.
 
     The film is fitted repeatedly. Before each fit, presses with large residuals get smaller weights, as for errors with
     Student's t distribution.
@@ -292,10 +292,10 @@ def _agreeing_presses(
 def _is_good(chi2: Array, degrees_of_freedom: Array) -> Booleans:
     """Return whether each press agrees with a film, shape (n,).
 
-    A press agrees if the sum of its squared residuals does not exceed a limit. A good press exceeds the limit with the
-    probability `BAD_PROBABILITY` divided by the number of presses (Bonferroni correction). The limit is increased if
-    the residuals of all presses are larger than expected. If more than `MAX_BAD_SHARE` of the presses exceed the limit,
-    all presses count as good.
+    A press agrees if the sum of its squared residuals does not exceed a limit. The probability that a good press
+    exceeds the limit is `BAD_PROBABILITY` divided by the number of presses (Bonferroni correction). The limit is
+    increased if the residuals of all presses are larger than expected. If more than `MAX_BAD_SHARE` of the presses
+    exceed the limit, all presses count as good.
 
     Args:
         chi2: Sum of squared residuals of each press, shape (n,).
@@ -315,9 +315,9 @@ def _is_good(chi2: Array, degrees_of_freedom: Array) -> Booleans:
 
 
 def _log_density_of_mistakes(data: PressData, is_mistake: Booleans) -> float:
-    """Return the logarithm of the probability density of some presses, assuming that they were recorded wrongly.
+    """Return the logarithm of the probability density of presses that were recorded wrongly.
 
-    The density includes the prior probability that these presses were recorded wrongly.
+    The density also contains the prior probability of these mistakes.
 
     Args:
         data: All presses.

@@ -1,7 +1,7 @@
-"""Charges of presses on the perfect films of a prior, and the derivatives of these charges.
+"""Charges of presses on the perfect films of a prior, and derivatives of these charges.
 
-A perfect film has no imperfections, no traces that are missing in the sensor file, and no discrepancy. The parameters
-of `FilmPrior` describe a perfect film completely.
+A perfect film has no imperfections, no discrepancy, and only traces that the sensor file contains. The parameters of
+`FilmPrior` describe a perfect film completely.
 """
 
 from dataclasses import dataclass, replace
@@ -40,7 +40,7 @@ FORCE_MARGIN = 1.01
 
 @dataclass(frozen=True)
 class FilmMaps:
-    """Forward maps of the perfect films of a prior. A forward map computes the charges of contacts.
+    """Forward maps of the perfect films of a prior. A forward map computes charges from contacts.
 
     Attributes:
         prior: Distribution of the films, which declares the parameters.
@@ -52,10 +52,10 @@ class FilmMaps:
 
     @cached_property
     def domain(self) -> Domain:
-        """Range of contacts for which the charges of every film of the prior can be computed.
+        """Range of contacts in which the charges of every film of the prior can be computed.
 
-        The range leaves a margin for finite differences. The stiffest film determines the smallest force, and the
-        softest film determines the largest force.
+        The range is small enough to leave a margin for finite differences. The stiffest film determines the smallest
+        force, and the softest film determines the largest force.
         """
         film = self.prior.sensor.film
         young = self.prior.index("young")
@@ -80,8 +80,8 @@ class FilmMaps:
         """Return the forward map of one film.
 
         Films that differ only in piezoelectric coefficients, gains and electrodes have the same stresses. Therefore,
-        the forward maps are cached by film and probe. A cached map is returned with the sensor that belongs to the
-        given parameters. The cache contains at most `CACHED_MAPS` maps.
+        the forward maps are cached by film and probe. The returned map contains the sensor that belongs to the given
+        parameters. The cache contains at most `CACHED_MAPS` maps.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -97,7 +97,7 @@ class FilmMaps:
 
     @cached_property
     def _maps(self) -> dict[tuple[Film, Circle], ForwardMap]:
-        """Cache of `forward_map`, by film and probe. The first entry of the cache is the oldest."""
+        """Cache of `forward_map`, by film and probe. The oldest entry is the first one."""
         return {}
 
     def parameter_jacobian(
@@ -162,13 +162,13 @@ class FilmMaps:
         step = STEP * self.prior.std[index]
         if parameters[index] + step > upper_bounds[index]:  # keep the changed parameter within its bounds
             step = -step
-        stepped = parameters.copy()
-        stepped[index] += step
-        rounded_step = stepped[index] - parameters[index]  # the step after rounding to floating-point numbers
+        stepped_parameters = parameters.copy()
+        stepped_parameters[index] += step
+        rounded_step = stepped_parameters[index] - parameters[index]  # after rounding to floating-point numbers
         stepped_contact = contact
         if name == "thickness":
             stepped_contact = contact * [1.0, 1.0, np.exp(rounded_step)]  # keeps F / h constant
-        stepped_charge = self.forward_map(stepped).charges(stepped_contact)
+        stepped_charge = self.forward_map(stepped_parameters).charges(stepped_contact)
         return np.asarray((stepped_charge - charge) / rounded_step)
 
 

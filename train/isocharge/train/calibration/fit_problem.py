@@ -1,4 +1,4 @@
-"""Least-squares problem of a calibration, whose solution is the film that explains the presses best.
+"""Least-squares problem of a calibration, which is solved by the film that explains the presses best.
 
 The solution is the vector of unknowns p that minimises the sum of two parts. The first part is the sum of the squared
 residuals of all presses. Each measured charge and each coordinate that the rig measured has one residual. The second
@@ -91,7 +91,7 @@ class SolvedFilm(NamedTuple):
 
 
 class SettledFit(NamedTuple):
-    """Result of repeated fits of a film, as `FitProblem.settle` returns it.
+    """Result of the repeated fits of a film by `FitProblem.settle`.
 
     Attributes:
         is_kept: Whether each press was used in the last fit, shape (n,). The other presses were left out as bad.
@@ -123,9 +123,9 @@ class FitProblem:
     def of(
         cls, charges: FilmCharges, initial: FilmEstimate, *, knows_temperature: bool, friction: float = 0.0
     ) -> "FitProblem":
-        """Create the problem from an estimate of the film before the presses.
+        """From an estimate of the film before the presses, create the problem.
 
-        In a fit, an unknown whose prior variance is zero keeps its mean, unless the hypothesis of the fit adds a
+        An unknown whose prior variance is zero keeps its mean in a fit, unless the hypothesis of the fit adds a
         variance.
 
         Args:
@@ -186,7 +186,7 @@ class FitProblem:
         return lower, upper
 
     def solve(self, data: PressData, weight: Array, start: Array, hypothesis: Hypothesis) -> SolvedFilm:
-        """Fit the film to weighted presses under a hypothesis.
+        """Fit the film to weighted presses, assuming a hypothesis.
 
         Args:
             data: The measured presses.
@@ -221,11 +221,11 @@ class FitProblem:
         solved: SolvedFilm,
         hypothesis: Hypothesis,
     ) -> SettledFit:
-        """Repeat the fit until neither the film nor the selection of presses changes, but at most `MAX_ROUNDS` times.
+        """Repeat the fit until neither the film nor the selection of presses changes.
 
-        Each round fits the film under the most probable hypothesis of the previous round. A hypothesis is a combination
-        of effects that the parameters of the film do not describe. A press that was left out in an earlier round is
-        used again if it agrees with the new film.
+        There are at most `MAX_ROUNDS` rounds. Each round assumes the most probable hypothesis of the previous round. A
+        hypothesis is a combination of effects that the parameters of the film do not describe. A press that was left
+        out in an earlier round is used again if it agrees with the new film.
 
         Args:
             data: All presses.
@@ -269,15 +269,15 @@ class FitProblem:
             start: Unknowns at which the search begins, shape (n_unknown,).
             hypothesis: Effects that the session may have.
         """
-        kept = data[is_kept]
-        return self.solve(kept, np.ones(len(kept)), start, hypothesis)
+        kept_data = data[is_kept]
+        return self.solve(kept_data, np.ones(len(kept_data)), start, hypothesis)
 
     def agrees(self, data: PressData, solved: SolvedFilm, mixture: Mixture, degrees_of_freedom: Array) -> Booleans:
-        """Return whether each press agrees with a film, given the uncertainty of the film, shape (n,).
+        """Return whether each press agrees with a film within the uncertainty of the film, shape (n,).
 
-        A press agrees if r' S^-1 r is at most a quantile of the chi-square distribution. Here r is the vector of the
-        residuals of the press for the estimated unknowns, and S is the covariance of r. The covariance S includes the
-        noise and the uncertainty of the film.
+        A press agrees if r' S^-1 r does not exceed a quantile of the chi-square distribution. Here r is the vector of
+        the residuals of the press for the estimated unknowns, and S is the covariance of r. The covariance S includes
+        the noise and the uncertainty of the film.
 
         Args:
             data: The presses. They may include presses that the fit did not use.
@@ -305,9 +305,10 @@ class FitProblem:
         return np.asarray(chi2 <= limit)
 
     def mixture(self, data: PressData, solved: SolvedFilm) -> Mixture:
-        """Estimate the unknowns from presses as an average over all hypotheses, within the bounds of the unknowns.
+        """Estimate the unknowns from presses by averaging over all hypotheses.
 
-        The residuals of the presses are approximated by linear functions of the unknowns near a solved film.
+        The residuals of the presses are approximated by linear functions of the unknowns near a solved film. The
+        average is kept within the bounds of the unknowns.
 
         Args:
             data: The measured presses.
@@ -328,10 +329,10 @@ class FitProblem:
     def _models_by_force_scatter(
         self, solved: SolvedFilm, data: PressData, jacobian: Array
     ) -> dict[float, LinearModel]:
-        """Create a linear model of the residuals for each considered scatter of the forces.
+        """Create a linear model of the residuals for each value in `FORCE_SCATTERS`.
 
-        A scatter of the forces adds noise to the residuals of each press. The noise has the direction of the derivative
-        of these residuals with respect to the stated force.
+        A random scatter of the forces adds noise to the vector of residuals of each press. This noise has the direction
+        of the derivative of the vector with respect to the stated force.
 
         Args:
             solved: The film about which the residuals are linearised, and the contacts of the presses on this film.
@@ -362,7 +363,7 @@ class FitProblem:
         return models
 
     def adjusted_contacts(self, unknowns: Array, data: PressData, start: Array | None = None) -> AdjustedContacts:
-        """Find the contact of each press that agrees best with a film.
+        """For each press, find the contact that agrees best with the measurements on a given film.
 
         The effects of the nuisances are first subtracted from the charges of the presses.
 
@@ -372,10 +373,10 @@ class FitProblem:
             start: Contacts (x, y, ln F) at which the search begins, shape (n, 3); by default those of `start_contacts`.
         """
         film = self._film(unknowns)
-        corrected = self._without_nuisances(unknowns, data)
+        corrected_data = self._without_nuisances(unknowns, data)
         if start is None:
-            start = start_contacts(self.charges, film, corrected)
-        return adjust_contacts(self.charges, film, corrected, start)
+            start = start_contacts(self.charges, film, corrected_data)
+        return adjust_contacts(self.charges, film, corrected_data, start)
 
     def derivatives(self, solved: SolvedFilm, data: PressData, *, with_coefficients: bool = True) -> Array:
         """Compute the derivatives of the residuals of presses with respect to the unknowns.
@@ -420,10 +421,10 @@ class FitProblem:
         return derivatives_with_adjusted_contacts(jacobian, residual_contact_slopes)
 
     def gain_covariance(self, nuisances: dict[str, NuisanceEstimate], force_scatter: float) -> Array:
-        """Return the additional covariance of the film's unknowns for a use of the film after the session.
+        """Return the covariance that is added to the unknowns of the film for its use after the session.
 
-        If the charges drift or the forces scatter during the session, the mean of all gains remains uncertain, because
-        later presses may be affected differently. The additional error is the same for all gains.
+        If the charges drift or the forces scatter during the session, later presses may be affected differently.
+        Therefore, the mean of all gains remains uncertain. The additional error is the same for all gains.
 
         Args:
             nuisances: Estimates of the nuisances of the session by name.
@@ -443,7 +444,7 @@ class FitProblem:
         return np.outer(common_error, common_error)
 
     def prior_covariance(self, hypothesis: Hypothesis) -> Array:
-        """Return the covariance of the unknowns before the presses under a hypothesis, shape (n_unknown, n_unknown)."""
+        """Return the prior covariance of the unknowns under a hypothesis, shape (n_unknown, n_unknown)."""
         return self.covariance + hypothesis.covariance(self.layout)
 
     def _film(self, unknowns: Array) -> Array:
@@ -460,7 +461,7 @@ class FitProblem:
         return film
 
     def _without_nuisances(self, unknowns: Array, data: PressData) -> PressData:
-        """Subtract the effects of the nuisances from presses; see `without_nuisances`."""
+        """Subtract the effects of nuisances from presses; see `without_nuisances`."""
         return without_nuisances(data, unknowns[self.layout.nuisances])
 
     def _neighbouring_films(self, unknowns: Array, data: PressData) -> tuple[list[Array], Array]:
@@ -522,7 +523,7 @@ class _FilmFit:
         self._latest: tuple[Array, SolvedFilm] | None = None  # active unknowns and film of the latest evaluation
 
     def film_at(self, active_unknowns: Array) -> SolvedFilm:
-        """Return the film with given unknowns, and the contacts that agree best with this film.
+        """Return the film with given unknowns, together with the best contacts of the presses on this film.
 
         The latest film is stored, because SciPy evaluates the residuals and the derivatives of each film separately.
         The search for the contacts on the next film begins at the contacts on the latest film.

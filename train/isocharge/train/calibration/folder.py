@@ -63,7 +63,7 @@ CARD = "card.md"
 
 
 def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
-    """Raise ModelError if a folder cannot be used for a calibration because of the folder's name or content.
+    """Raise ModelError if the name or the content of a folder makes it unsuitable for a calibration.
 
     A calibration can be written to a new folder, to an empty folder, or to a folder of earlier calibrations. Hidden
     files in the folder are ignored.
@@ -87,9 +87,9 @@ def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
 def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[None]:
     """Lock a folder for a calibration while a `with` block runs (context manager).
 
-    Before the block runs, drafts that a killed process left behind are removed. The readable files of the last version
-    are also copied to the folder again. After the block, the folder and its newly created parent folders are removed if
-    they are empty.
+    Before the block, drafts that a killed process left behind are removed. In addition, the readable files of the last
+    version are copied to the folder again. After the block, the folder and its newly created parent folders are removed
+    if they are empty.
 
     Args:
         folder: The folder, which is created if it does not exist.
@@ -116,7 +116,7 @@ def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[No
 
 
 def _copy_last_version(folder: Path) -> None:
-    """Copy the readable files of the last version to the folder of the calibration, unless the copies are up to date.
+    """Copy the readable files of the last version to the folder of the calibration, if the copies are not up to date.
 
     Args:
         folder: Folder of the calibration, which contains the version folders.
@@ -167,11 +167,10 @@ def write_calibration(result: CalibrationResult, folder: Path, command: str = ""
 
 
 def _write_version(result: CalibrationResult, folder: Path, command: str) -> Path:
-    """Write the model and all files of a calibration to the next version folder, and return this version folder.
+    """Write the model and all files of a calibration to the next version folder, and return this folder.
 
     The presses are not written if the calibration was moved to another temperature, because no presses were made at
-    this temperature. The files with which a service follows the pretension are written only if the pretension can be
-    followed.
+    this temperature. If a service can follow the pretension, the files for this purpose are also written.
 
     Args:
         result: Result of the calibration.
@@ -200,14 +199,14 @@ def _write_version(result: CalibrationResult, folder: Path, command: str) -> Pat
         files[PRETENSIONS] = pretensions.to_bytes()
         files[DIRECTIONS] = film_directions(result).to_bytes()
 
-    released = release(
+    released_model = release(
         replace(fitted, provenance=Provenance(files=files)),
         folder,
         version=max(version_folders(folder), default=0) + 1,
         command=command,
         card=lambda about, _: _card(result, about),  # replaces the usual card of a model
     )
-    return released.folder
+    return released_model.folder
 
 
 def result_table(result: CalibrationResult) -> dict[str, Any]:
@@ -253,7 +252,7 @@ def error_table(error: ContactError) -> dict[str, float]:
 
 
 def read_earlier(folder: Path, problem: CalibrationProblem, *, knows_temperature: bool = False) -> FilmEstimate:
-    """Read the film of an earlier calibration, and increase its uncertainty by the possible drift since then.
+    """Read the film of an earlier calibration, and add the possible drift since then to its uncertainty.
 
     Args:
         folder: Folder that `write_calibration` wrote, or one of its version folders.
@@ -290,14 +289,14 @@ def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> Calibr
     # The path is FOLDER/VERSION/calibration.json. The text contains the last two folders, FOLDER/VERSION.
     version_folder = path.parent
     version = "/".join(version_folder.parts[-2:])
-    moved = f"moved from {film.warming.at_C:.1f} C, {version}, to {to_C:.1f} C by the change in its calibration"
+    move_text = f"moved from {film.warming.at_C:.1f} C, {version}, to {to_C:.1f} C by the change in its calibration"
     moved_film = film.at_temperature(to_C, problem.prior)
     # The film before the move is passed as the earlier estimate, so that the result compares both films.
-    return film_without_presses(replace(problem, earlier=film), moved_film, moved)
+    return film_without_presses(replace(problem, earlier=film), moved_film, move_text)
 
 
 def _read_last_film(folder: Path, problem: CalibrationProblem) -> tuple[Path, FilmEstimate]:
-    """Find the file calibration.json of an earlier calibration, and read the film from this file.
+    """Find the file calibration.json of an earlier calibration, and read its film.
 
     If the given folder contains version folders, the file of the last version is read. Otherwise, the given folder is
     expected to be a version folder, which contains the file itself.
@@ -365,10 +364,10 @@ combinations above are known; `calibration.json` has their correlations.
 
 
 def _errors_section(result: CalibrationResult, about: ModelMetadata) -> str:
-    """Return the section of the card about the errors of the model, in Markdown.
+    """Return the section about the errors of the model for the card, in Markdown.
 
-    The section contains a table of errors, and sentences about the presses on which the errors were measured. The
-    errors are those of a cross-validation if it was possible, and those on simulated presses otherwise.
+    The section contains a table of errors. It also describes the presses on which the errors were measured. The errors
+    come from a cross-validation if it was possible. Otherwise, they come from simulated presses.
 
     Args:
         result: Result of the calibration.

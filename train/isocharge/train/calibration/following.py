@@ -1,8 +1,8 @@
-"""Content of the file `pretensions.npz`, with which a service follows the pretension of a calibrated film.
+"""Content of the file `pretensions.npz`. A service needs this file to follow the pretension of a calibrated film.
 
-The file contains the weights of networks for the film at several pretensions. Apart from the pretension, the networks
-use the parameters of the calibrated film. Like the network of the model, each network is adapted to the discrepancy and
-to the remaining uncertainty of the film.
+The file contains the weights of several networks. Each network belongs to the film with another pretension. All other
+parameters are those of the calibrated film. Each network is adapted to the discrepancy and to the remaining uncertainty
+of the film, as is the network of the model.
 """
 
 from dataclasses import replace
@@ -39,9 +39,9 @@ MAX_TYPICAL_MISFIT = 1.5
 
 
 def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretensions | None:
-    """Compute the networks of a calibrated film at several pretensions.
+    """Compute networks for a calibrated film at several pretensions.
 
-    A service interpolates between these networks in order to follow the pretension of the film.
+    A service interpolates between these networks to follow the pretension of the film.
 
     Args:
         result: Result of the calibration.
@@ -90,7 +90,7 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
 
 
 def _networks_at(pretensions_MPa: Array, result: CalibrationResult, network: FoldedNetwork) -> list[FoldedNetwork]:
-    """Return the network of the calibrated film at each of several pretensions.
+    """Return networks for the calibrated film, one for each of several pretensions.
 
     Args:
         pretensions_MPa: The pretensions, shape (n,), MPa.
@@ -112,7 +112,7 @@ def _networks_at(pretensions_MPa: Array, result: CalibrationResult, network: Fol
 
 
 def _typical_misfit(pretensions: Pretensions, result: CalibrationResult) -> float:
-    """Return the root mean square of the misfits of simulated touches on the calibrated film, in units of the noise.
+    """Simulate touches on the calibrated film, and return the root mean square of their misfits in units of the noise.
 
     Args:
         pretensions: Weights of the networks at several pretensions.
@@ -133,8 +133,8 @@ def _typical_misfit(pretensions: Pretensions, result: CalibrationResult) -> floa
 def _pretension_nodes(calibrated_MPa: float, lower_MPa: float, upper_MPa: float) -> Array:
     """Return Chebyshev nodes around the calibrated pretension, shape (N_NODES,), MPa.
 
-    The nodes are stretched, so that the first and the last node lie at the ends of their range. The node that is
-    closest to the calibrated pretension is replaced by the calibrated pretension.
+    The nodes are stretched, so that the first and the last node lie at the ends of their range. The node closest to the
+    calibrated pretension is replaced by this pretension.
 
     Args:
         calibrated_MPa: The calibrated pretension, MPa.
@@ -153,7 +153,7 @@ def _pretension_nodes(calibrated_MPa: float, lower_MPa: float, upper_MPa: float)
 
 
 def _with_correlations_of(model_network: FoldedNetwork, film_network: FoldedNetwork) -> FoldedNetwork:
-    """Copy the outputs for the correlations of a contact from the network of the model to another network.
+    """Copy the outputs for correlations from the network of the model to another network.
 
     The correlations are not computed again, because they hardly change with the pretension.
 
@@ -178,8 +178,8 @@ def _with_correlations_of(model_network: FoldedNetwork, film_network: FoldedNetw
 def _weight_arrays(network: FoldedNetwork) -> list[np.ndarray]:
     """Return the weights of a network as single-precision arrays, in the order that `Pretensions` expects.
 
-    The weight and the bias of each hidden layer come first. The skip connection follows, and then the bias and the
-    weight of the last layer.
+    The weight and the bias of each hidden layer come first. The skip layer, the bias of the last layer, and the weight
+    of the last layer follow.
 
     Args:
         network: The network.
@@ -193,7 +193,7 @@ def _weight_arrays(network: FoldedNetwork) -> list[np.ndarray]:
 
 
 def _weight_names(network: FoldedNetwork) -> list[str]:
-    """Return the names of the ONNX constants that contain the weights of a network, in the order of `_weight_arrays`.
+    """Return the names of the ONNX constants with the weights of a network, in the order of `_weight_arrays`.
 
     The constants are recognised by their values, because their names depend on how the ONNX graph is written.
 
@@ -211,11 +211,12 @@ def _weight_names(network: FoldedNetwork) -> list[str]:
 
 
 def _lasting_std_MPa(result: CalibrationResult) -> float:
-    """Compute the standard deviation of the followed pretension that remains after many touches, MPa.
+    """Compute the standard deviation that the followed pretension has even after many touches, MPa.
 
     The service estimates the pretension from the misfits of touches by least squares. All other unknowns of the film
-    keep their calibrated values. The errors of the calibrated values cause an error of the estimated pretension, which
-    further touches do not reduce. The error of the calibrated pretension is one of these errors. Its factor is 1.
+    keep their calibrated values. The errors of the calibrated values cause an error of the estimated pretension.
+    Further touches do not reduce this error. The error of the calibrated pretension itself also contributes to it, with
+    the factor 1.
 
     Args:
         result: Result of the calibration.

@@ -1,4 +1,4 @@
-"""Hypotheses about effects that the parameters of a film do not describe, and the probabilities of these hypotheses.
+"""Hypotheses about effects that the parameters of a film do not describe, and probabilities of these hypotheses.
 
 A film may have imperfections (modes), a discrepancy, and traces that are missing in the sensor file. A session may have
 nuisances, such as an offset of the charges. The stated forces may also scatter. A hypothesis is a combination of such
@@ -6,7 +6,7 @@ effects. Traces are considered only together with modes and a discrepancy.
 
 The probability of a hypothesis follows from its evidence, which is the probability density of the presses under the
 hypothesis (MacKay 1992). The evidence is computed from a linear model of the residuals with Gaussian noise. The
-estimate of the film is the average of the estimates under all hypotheses, weighted by the probabilities of the
+estimate of the film is the average of the estimates under all hypotheses. The weights are the probabilities of the
 hypotheses.
 """
 
@@ -45,7 +45,7 @@ NEGLIGIBLE_PROBABILITY = 1e-7
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A combination of effects on the presses of a session that the parameters of the film do not describe.
+    """A combination of effects that the parameters of the film do not describe.
 
     Attributes:
         modes: Size of the modes of imperfections, relative to typical films, dimensionless.
@@ -91,7 +91,7 @@ class Hypothesis:
         return covariance
 
     def has(self, effect: str) -> bool:
-        """Return whether the hypothesis includes an effect, that is, whether the size of the effect is not zero.
+        """Return whether a given effect has a size above zero in this hypothesis.
 
         Args:
             effect: "modes", "discrepancy", "traces", "force_scatter", or the name of a nuisance.
@@ -106,10 +106,10 @@ class Hypothesis:
 
 
 def hypotheses() -> Iterator[Hypothesis]:
-    """Yield all hypotheses that are considered (generator).
+    """Yield all hypotheses that a calibration considers by default (generator).
 
     The first hypotheses are the combinations of modes, discrepancy, nuisances and force scatter. A hypothesis with
-    modes always includes a discrepancy, because the modes are computed to first order and never explain the charges
+    modes always includes a discrepancy. The modes are computed only to first order, so they never explain the charges
     completely. The last hypotheses combine traces with modes and with each size of the discrepancy except zero.
     """
     # Each effect has several possible sizes. A combination contains one pair (size, probability) for each effect.
@@ -177,10 +177,10 @@ class LinearModel(NamedTuple):
     def with_added_noise(
         self, jacobian: Array, residual: Array, deviation: Array, noise_variance: Array
     ) -> "LinearModel":
-        """Return a model whose residuals have additional noise along some orthogonal directions.
+        """Return a model whose residuals have additional noise along several orthogonal directions.
 
-        If noise with the variance v is added along a direction, the weight of the squared residual along this direction
-        decreases from 1 to 1 / (1 + v).
+        The squared residual along each direction has the weight 1. If noise with the variance v is added along the
+        direction, this weight decreases to 1 / (1 + v).
 
         Args:
             jacobian: Derivatives of the components of the residuals along the directions, shape (n_direction,
@@ -192,16 +192,16 @@ class LinearModel(NamedTuple):
         # The weight decreases by the share v / (1 + v). A residual that is multiplied by the square root of this share
         # contributes the share to the sum of squares, which is then subtracted.
         root_share = np.sqrt(noise_variance / (1.0 + noise_variance))
-        removed = LinearModel.of(root_share[:, None] * jacobian, root_share * residual, deviation)
+        removed_part = LinearModel.of(root_share[:, None] * jacobian, root_share * residual, deviation)
         log_determinant = float(np.log1p(noise_variance).sum())
         return LinearModel(
-            normal=self.normal - removed.normal,
-            moment=self.moment - removed.moment,
-            square=self.square - removed.square + log_determinant,
+            normal=self.normal - removed_part.normal,
+            moment=self.moment - removed_part.moment,
+            square=self.square - removed_part.square + log_determinant,
         )
 
     def log_evidence(self, prior_covariance: Array) -> float:
-        """Return the logarithm of the evidence, up to a constant.
+        """Return the logarithm of the evidence without a constant term.
 
         The evidence is the probability density of the presses for a given prior covariance.
 
@@ -240,7 +240,7 @@ class LinearModel(NamedTuple):
         return mean_change, covariance
 
     def _solve(self, prior_covariance: Array) -> "_Solution":
-        """Solve the normal equations of the unknowns that have a variance before the presses.
+        """Solve the normal equations for the unknowns that have a variance before the presses.
 
         Args:
             prior_covariance: Covariance of the unknowns before the presses, shape (n_unknown, n_unknown).
@@ -261,8 +261,8 @@ class LinearModel(NamedTuple):
 class _Solution(NamedTuple):
     """Solution of the normal equations for scaled unknowns.
 
-    The active unknowns are those that have a variance before the presses. They equal the prior root times the scaled
-    unknowns. The covariance of the scaled unknowns before the presses is the identity matrix.
+    The active unknowns are those that have a variance before the presses. The active unknowns equal the prior root
+    times the scaled unknowns. The covariance of the scaled unknowns before the presses is the identity matrix.
 
     Attributes:
         active: Whether each unknown is active, shape (n_unknown,).
@@ -283,7 +283,7 @@ class _Solution(NamedTuple):
 
 
 class Mixture(NamedTuple):
-    """Estimate of the unknowns as an average over all hypotheses.
+    """Estimate of the unknowns, averaged over all hypotheses.
 
     Attributes:
         mean: Change of the mean of the unknowns by the presses, shape (n_unknown,).
@@ -327,17 +327,17 @@ def mix_hypotheses(
     probabilities = np.exp(np.array(log_weights) - log_evidence)
 
     # Estimates under the hypotheses that are not negligible
-    relevant = np.flatnonzero(probabilities > NEGLIGIBLE_PROBABILITY)
+    relevant_rows = np.flatnonzero(probabilities > NEGLIGIBLE_PROBABILITY)
     means = []
     covariances = []
-    for index in relevant:
+    for index in relevant_rows:
         hypothesis = all_hypotheses[index]
         model = models[hypothesis.force_scatter]
         hypothesis_mean, hypothesis_covariance = model.posterior(prior_covariance_of(hypothesis))
         means.append(hypothesis_mean)
         covariances.append(hypothesis_covariance)
 
-    mean, covariance = _mixture_moments(probabilities[relevant], means, covariances)
+    mean, covariance = _mixture_moments(probabilities[relevant_rows], means, covariances)
     probability_of_hypothesis = dict(zip(all_hypotheses, probabilities.tolist(), strict=True))
     return Mixture(mean, covariance, probability_of_hypothesis, log_evidence)
 
@@ -345,8 +345,8 @@ def mix_hypotheses(
 def _mixture_moments(probabilities: Array, means: Sequence[Array], covariances: Sequence[Array]) -> tuple[Array, Array]:
     """Return the mean and the covariance of a mixture of normal distributions.
 
-    By the law of total covariance, the covariance of the mixture is the mean of the covariances of the distributions
-    plus the covariance of their means.
+    The covariance of the mixture is the mean of the covariances plus the covariance of the means (law of total
+    covariance).
 
     Args:
         probabilities: Probability of each distribution, shape (n_distribution,).

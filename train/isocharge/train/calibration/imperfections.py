@@ -1,8 +1,8 @@
 """Effects of traces and of an uneven tension on the charges of a film.
 
 A trace that is missing in the sensor file collects charge outside the pad of its electrode. Such a trace is modelled by
-several lines of unknown width, which lead from the edge of the pad to the rim of the film. The second-order effect of
-an uneven tension is the effect of a smaller, uniform tension.
+several lines of unknown width, which lead from the edge of the pad to the rim of the film. In second order, an uneven
+tension has the effect of a smaller uniform tension.
 """
 
 from typing import NamedTuple
@@ -57,11 +57,11 @@ class ModeCharges(NamedTuple):
 
 
 def trace_lines(sensor: Sensor) -> Array:
-    """Return both ends of each straight line along which a trace may lie.
+    """Return the two ends of each straight line along which a trace may lie.
 
     Each line begins at the edge of the pad of an electrode. The pad is treated as a circle of the same area. The line
     ends near the rim, on a circle whose radius is `TRACE_END` times the radius of the film. Each pad has one line for
-    each angle in `TRACE_ANGLES`. A line with the angle 0 has the direction from the centre of the film to the pad.
+    each angle in `TRACE_ANGLES`. A line with the angle 0 leads straight away from the centre of the film.
 
     Args:
         sensor: Sensor with the film and the pads of the electrodes.
@@ -87,7 +87,7 @@ def trace_lines(sensor: Sensor) -> Array:
 
 
 def trace_charges(forward_map: ForwardMap, lines: Array, contact: Array) -> Array:
-    """Compute the charge that each line would collect if it were a metal trace of the width `TRACE_STD_MM`.
+    """Compute the charge that each line would collect as a metal trace of the width `TRACE_STD_MM`.
 
     Args:
         forward_map: Forward map of the film.
@@ -111,7 +111,7 @@ def trace_charges(forward_map: ForwardMap, lines: Array, contact: Array) -> Arra
 
 
 def trace_widths(coefficients: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return the total width of the traces of each electrode, and the standard deviation of this width.
+    """Return the total width of each electrode's traces, and the standard deviation of this width.
 
     Args:
         coefficients: Coefficients of the lines, shape (n_electrode * n_line,). A coefficient is the width of a line
@@ -155,10 +155,10 @@ def tension_unevenness(pretension: float, tension_stds: Array, coefficients: Arr
 
 
 def log_unevenness(log_tension_derivative: Array) -> Array:
-    """Compute the derivative of ln Q with respect to the unevenness of the tension, where Q is the charge.
+    """Compute the derivative of ln Q, where Q is the charge, with respect to the unevenness of the tension.
 
     The derivative is s (1 - (1 - s / 2)^SLACKENING). Here s = -d ln Q / d ln T is the sensitivity of the charge to the
-    mean tension T. The sensitivity is small if the press itself stretches the film strongly.
+    mean tension T. The sensitivity is small if the film is stretched mainly by the press itself.
 
     Args:
         log_tension_derivative: Derivatives d ln Q / d ln T, shape (n, n_electrode), dimensionless.

@@ -4,8 +4,8 @@ Each nuisance in `NUISANCES` defines its name, its unit, its prior standard devi
 on the pretension. The effect of a nuisance is proportional to its value. Therefore, the derivative with respect to a
 nuisance is the effect of the value 1.
 
-Nuisances are not stored after the session, with one exception. The change of the pretension with temperature is stored
-as `problem.Warming`, because the next calibration needs it.
+After the session, only one nuisance is stored. The stored nuisance is the change of the pretension with temperature
+(`problem.Warming`), because the next calibration needs it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,7 +32,7 @@ class NuisanceEstimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Nuisance:
-    """Declaration of a nuisance. Each subclass defines the effect of one kind of nuisance.
+    """Declaration of a nuisance. Each subclass defines the effects of one kind of nuisance.
 
     Attributes:
         name: Name of the nuisance.
@@ -49,7 +49,7 @@ class Nuisance:
     std_with_temperatures: float = 0.0
 
     def charge_error(self, data: PressData, value: float) -> Array:
-        """Return the charges that the nuisance adds to the measured charges; zero by default.
+        """Return the charges that the nuisance adds to the measured charges. By default, they are zero.
 
         Args:
             data: The measured presses.
@@ -62,7 +62,7 @@ class Nuisance:
         return np.zeros_like(data.charge)
 
     def tension_change(self, data: PressData, value: float) -> Array:
-        """Return the change of the pretension that the nuisance causes during each press; zero by default.
+        """Return the change of the pretension that the nuisance causes during each press. By default, it is zero.
 
         Args:
             data: The measured presses.
@@ -75,7 +75,7 @@ class Nuisance:
         return np.zeros(len(data))
 
     def gain_std(self, estimate: NuisanceEstimate) -> float:
-        """Return the relative standard deviation that the nuisance adds to all gains when the film is used later.
+        """Return the relative standard deviation that the nuisance adds to all gains for the later use of the film.
 
         By default, a nuisance does not affect the later use of the film.
 
@@ -86,7 +86,7 @@ class Nuisance:
         return 0.0
 
     def caution(self, estimate: NuisanceEstimate) -> str:
-        """Return the text that warns the user that the session probably has this nuisance.
+        """Return a warning that the session probably has this nuisance.
 
         Args:
             estimate: Estimate of the nuisance.
@@ -95,7 +95,7 @@ class Nuisance:
 
 
 class PretensionPerKelvin(Nuisance):
-    """Change of the pretension with temperature, which occurs because film and ring expand differently."""
+    """Change of the pretension with temperature, because film and ring expand differently."""
 
     def tension_change(self, data: PressData, value: float) -> Array:
         """Return the pretension during each press minus the pretension at the mean temperature, shape (n,), MPa."""
@@ -143,7 +143,7 @@ class ChargeDrift(Nuisance):
         return value * data.session_time[:, None] * data.charge
 
     def gain_std(self, estimate: NuisanceEstimate) -> float:
-        """Return the standard deviation of a uniform distribution whose width is the drift.
+        """Return the standard deviation of a uniform distribution with the width of the drift.
 
         All gains that occurred during the session are assumed to be equally probable at a later time.
         """
@@ -158,7 +158,7 @@ class ChargeDrift(Nuisance):
 
 
 class Friction(Nuisance):
-    """Coefficient of friction between tip and film, for presses on a vertical stage; see `side_forces`."""
+    """Coefficient of friction between tip and film for presses with a vertical stage; see `side_forces`."""
 
     def charge_error(self, data: PressData, value: float) -> Array:
         """Return the charges that friction adds, shape (n, n_electrode), pC."""
@@ -213,7 +213,7 @@ def film_warming_sentences(estimates: Mapping[str, NuisanceEstimate]) -> Iterato
 
 
 def without_nuisances(data: PressData, values: Sequence[float] | Array) -> PressData:
-    """Subtract the charges of the nuisances from measured presses, and set the change of the pretension of each press.
+    """Subtract the charges of nuisances from measured presses, and set the change of the pretension during each press.
 
     Args:
         data: The presses as they were measured.

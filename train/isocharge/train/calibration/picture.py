@@ -84,7 +84,7 @@ def _draw_presses(axes: Any, result: CalibrationResult) -> None:
 
 
 def _draw_error(axes: Any, result: CalibrationResult, error: ContactError, title: str) -> Any:
-    """Draw the electrodes, and a map of the position error that the uncertainty of the film causes.
+    """Draw the electrodes and a map of the position error due to the uncertainty of the film.
 
     Args:
         axes: Axes of matplotlib.

@@ -25,8 +25,7 @@ Several pretensions are used only if the pretension differs between the presses.
 class PressData:
     """Measured presses with the weights of their charges and contacts.
 
-    Each press has one residual for each electrode, followed by three residuals of the contact (x, y, ln F) that the rig
-    measured.
+    Each press has one residual for each electrode. Three further residuals belong to the measured contact (x, y, ln F).
 
     Attributes:
         charge: Measured charges, shape (n, n_electrode), pC; 0 where unknown.
@@ -60,8 +59,8 @@ class PressData:
     def of(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
         """Convert measured presses into data for a fit.
 
-        A missing charge gets the weight 0. A missing coordinate of a contact is replaced by the centre of the domain,
-        and gets a standard deviation as large as the domain.
+        A missing charge gets the weight 0. A missing coordinate of a contact is replaced by its value at the centre of
+        the domain. The standard deviation of this coordinate is as large as the domain.
 
         Args:
             presses: The measured presses.
@@ -91,7 +90,7 @@ class PressData:
         )
 
     def __getitem__(self, rows: Integers | Booleans) -> "PressData":
-        """Return the data of selected presses. Every attribute is an array with one row for each press."""
+        """Return the data of selected presses, which are the given rows of every attribute."""
         return PressData(**{name: column[rows] for name, column in vars(self).items()})
 
     def __len__(self) -> int:
@@ -110,7 +109,7 @@ class PressData:
         return np.asarray(position.all(axis=1))
 
     def with_force_scatter(self, share: float) -> "PressData":
-        """Return a copy of the presses in which the forces have a larger uncertainty.
+        """Return a copy of the presses with a larger uncertainty of the forces.
 
         Args:
             share: Standard deviation of the scatter, relative to the force. Its square is added to the variance of the
@@ -124,22 +123,22 @@ class PressData:
     def force_derivative(self) -> Array:
         """Return the derivatives of the residuals with respect to the logarithm of the measured force.
 
-        Only the last residual of each press, the residual of the force, depends on the measured force.
+        Only the last residual of each press depends on the measured force.
 
         Returns:
             Derivatives, shape (n, n_electrode + 3).
         """
         _, _, force_weight = self.contact_weight.T
-        derivative = np.zeros(self.measured.shape)
-        derivative[:, -1] = -force_weight
-        return derivative
+        derivatives = np.zeros(self.measured.shape)
+        derivatives[:, -1] = -force_weight
+        return derivatives
 
     def pretension_nodes(self, pretension: float, bounds: tuple[float, float]) -> tuple[Array, Array]:
-        """Return the pretensions at which charges are computed, and the weights for an interpolation at each press.
+        """Return pretensions at which charges are computed, and weights for the interpolation at each press.
 
-        The returned pretensions are Chebyshev nodes over the range of the pretensions during the presses. The weights
-        are those of Lagrange's interpolation. If all presses have the same pretension, this pretension is the only
-        node.
+        The returned pretensions are Chebyshev nodes between the smallest and the largest pretension of the presses. The
+        weights are those of Lagrange's interpolation. If all presses have the same pretension, this pretension is the
+        only node.
 
         Args:
             pretension: Pretension of the film, MPa.
@@ -160,7 +159,7 @@ class PressData:
         return nodes, weights
 
     def residual(self, charge: Array, contact: Array) -> Array:
-        """Return the residuals of the presses for given contacts, divided by their standard deviations.
+        """Return the residuals of the presses for given contacts, in units of their standard deviations.
 
         Args:
             charge: Charges of a film at these contacts, shape (n, n_electrode), pC.
@@ -192,7 +191,7 @@ def temperatures(presses: MeasuredPresses) -> Array:
     """Return the temperature of each press, shape (n,), degrees Celsius.
 
     A missing temperature is interpolated between the temperatures of the previous and the next press. If no temperature
-    was measured, zeros are returned.
+    was measured, the function returns zeros.
 
     Args:
         presses: The measured presses.

@@ -1,7 +1,7 @@
-"""CSV file of a press session, with a hidden second file that contains the sensor and the probe of the session.
+"""CSV file of a press session, with a second, hidden file for the sensor and the probe of the session.
 
 The file `presses.csv` contains the measured presses. After each press, the whole file is replaced. Therefore, the file
-is complete at any time, and an interrupted session can be continued.
+is always complete, and an interrupted session can be continued.
 
 The hidden file `.presses.csv.session.json` contains the sensor and the probe of the session. Before a session is
 continued, its sensor and probe are compared with the content of the hidden file. The process that runs the session
@@ -24,7 +24,7 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 
 
 class PressFile:
-    """File of presses that are made on one sensor with one probe, as `open_press_file` opens it.
+    """File that contains presses on one sensor with one probe; see `open_press_file`.
 
     Attributes:
         path: Path of the file of presses.
@@ -35,7 +35,7 @@ class PressFile:
         self._sensor = sensor
 
     def read(self, *, position_std_mm: float, force_std: float) -> MeasuredPresses | None:
-        """Return the presses of an earlier session, or None if there are none.
+        """Return the presses of an earlier session, or None if there is no earlier session.
 
         Args:
             position_std_mm: Standard deviation of x and y of a press if the file does not contain it, mm.
@@ -76,10 +76,10 @@ class PressFile:
 
 @contextmanager
 def open_press_file(path: Path, sensor: Sensor, probe: Probe, *, fresh: bool = False) -> Iterator[PressFile]:
-    """Open a file of presses for one session, and lock the file until a `with` block ends (context manager).
+    """Open a file of presses for one session, and lock the session during a `with` block (context manager).
 
-    A hidden file beside the file of presses contains the sensor and the probe, and is locked. After the block, the
-    hidden file is removed if there is no file of presses.
+    A hidden file beside the file of presses contains the sensor and the probe. This hidden file is locked. After the
+    block, the hidden file is removed if there is no file of presses.
 
     Args:
         path: The file, in the format CSV, or Parquet if its name ends in `.parquet`. It may contain the presses of an
@@ -122,7 +122,7 @@ def open_press_file(path: Path, sensor: Sensor, probe: Probe, *, fresh: bool = F
 
 
 def _check_same_sensor_and_probe(path: Path, session_path: Path, sensor_and_probe: dict[str, Any]) -> None:
-    """Raise PressError if the presses of a file were made on another sensor or with another probe.
+    """Raise PressError if earlier presses were made on another sensor or with another probe.
 
     Args:
         path: The file of presses, for the error message.

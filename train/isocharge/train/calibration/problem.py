@@ -1,4 +1,4 @@
-"""Problem of a calibration: the prior distribution of the films, and the network for all films."""
+"""Problem of a calibration, with the prior distribution of the films and the network for all films."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -77,11 +77,11 @@ class Warming(NamedTuple):
 
     @property
     def identified(self) -> bool:
-        """Whether presses have at least halved the standard deviation of the change per kelvin."""
+        """Whether presses have reduced the standard deviation of the change per kelvin by at least half."""
         return self.std <= MAX_IDENTIFIED_STD_RATIO * PRETENSION_PER_KELVIN.std_with_temperatures
 
     def with_unknowns(self, count: int) -> "Warming":
-        """Return a copy whose covariance refers to another number of unknowns.
+        """Return a copy with a covariance for another number of unknowns.
 
         Args:
             count: New number of unknowns. If it is smaller, the last unknowns are removed. If it is larger, unknowns
@@ -95,7 +95,7 @@ class Warming(NamedTuple):
 
 @dataclass(frozen=True)
 class FilmEstimate:
-    """Estimate of a film: mean and covariance of a Gaussian distribution of its unknowns.
+    """Estimate of a film, which is a Gaussian distribution of the film's unknowns.
 
     Attributes:
         parameters: Best parameters, as in `FilmPrior`, shape (n_parameter,).
@@ -121,11 +121,11 @@ class FilmEstimate:
 
     @property
     def unknown_covariance(self) -> Array:
-        """Covariance of `unknowns`, in which parameters are in units of their prior standard deviations."""
+        """Covariance of `unknowns`, with parameters in units of their prior standard deviations."""
         return self.joint if self.coefficients.size else self.covariance
 
     def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> "FilmEstimate":
-        """Return the estimate for a later time, with a larger covariance that includes the possible drift of the film.
+        """Return the estimate for a later time, with the possible drift of the film added to the covariance.
 
         The parameters drift independently of each other. If the temperatures at both times are known, only creep
         contributes to the drift of the pretension.
@@ -149,10 +149,10 @@ class FilmEstimate:
         return FilmEstimate(parameters, covariance, self.coefficients, joint, self.warming)
 
     def at_temperature(self, at_C: float, prior: FilmPrior) -> "FilmEstimate":
-        """Return the estimate of the film at another temperature.
+        """Return the estimate of the film for another temperature.
 
-        Only the pretension changes, in proportion to the change of the temperature. If `warming` is None, the estimate
-        is returned unchanged, because the temperature of the film is unknown.
+        Only the pretension changes, in proportion to the change of the temperature. If `warming` is None, the function
+        returns the estimate unchanged, because the temperature of the film is unknown.
 
         Args:
             at_C: The other temperature, degrees Celsius.
@@ -198,7 +198,7 @@ class FilmEstimate:
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """Problem of a calibration: the films that a sensor may have, and the range of contacts.
+    """Problem of a calibration, with the films that a sensor may have and the range of contacts.
 
     Attributes:
         sensor: The sensor as described in its file.
@@ -227,7 +227,7 @@ class CalibrationProblem:
 
     @classmethod
     def of(cls, sensor: Sensor, probe: Probe, models: Path | None = None) -> "CalibrationProblem":
-        """Create the problem of a sensor and a probe, and find the installed network that fits them.
+        """Create the problem for a sensor and a probe, and find an installed network that fits them.
 
         Args:
             sensor: The sensor; see `films_for`.
@@ -252,7 +252,7 @@ class CalibrationProblem:
 
     @cached_property
     def prior(self) -> FilmPrior:
-        """Prior distribution of the films, with the electrodes of the sensor and their traces."""
+        """Prior distribution of the films, with the electrodes and traces of the sensor."""
         return _with_electrodes(self.films.prior, self.sensor)
 
     @cached_property
@@ -268,11 +268,11 @@ class CalibrationProblem:
         *,
         release: bool = True,
     ) -> Fitted:
-        """Return the network of a film, adapted to the charges of the film and to the electrodes of the sensor.
+        """Return a network that is adapted to the charges of a film and to the electrodes of the sensor.
 
-        The charges that follow from the parameters of the film are multiplied by given factors. If the electrodes of
-        the sensor differ from those of the network for all films, the charges are also multiplied by the ratio of the
-        charges with both kinds of electrodes.
+        The charges that follow from the parameters of the film are multiplied by given factors. The sensor may have
+        other electrodes than the network for all films. Then the charges are also multiplied by the ratio of the
+        charges of these two kinds of electrodes.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -289,7 +289,7 @@ class CalibrationProblem:
         has_same_electrodes = self.prior is self.films.prior
 
         def charge_factor(contact: Array) -> Array:
-            """Return the ratio of the charges of this film to those for which the network for all films was trained.
+            """Return the ratio of the real charges of the film to the charges that the network for all films expects.
 
             Args:
                 contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -313,7 +313,7 @@ class CalibrationProblem:
 
     @cached_property
     def proposed_forces(self) -> tuple[float, float]:
-        """Smallest and largest force of a proposed press, N. Both are within the domain and the stress limit.
+        """Smallest and largest force of a proposed press, N. Both forces are within the domain and the stress limit.
 
         Raises:
             SceneError: If the smallest force of the domain already exceeds the stress limit.
@@ -331,7 +331,8 @@ class CalibrationProblem:
     def before(self) -> FilmEstimate:
         """Estimate of the film before the presses.
 
-        An earlier estimate is used if there is one. Otherwise, the estimate is the film of the sensor file.
+        If there is an earlier calibration, its estimate is used. Otherwise, the estimate is the film of the sensor
+        file.
         """
         if self.earlier:
             return self.earlier
@@ -345,7 +346,7 @@ class CalibrationProblem:
 
     @cached_property
     def expected(self) -> FilmEstimate:
-        """Estimate of the film that is used to plan presses before any press is made.
+        """Estimate of the film, used to plan presses before any press is made.
 
         Without an earlier calibration, the covariance of this estimate includes `PLANNED_IMPERFECTIONS`.
         """
@@ -358,10 +359,10 @@ class CalibrationProblem:
 
 
 def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> FilmsModel:
-    """Find the network that was trained for all films with the electrodes of a sensor.
+    """Find a network that was trained for all films with the electrodes of a sensor.
 
     The installed networks are tried one after the other until one fits. Networks whose names begin with the name of the
-    sensor are tried first, but networks with other names may also fit.
+    sensor are tried first. Networks with other names may also fit.
 
     Args:
         sensor: The sensor. Its pads, the radius of its film and its readout must be the same as in the training of the
@@ -402,10 +403,10 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
 
 
 def _with_electrodes(prior: FilmPrior, sensor: Sensor) -> FilmPrior:
-    """Replace the electrodes of a prior by those of a sensor if both have the same pads.
+    """If a prior and a sensor have the same pads, replace the electrodes of the prior by those of the sensor.
 
-    The electrodes of the sensor may have traces and patterned backs. The given prior itself is returned if the pads
-    differ, or if all electrodes are equal.
+    The electrodes of the sensor may have traces and patterned backs. If the pads differ, or if all electrodes are
+    equal, the function returns the given prior itself.
 
     Args:
         prior: Distribution of the films for which a network was trained.
@@ -419,7 +420,7 @@ def _with_electrodes(prior: FilmPrior, sensor: Sensor) -> FilmPrior:
 
 
 def _pad_corners(sensor: Sensor) -> dict[str, list[list[float]]]:
-    """Return the corners of each pad, rounded to 1e-6 mm, by the name of its electrode."""
+    """Return the corners of each pad by the name of its electrode. The corners are rounded to 1e-6 mm."""
     return {electrode.name: np.round(electrode.corners, 6).tolist() for electrode in sensor.electrodes}
 
 
@@ -440,7 +441,7 @@ def _network_folders(models: Path | None, name: str) -> list[Path]:
                 folders_with_network.append(version_folder)
 
     def has_other_name(version_folder: Path) -> bool:
-        """Return whether the name of a model does not begin with the name of the sensor. False is sorted first."""
+        """Return whether a model has a name that does not begin with the name of the sensor. False is sorted first."""
         return not version_folder.parent.name.startswith(name)
 
     return sorted(folders_with_network, key=has_other_name)

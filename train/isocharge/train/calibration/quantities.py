@@ -4,7 +4,7 @@ The charges depend on Young's modulus E, the piezoelectric coefficients and the 
 these parameters. Similarly, the charges depend on E and the thickness h almost only through the product E h. Therefore,
 a calibration may determine a product of parameters accurately although each single parameter remains uncertain. For
 this reason, products and ratios of parameters are reported with their own standard deviations. A quantity counts as
-identified if the presses at least halved its standard deviation.
+identified if the presses reduced its standard deviation by at least half.
 """
 
 from collections.abc import Mapping
@@ -53,7 +53,7 @@ class Quantity:
 
     @property
     def identified(self) -> bool:
-        """Whether the presses have at least halved the standard deviation of the quantity."""
+        """Whether the presses have reduced the standard deviation of the quantity by at least half."""
         return self.std <= MAX_IDENTIFIED_STD_RATIO * self.before_std
 
     @property
@@ -63,7 +63,7 @@ class Quantity:
         return self.value - half_width, self.value + half_width
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the quantity into a dictionary for JSON, without its name and its weights."""
+        """Convert the quantity into a dictionary for JSON. The dictionary does not contain the name and the weights."""
         table = {key: value for key, value in asdict(self).items() if key not in ("name", "weights")}
         return table | {"interval_95": list(self.interval_95), "identified": self.identified}
 
@@ -156,7 +156,7 @@ def _definitions(prior: FilmPrior) -> dict[str, _Definition]:
 
 
 def _relative(meaning: str, log_weights: Array) -> _Definition:
-    """Return the definition of a quantity in percent, as a difference from its value in the sensor file.
+    """Define a quantity in percent, as the difference from its value in the sensor file.
 
     Args:
         meaning: Description of the quantity in words.
@@ -168,8 +168,8 @@ def _relative(meaning: str, log_weights: Array) -> _Definition:
 def summarise(table: Mapping[str, Quantity]) -> tuple[str, ...]:
     """Return sentences about the identified and the unidentified quantities.
 
-    If several single parameters are not identified, a further sentence states how accurately the charge of a press is
-    known. The charge of a press depends on a combination of these parameters.
+    The charge of a press depends on a combination of single parameters. If several of these parameters are not
+    identified but the combination is, a further sentence states how accurately the charge is known.
 
     Args:
         table: The quantities by name, as `quantities` returns them.
@@ -178,9 +178,11 @@ def summarise(table: Mapping[str, Quantity]) -> tuple[str, ...]:
     unidentified = [quantity for quantity in table.values() if not quantity.identified]
     sentences = []
     if identified:
-        shown = identified[:SHOWN_IN_SENTENCE]
-        values_text = ", ".join(f"{quantity.name} {quantity.value:.3g} +- {quantity.std:.2g}" for quantity in shown)
-        remaining_count = len(identified) - len(shown)
+        shown_quantities = identified[:SHOWN_IN_SENTENCE]
+        values_text = ", ".join(
+            f"{quantity.name} {quantity.value:.3g} +- {quantity.std:.2g}" for quantity in shown_quantities
+        )
+        remaining_count = len(identified) - len(shown_quantities)
         if remaining_count:
             values_text += f" and {remaining_count} more, on the card"
         sentences.append(f"The presses determine {values_text}.")

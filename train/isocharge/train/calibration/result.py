@@ -31,7 +31,7 @@ VISIBLE_TRACE = 2.0
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """Result of a calibration: the estimate of the film, and values that are derived from this estimate.
+    """Result of a calibration, with the estimate of the film and with values that follow from this estimate.
 
     Attributes:
         problem: The calibration problem, which defines the possible films.
@@ -63,19 +63,19 @@ class CalibrationResult:
 
     @cached_property
     def sensitivity(self) -> ContactSensitivity:
-        """Linearised effects of noise, and of errors in the unknowns of the film, on estimated contacts."""
+        """Linearised effects that noise and errors in the unknowns of the film have on estimated contacts."""
         return ContactSensitivity.at(self.problem, self.posterior.unknowns)
 
     @cached_property
     def error_left(self) -> ContactError:
-        """Errors of estimated contacts that the remaining uncertainty of the film causes."""
+        """Contact errors that are caused by the remaining uncertainty of the film."""
         return self.sensitivity.contact_error(self.posterior.joint)
 
     @cached_property
     def error_left_before(self) -> ContactError:
-        """Errors of estimated contacts that the uncertainty of the film caused before the calibration.
+        """Contact errors that were caused by the uncertainty of the film before the calibration.
 
-        If the film was moved to another temperature, the errors are those before the move.
+        If the film was moved to another temperature, these are the errors before the move.
         """
         before = self.problem.before
         unknown_count = len(self.posterior.joint)
@@ -108,7 +108,7 @@ class CalibrationResult:
         """Contacts that were estimated by cross-validation; see `cross_validate`.
 
         The value is None if there are too few presses, or if the film was moved to another temperature without presses.
-        The contacts are computed at the first access, which takes about as long as the calibration.
+        The contacts are computed at the first access. This computation takes about as long as the calibration.
         """
         if self.moved:
             return None
@@ -116,7 +116,7 @@ class CalibrationResult:
         at_C = None if warming is None else warming.at_C
 
         def network_of(film: FilmPosterior) -> Fitted:
-            """Return the network of a film that was fitted to some of the presses."""
+            """Return a network for a film that was fitted to a part of the presses."""
             return self._network_of(film.unknowns, film.joint)
 
         # If a side force is declared only for later contacts, the presses themselves have no friction.
@@ -129,7 +129,7 @@ class CalibrationResult:
 
     @cached_property
     def side_forces(self) -> SideForces | None:
-        """Side forces that later contacts may have; None if no side forces are expected."""
+        """Side forces that later contacts may have, or None if no side forces are expected."""
         if self.side_force_map is None:
             return None
         return SideForces(
@@ -140,7 +140,7 @@ class CalibrationResult:
         )
 
     def charge_factor(self, unknowns: Array, contact: Array) -> Array:
-        """Compute the factors by which imperfections, the discrepancy and friction change the charges of a film.
+        """Compute the factors by which imperfections, the discrepancy and friction multiply the charges of a film.
 
         Args:
             unknowns: Parameters and coefficients of a film that is similar to the calibrated film.
@@ -156,7 +156,7 @@ class CalibrationResult:
         return factor * self.side_forces.charge_factor(contact)
 
     def fitted_film(self, parameters: Array, *, release: bool = False) -> Fitted:
-        """Return the network of a film with other parameters.
+        """Return a network for a film with other parameters.
 
         The film has the coefficients and the uncertainty of the calibrated film.
 
@@ -168,10 +168,10 @@ class CalibrationResult:
         return self._network_of(unknowns, self.posterior.joint, release=release)
 
     def _network_of(self, unknowns: Array, covariance: Array, *, release: bool = False) -> Fitted:
-        """Return the network of a film that is similar to the calibrated film.
+        """Return a network for a film that is similar to the calibrated film.
 
-        The variances that the network reports include the effects of the uncertainty of the film and of side forces.
-        Both effects are linearised at the calibrated film.
+        The variances that the network reports include two effects: the uncertainty of the film, and side forces. Both
+        effects are linearised at the calibrated film.
 
         Args:
             unknowns: Unknowns of the film, shape (n_unknown,).
@@ -201,7 +201,7 @@ class CalibrationResult:
 
     @property
     def bad_lines(self) -> tuple[int, ...]:
-        """Line numbers of the presses that were left out because they do not agree with the other presses."""
+        """Line numbers of presses that were left out because they do not agree with the other presses."""
         return self.presses[self.posterior.bad].lines
 
     @cached_property
@@ -210,17 +210,18 @@ class CalibrationResult:
 
         The sentences are computed only once, because the planning of further presses is slow.
         """
-        after = self.error_left
-        before = self.error_left_before
-        noise = self.sensitivity.noise_error
+        error_after = self.error_left
+        error_before = self.error_left_before
+        noise_error = self.sensitivity.noise_error
 
         # The errors are compared with those before the presses, or before the film was moved to another temperature.
         event = "it was moved" if self.moved else "these presses"
         film_errors = (
-            f"The uncertainty of the film causes errors of {after.position_mm:.2g} mm and {after.force_percent:.2g} % "
-            f"of the force (root mean square); before {event} they were {before.position_mm:.2g} mm and "
-            f"{before.force_percent:.2g} %. Noise alone causes {noise.position_mm:.2g} mm and "
-            f"{noise.force_percent:.2g} %."
+            f"The uncertainty of the film causes errors of {error_after.position_mm:.2g} mm and "
+            f"{error_after.force_percent:.2g} % "
+            f"of the force (root mean square); before {event} they were "
+            f"{error_before.position_mm:.2g} mm and {error_before.force_percent:.2g} %. Noise alone causes "
+            f"{noise_error.position_mm:.2g} mm and {noise_error.force_percent:.2g} %."
         )
         film_quantities = summarise(self.quantities)
         if self.moved:
@@ -253,7 +254,7 @@ class CalibrationResult:
         )
 
     def _temperature_sentences(self) -> Iterator[str]:
-        """Yield a sentence on how the pretension changes with temperature, if temperatures were measured."""
+        """If temperatures were measured, yield a sentence on how the pretension changes with temperature."""
         warming = self.posterior.warming
         if warming is None:
             return
@@ -269,7 +270,7 @@ class CalibrationResult:
         )
 
     def _side_force_sentences(self) -> Iterator[str]:
-        """Yield sentences about the friction of the presses and the side forces of later contacts, if there are any."""
+        """Yield sentences about the friction of the presses, and about the side forces of later contacts."""
         if self.side_forces is None:
             return
         error = ContactError.of(self.side_forces.contact_covariance(self.sensitivity))
@@ -322,7 +323,7 @@ class CalibrationResult:
 
 
 def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved: str) -> CalibrationResult:
-    """Create a calibration result without presses from an estimate of a film.
+    """From an estimate of a film, create a calibration result that has no presses.
 
     Args:
         problem: The calibration problem.

@@ -1,4 +1,4 @@
-"""Session in which a person or a machine makes presses one after the other, at contacts that the session proposes.
+"""Session in which a person or a machine makes presses one after the other. The session proposes the contacts.
 
 After each press, the film is fitted again, and the next press is proposed. A session does not access a serial port, a
 screen or a clock. The caller shows the proposed press, measures the charges, and passes the answer of the person to the
@@ -107,7 +107,7 @@ def _typed_contact(text: str) -> Array:
 
 
 def _with_unknown_temperature(temperatures_C: Array | None) -> Array | None:
-    """Append an unknown temperature to the temperatures of earlier presses.
+    """Append the unknown temperature of a new press to the temperatures of earlier presses.
 
     Args:
         temperatures_C: Temperatures, shape (n,), degrees Celsius; None if no temperatures are measured.
@@ -121,7 +121,7 @@ def _with_unknown_temperature(temperatures_C: Array | None) -> Array | None:
 
 
 def _cell_value(cell: str) -> float:
-    """Convert the text of one value into a number, which is NaN if the value is unknown.
+    """Convert the text of one value into a number. The number is NaN if the value is unknown.
 
     Args:
         cell: Text of the value, without blanks at the ends.
@@ -138,7 +138,7 @@ def _cell_value(cell: str) -> float:
 
 
 class PressSession:
-    """Session of presses on one film: the presses so far, and the present estimate of the film.
+    """Session of presses on one film, with the presses so far and the present estimate of the film.
 
     Attributes:
         problem: The calibration problem, which defines the possible films and their estimate before the presses.
@@ -186,7 +186,7 @@ class PressSession:
 
     @property
     def proposed(self) -> ProposedPress:
-        """The proposed next press, which is expected to reduce the remaining error most.
+        """The proposed next press, with the largest expected reduction of the remaining error.
 
         The proposal is computed at the first access after each change, and is then stored.
 
@@ -212,7 +212,7 @@ class PressSession:
 
     @property
     def enough(self) -> bool:
-        """Whether the position error by the uncertainty of the film is small compared with the error by noise."""
+        """Whether the uncertainty of the film causes only small position errors, compared with the noise."""
         if self.result is None or len(self) < FEW:
             return False
         noise_mm = self.result.sensitivity.noise_error.position_mm
@@ -243,7 +243,7 @@ class PressSession:
         self._change(extended_presses)
 
     def check(self, contact: Array) -> None:
-        """Raise PressError if a calibration would not accept a press with a given contact.
+        """Raise PressError if a calibration does not accept presses with a given contact.
 
         Args:
             contact: Contact (x, y, F) of the press, shape (3,), mm and N, NaN where unknown.
@@ -261,7 +261,7 @@ class PressSession:
             )
 
     def undo(self, number: int | Literal["last"] = "last") -> int:
-        """Remove a press, fit the film again, and return the number of the press.
+        """Remove a press, fit the film to the other presses, and return the number of the removed press.
 
         Args:
             number: Number of the press, counted from 1; "last" for the last press.
@@ -274,8 +274,8 @@ class PressSession:
             raise PressError("there is no press to undo yet")
         removed_number = count if number == "last" else number
         if not 1 <= removed_number <= count:
-            taken = "1 is taken" if count == 1 else f"{count} are taken"
-            raise PressError(f"there is no press {removed_number} to undo: {taken}")
+            count_text = "1 is taken" if count == 1 else f"{count} are taken"
+            raise PressError(f"there is no press {removed_number} to undo: {count_text}")
         numbers = np.arange(1, count + 1)
         self._change(self.presses[numbers != removed_number])
         return removed_number
@@ -286,7 +286,7 @@ class PressSession:
         self._proposed = None
 
     def _change(self, presses: MeasuredPresses) -> None:
-        """Save a changed list of presses, and fit the film to these presses."""
+        """Save a changed list of presses, and fit the film to the presses in the list."""
         self._save(presses)
         self._fit(presses)
 
@@ -312,10 +312,10 @@ class PressSession:
 
     @property
     def summary(self) -> tuple[str, ...]:
-        """Sentences about the errors that the film causes, and about presses that do not agree with the others.
+        """Sentences about contact errors due to the film, and about presses that do not agree with the others.
 
-        If no film explains the presses, the only sentence states the reason. There are no sentences if fewer than
-        `MIN_PRESSES` presses were made.
+        If no film explains the presses, there is only one sentence, which states the reason. There are no sentences if
+        fewer than `MIN_PRESSES` presses were made.
         """
         if self.refusal:
             return (f"No film explains these presses: {self.refusal}",)

@@ -1,4 +1,4 @@
-"""Side forces of the presses of a calibration, and of later contacts on the calibrated film.
+"""Side forces of presses in a calibration, and side forces of later contacts on the calibrated film.
 
 If a tip on a vertical stage presses beside the centre, friction pulls the film inwards (`simulate.solver.friction`).
 The coefficient of friction is a nuisance of the session. Friction changes the charges of a press by about
@@ -8,8 +8,8 @@ other.
 
 Later contacts may have the same friction as the presses, for example if a robot moves vertically. Later contacts may
 also have no friction, for example if a probe moves freely. The model of the calibrated film assumes half of the
-friction of the presses. The standard deviations of the model include the error of this assumption in both cases. They
-also include any side force that the user declares.
+friction of the presses. The standard deviations of the model include the error of this assumption in both cases. The
+standard deviations also include any side force that the user declares.
 """
 
 from dataclasses import dataclass, replace
@@ -63,7 +63,7 @@ def check_side_force(share: float) -> None:
 
 
 def solve_side_forces(charges: FilmCharges, parameters: Array) -> SideForceMap:
-    """Compute the effect of side forces on the charges of one film, which takes several seconds.
+    """Compute the effect of side forces on the charges of one film. The computation takes several seconds.
 
     Args:
         charges: Model of the charges of all films.
@@ -75,7 +75,7 @@ def solve_side_forces(charges: FilmCharges, parameters: Array) -> SideForceMap:
 def with_friction(
     data: PressData, charges: FilmCharges, side_force_map: SideForceMap, contact: Array, coefficient: float
 ) -> PressData:
-    """Return a copy of the presses in which `friction_charge` is the effect of friction on their charges.
+    """Return a copy of the presses, with the effect of friction on their charges as `friction_charge`.
 
     Args:
         data: The measured presses.
@@ -84,9 +84,9 @@ def with_friction(
         contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
         coefficient: Estimated coefficient of friction, at which the effect is computed.
     """
-    reference = float(np.clip(coefficient, MIN_REFERENCE, MAX_FRICTION))
-    charge_at_reference = side_force_map.friction_charges(charges.into_domain(contact), reference)
-    return replace(data, friction_charge=charge_at_reference / reference)  # per unit of the coefficient
+    reference_coefficient = float(np.clip(coefficient, MIN_REFERENCE, MAX_FRICTION))
+    charge_at_reference = side_force_map.friction_charges(charges.into_domain(contact), reference_coefficient)
+    return replace(data, friction_charge=charge_at_reference / reference_coefficient)  # per unit of the coefficient
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class SideForces:
         return float(np.clip(self.friction.value, 0.0, MAX_FRICTION))
 
     def charge_factor(self, contact: Array) -> Array:
-        """Compute the factors by which half of the friction of the presses changes the charges.
+        """Compute the factors by which half of the friction of the presses multiplies the charges.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -131,9 +131,10 @@ class SideForces:
 
     @cached_property
     def _log_factor(self) -> Series:
-        """Series in the contact for the logarithm of the factor by which half of the friction changes the charges.
+        """Series for the logarithm of the factor by which half of the friction multiplies the charges.
 
-        The series is used because its evaluation is faster than the computation of the effect of friction.
+        The variables of the series are the coordinates of the contact. The series is evaluated faster than the effect
+        of friction could be computed.
         """
         contact = spread_contacts(self.domain, CONTACTS)
         unit_contact = self.domain.to_unit(contact)
@@ -142,7 +143,7 @@ class SideForces:
         return Series(fit_series(unit_contact, log_factor, DEGREE, FORCE_DEGREE))
 
     def contact_covariance(self, sensitivity: ContactSensitivity) -> Array:
-        """Compute the covariances of estimated contacts that the side forces of these contacts cause.
+        """Compute the part of the covariance of each estimated contact that is caused by its side force.
 
         Contacts with the friction of the presses and contacts without friction are assumed to be equally probable. A
         declared side force is assumed to have the declared size and a random direction.
@@ -173,7 +174,7 @@ class SideForces:
 
 
 def _covariance_of_charge_error(charge_gain: Array, charge_error: Array) -> Array:
-    """Compute the covariances of estimated contacts that an error of their charges causes.
+    """Compute the part of the covariance of each estimated contact that is caused by an error of its charges.
 
     The errors of all charges of a contact are fully correlated, because all of them have the same cause.
 

@@ -1,9 +1,9 @@
-"""Layout of the vector of unknowns of a calibration, with a named slice for each kind of unknown.
+"""Layout of the vector of unknowns in a calibration, with a named slice for each kind of unknown.
 
 The first unknowns are the parameters of the film (`film_prior.PARAMETERS` and the gains). After the parameters come
-three kinds of coefficients: those of the modes of imperfections, of the traces, and of the terms of the discrepancy.
-The last unknowns are the nuisances of the session (`nuisances.NUISANCES`). During a fit, parameters are in units of
-their prior standard deviations.
+three kinds of coefficients: for the modes of imperfections, for the traces, and for the terms of the discrepancy. The
+last unknowns are the nuisances of the session (`nuisances.NUISANCES`). During a fit, parameters are in units of their
+prior standard deviations.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class UnknownLayout:
 
     @cached_property
     def traces(self) -> slice:
-        """Coefficients of traces that are missing in the sensor file.
+        """Coefficients of traces that the sensor file does not contain.
 
         Each electrode has one coefficient for each angle in `TRACE_ANGLES`.
         """
@@ -47,7 +47,7 @@ class UnknownLayout:
 
     @cached_property
     def terms(self) -> slice:
-        """Coefficients of the discrepancy: one for each pair of a term and an electrode.
+        """Coefficients of the discrepancy, one for each combination of a term and an electrode.
 
         In the order of these coefficients, the index of the electrode changes fastest.
         """
@@ -60,12 +60,12 @@ class UnknownLayout:
 
     @cached_property
     def coefficients(self) -> slice:
-        """All coefficients: those of the modes, the traces and the terms of the discrepancy."""
+        """All coefficients: those for the modes, for the traces, and for the terms of the discrepancy."""
         return slice(self.modes.start, self.terms.stop)
 
     @cached_property
     def imperfections(self) -> slice:
-        """Coefficients of physical imperfections: those of the modes and the traces."""
+        """Coefficients of physical imperfections: those for the modes and those for the traces."""
         return slice(self.modes.start, self.traces.stop)
 
     @cached_property

@@ -1,1 +1,1 @@
-"""Training data of a network: presses, the series fitted to their charges, and examples of misfit."""
+"""Training data of a network: presses, series that are fitted to their charges, and examples for the misfit network."""

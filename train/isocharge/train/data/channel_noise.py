@@ -1,9 +1,9 @@
-"""Estimation of the noise of measured presses from the presses themselves.
+"""Estimation of the noise in measured presses from the presses themselves.
 
-For each press, a plane is fitted to the charges of the presses with the most similar positions and forces. The plane
-predicts the charges of the press. The residuals of the prediction are attributed to the noise of the channels, although
-they also contain the errors of the measured positions and forces. The variance of the noise of a channel is modelled as
-white^2 + (gain * Q)^2, with the charge Q and two parameters, white and gain.
+For each press, a plane is fitted to the charges of its neighbours, which are the presses with the most similar
+positions and forces. The plane predicts the charges of the press. The residuals of the prediction are attributed to the
+noise of the channels, although they also contain the errors of the measured positions and forces. The variance of the
+noise of a channel is modelled as white^2 + (gain * Q)^2, with the charge Q and two parameters, white and gain.
 """
 
 from dataclasses import dataclass
@@ -73,8 +73,9 @@ class ChannelNoise:
     def of(cls, charge: Array, unit: Array) -> "ChannelNoise":
         """Estimate the noise of each channel from measured presses.
 
-        A plane through the neighbours of each press gives estimates of the charges without noise, and residuals. The
-        white noise and the noise of the gain are fitted to these residuals. Both kinds of noise have lower limits.
+        A plane through the neighbours of a press estimates the charges of the press without noise. The residuals are
+        the differences between the measured and the estimated charges. The white noise and the noise of the gain are
+        fitted to these residuals. Both kinds of noise have lower limits.
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.
@@ -106,27 +107,27 @@ class ChannelNoise:
         return cls(np.full(electrodes, noise.white), np.full(electrodes, gain), noise.name)
 
     def sigma(self, charge: Array) -> Array:
-        """Return the standard deviations of charges of shape (n, n_electrode), pC, as an array of the same shape."""
+        """Return the standard deviation of the noise, pC, of each charge, pC. Both have the shape (n, n_electrode)."""
         return np.asarray(np.hypot(self.white, self.gain * charge))
 
     def add(self, charge: Array, rng: np.random.Generator) -> Array:
-        """Return noisy readings of charges of shape (n, n_electrode), pC."""
+        """Add random noise to charges, pC. Charges and result have the shape (n, n_electrode)."""
         return np.asarray(charge + self.sigma(charge) * rng.standard_normal(charge.shape))
 
     def level(self, charge: Array) -> Array:
-        """Return the levels of charges Q of shape (n, n_electrode), pC: asinh(gain Q / white) / gain.
+        """Convert charges Q, shape (n, n_electrode), pC, into the levels asinh(gain Q / white) / gain.
 
         The noise of every level has a standard deviation of about 1.
         """
         return np.asarray(np.arcsinh(charge * self.gain / self.white) / self.gain)
 
     def charge(self, level: Array) -> Array:
-        """Return the charges, pC, that correspond to levels. This method is the inverse of `level`."""
+        """Convert levels into charges, pC. This method is the inverse of `level`."""
         exponent = np.clip(level * self.gain, -LARGEST_EXPONENT, LARGEST_EXPONENT)
         return np.asarray(np.sinh(exponent) * self.white / self.gain)
 
     def transition_charge(self, charge: Array) -> Array:
-        """Return the charges at which the features change from linear to logarithmic, shape (n_electrode,), pC.
+        """Return the charge at which each feature changes from linear to logarithmic, shape (n_electrode,), pC.
 
         The features are asinh(Q / transition charge).
 
@@ -143,7 +144,7 @@ class ChannelNoise:
         return np.asarray(np.maximum(noise_corner, lower_limit))
 
     def scaled(self, factor: float) -> "ChannelNoise":
-        """Return the noise model with all standard deviations multiplied by a factor."""
+        """Multiply all standard deviations by a factor, and return the new noise model."""
         return ChannelNoise(factor * self.white, factor * self.gain, self.name)
 
     def to_dict(self) -> dict[str, object]:
@@ -157,7 +158,7 @@ class ChannelNoise:
 
 @dataclass(frozen=True)
 class LocalPlanes:
-    """Planes that are fitted to the neighbours of each press, but not to the press itself.
+    """One plane for each press, which is fitted to the neighbours of the press but not to the press itself.
 
     Attributes:
         value: Value of the plane at the press, shape (n, k).
@@ -174,7 +175,9 @@ class LocalPlanes:
 
     @classmethod
     def through(cls, unit: Array, values: Array) -> "LocalPlanes":
-        """Fit a plane to the neighbours of each press by least squares, without the press itself.
+        """For each press, fit a plane to its neighbours by least squares.
+
+        The press itself is not used in the fit.
 
         Args:
             unit: Contacts in unit coordinates, shape (n, 3).
@@ -203,10 +206,10 @@ class LocalPlanes:
         return cls(value, slope, residual, reach)
 
     def residuals(self, values: Array) -> Array:
-        """Compute the difference between each set of k values and the nearest point of all planes.
+        """Compute the difference between each set of k values and the point on the planes that is nearest to it.
 
-        Each set of values is compared with the `CANDIDATES` planes whose centres are nearest to it. A plane extends as
-        far as the farthest neighbour of its press.
+        Only the `CANDIDATES` planes whose centres are nearest to the set are searched. A plane extends as far as the
+        farthest neighbour of its press.
 
         Args:
             values: m sets of values, shape (m, k).
@@ -246,9 +249,9 @@ def usual_size(charge: Array) -> Array:
 def _fit_variances(charge: Array, residual: Array) -> tuple[float, float]:
     """Estimate the variances white^2 and gain^2 of one channel.
 
-    The function white^2 + gain^2 Q^2 is fitted to the squared residuals by weighted least squares, with variances that
-    are not negative. The standard deviation of a squared residual is proportional to its expected value. The weights of
-    each round therefore follow from the expected values of the previous round.
+    The function white^2 + gain^2 Q^2 is fitted to the squared residuals by weighted least squares. Neither white^2 nor
+    gain^2 can become negative. The standard deviation of a squared residual is proportional to its expected value. The
+    weights of each round therefore follow from the expected values of the previous round.
 
     Args:
         charge: Charges Q without noise, shape (n,), pC.

@@ -5,14 +5,14 @@ the position. The logarithm of each charge Q_e is therefore expanded in Chebyshe
 
     ln Q_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree.
 
-Here r is the radius of the working area, and l is the logarithm of the force, scaled to the interval [-1, 1]. Taut
-uniaxial films have charges of both signs. For charges of both signs, the quotient Q_e / S(l) is expanded instead of the
-logarithm, where S(l) is the typical size of the charges as a function of l. The coefficients are fitted to a dataset by
+Here r is the radius of the working area. The variable l is the logarithm of the force, scaled to the interval [-1, 1].
+Taut uniaxial films have charges of both signs. For such charges, the quotient Q_e / S(l) is expanded instead of the
+logarithm of Q_e. The typical size S of the charges is a function of l. The coefficients are fitted to a dataset by
 linear least squares.
 
 The training uses the series in three searches: for the contact whose charges are nearest to given charges, for folds of
 the map, and for distant contacts with the same charges. The trained model does not use the series. For a dataset with
-several probes, the series describes the mean of the charges of these probes.
+several probes, the series describes the mean of the charges over the probes.
 """
 
 from dataclasses import dataclass, replace
@@ -92,7 +92,7 @@ GOOD_ENOUGH = 1.5e-4
 
 @dataclass(frozen=True)
 class ChargeField:
-    """Chebyshev series of the charges, which is fitted to presses and has the methods of a `ChargeMap`.
+    """`ChargeMap` that evaluates a Chebyshev series, which was fitted to presses.
 
     Attributes:
         domain: Contacts for which the field holds.
@@ -159,7 +159,7 @@ class ChargeField:
         return charge
 
     def derivatives(self, contact: Array) -> Array:
-        """Compute the derivatives of the charges; see `ChargeMap.derivatives`."""
+        """Compute the derivatives of the charges with respect to (x, y, ln F); see `ChargeMap.derivatives`."""
         _, derivatives = self.linearised(contact)
         return derivatives
 
@@ -196,7 +196,7 @@ class ChargeField:
 
     @property
     def of_positive(self) -> ChargeSeries | None:
-        """Series for positive charges, with which contacts are tracked across folds; None for charges of both signs."""
+        """Series with which contacts are tracked across folds. None if the charges have both signs."""
         if self.log_size is not None:
             return None
         return ChargeSeries(self._series, self.domain.radius, self.domain.force_range)
@@ -204,7 +204,7 @@ class ChargeField:
 
 @dataclass(frozen=True)
 class _SeriesFitter:
-    """Presses to which series of several degrees are fitted, and other presses on which the errors are measured.
+    """Data for fits of series: presses for the fits, and other presses on which the errors are measured.
 
     Attributes:
         domain: Working area and range of forces of the contacts.
@@ -228,7 +228,7 @@ class _SeriesFitter:
     def of(
         cls, domain: Domain, electrodes: tuple[str, ...], presses: LabelledPresses, validation: LabelledPresses
     ) -> "_SeriesFitter":
-        """Compute the values to which the series is fitted, and the units of the errors.
+        """Compute the target values of the series, and the units in which its errors are measured.
 
         Args:
             domain: Working area and range of forces of the contacts.
@@ -252,7 +252,7 @@ class _SeriesFitter:
     def fit(self, degree: int, force_degree: int) -> ChargeField | None:
         """Fit a series with the given degrees, and measure its error on the validation presses.
 
-        At most the first `ROWS_PER_TERM` presses for each term of the series are used.
+        The fit uses the first presses, at most `ROWS_PER_TERM` for each term of the series.
 
         Args:
             degree: Largest total degree in x and y.
@@ -272,9 +272,9 @@ class _SeriesFitter:
 
 
 def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
-    """Fit a polynomial in the scaled logarithm l of the force to the logarithm of the size S of the charges.
+    """Fit a polynomial in l, the scaled logarithm of the force, to ln S, the logarithm of the size of the charges.
 
-    The size of the charges of a press is the root of the sum of their squares, but at least `LOWEST_CHARGE`.
+    For each press, the size S is the root of the sum of the squared charges, but at least `LOWEST_CHARGE`.
 
     Args:
         unit_log_force: Logarithms l of the forces scaled to [-1, 1], shape (n,).
@@ -303,7 +303,7 @@ def _size_and_slope(coefficients: Array, unit_log_force: Array) -> tuple[Array, 
 
 
 def series_term_count(degree: int, force_degree: int) -> int:
-    """Return the number of terms of a series with a given total degree in x and y and a given degree in the force."""
+    """Return the number of terms of a series, from its total degree in x and y and its degree in the force."""
     return (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
 
 
@@ -386,25 +386,26 @@ def invertible_domain(
     Raises:
         DatasetError: If the radius of the disk is less than `SMALLEST_SHARE` of the radius of the field.
     """
-    requested = field.domain
+    requested_domain = field.domain
     has_little_noise = field.error < MAX_ERROR_WITHOUT_NOISE
     fold_radius = _fold_radius(field, noise)
     if field.error > MAX_ERROR_OF_CERTAIN_FOLD:
         # The fold may be an error of the fit, so it is only reported, and only if it lies well inside the domain.
         credible_ratio = CREDIBLE_FOLD_RATIO if has_little_noise else CREDIBLE_FOLD_RATIO_WITH_NOISE
-        if fold_radius < credible_ratio * requested.radius:
-            return requested, (_uncertain_fold_caution(fold_radius, requested.radius),)
+        if fold_radius < credible_ratio * requested_domain.radius:
+            return requested_domain, (_uncertain_fold_caution(fold_radius, requested_domain.radius),)
         fold_radius = np.inf  # a fold near the edge is probably not real
 
-    if fold_radius < SMALLEST_SHARE * requested.radius:
+    if fold_radius < SMALLEST_SHARE * requested_domain.radius:
         raise DatasetError(
-            f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of {requested.radius:g} mm "
-            "asked for: beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
+            f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of "
+            f"{requested_domain.radius:g} mm asked for: beyond, two contacts give the same charges; add an "
+            "electrode, or take a biaxial film"
         )
-    domain = requested
+    domain = requested_domain
     cautions = []
-    if fold_radius < requested.radius:
-        domain = requested.within(fold_radius)
+    if fold_radius < requested_domain.radius:
+        domain = requested_domain.within(fold_radius)
         cautions.append(_fold_caution(field, presses, fold_radius))
     if has_little_noise:
         searched_field = within(field, SEARCHED_RADIUS_RATIO * domain.radius)  # the field is inaccurate at the edge
@@ -434,7 +435,7 @@ def _pair_cautions(searched_map: ChargeMap, noise: NoiseModel) -> list[str]:
 
 
 def _uncertain_fold_caution(fold_radius: float, requested_radius: float) -> str:
-    """Return a sentence about a fold inside the domain that the fit shows but cannot prove.
+    """Return a sentence about a fold that the fit shows inside the domain but cannot prove.
 
     Args:
         fold_radius: Distance of the fold from the centre, mm.
@@ -449,7 +450,7 @@ def _uncertain_fold_caution(fold_radius: float, requested_radius: float) -> str:
 
 
 def _fold_caution(field: ChargeField, presses: LabelledPresses, fold_radius: float) -> str:
-    """Return a sentence about a certain fold, which states how far the domain is reduced because of the fold.
+    """Return a sentence that states the radius of a certain fold, to which the domain is reduced.
 
     For positive charges, the sentence also names the command that tracks contacts beyond the fold.
 
@@ -471,7 +472,7 @@ def _fold_caution(field: ChargeField, presses: LabelledPresses, fold_radius: flo
 
 
 def _fold_radius(field: ChargeField, noise: NoiseModel) -> float:
-    """Return the radius of the largest disk without folds, mm, rounded; infinity if the domain has no fold.
+    """Return the rounded radius of the largest disk without folds, mm, or infinity if the domain has no fold.
 
     Args:
         field: Charge field in whose domain folds are searched for.

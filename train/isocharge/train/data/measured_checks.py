@@ -1,7 +1,7 @@
-"""Checks of measured presses before a network is trained on these presses.
+"""Checks of measured presses, which are made before a network is trained on the presses.
 
-Without these checks, the loss could become infinite or NaN during the training, or the reported errors and misfits of
-the model could be meaningless.
+Without such checks, the loss could become infinite or NaN during the training. The reported errors and misfits of the
+model could also be meaningless.
 """
 
 from collections.abc import Mapping
@@ -141,7 +141,8 @@ def _check_size(name: str, charge: Array) -> None:
 def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compared_values: Array) -> None:
     """Raise an error if a value of a column is far from all other values.
 
-    The largest distance from the median is compared with the usual distance, which is a quantile of the distances.
+    The largest distance of a value from the median is compared with the usual distance, which is a quantile of all
+    distances that are not zero.
 
     Args:
         presses: The presses, which contain the number of each line for the message.
@@ -168,7 +169,7 @@ def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compare
 
 
 def _check_independence(channels: Mapping[str, Array]) -> None:
-    """Raise an error if the charges of a channel are a linear combination of the charges of other channels.
+    """Raise an error if the charges of any channel are a linear combination of those of other channels.
 
     Args:
         channels: Charges of each channel, shape (n,), pC, by its name.
@@ -179,8 +180,8 @@ def _check_independence(channels: Mapping[str, Array]) -> None:
     """
     charge = np.column_stack(list(channels.values()))
     scaled_charge = charge / usual_size(charge)
-    standardised = (scaled_charge - scaled_charge.mean(axis=0)) / scaled_charge.std(axis=0)
-    _, singular_values, directions = np.linalg.svd(standardised, full_matrices=False)
+    standardised_charge = (scaled_charge - scaled_charge.mean(axis=0)) / scaled_charge.std(axis=0)
+    _, singular_values, directions = np.linalg.svd(standardised_charge, full_matrices=False)
     largest, *_, smallest = singular_values
     if smallest > LEAST_INDEPENDENCE * largest:
         return

@@ -1,4 +1,4 @@
-"""Sensor without a sensor file, which is described by the names of its channels and the area that was pressed."""
+"""Description of a sensor without a sensor file: the names of its channels, and the area that was pressed."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ MIN_TURN_rad = 1e-6
 
 @dataclass(frozen=True)
 class MeasuredSensor:
-    """Description of a sensor in the metadata of a model of measured presses.
+    """Description of a sensor without a sensor file, for the metadata of a model.
 
     Attributes:
         name: Name of the sensor, in whose system of coordinates x and y are given.
@@ -51,7 +51,7 @@ class MeasuredSensor:
 
 @dataclass(frozen=True)
 class PressedArea(Domain):
-    """Domain of contacts that were pressed, with an area of any shape and position, and a range of forces.
+    """Domain of measured contacts: an area of any shape and position, and a range of forces.
 
     `radius` is the distance of the farthest corner from the middle of the area, not from the origin.
 
@@ -63,7 +63,7 @@ class PressedArea(Domain):
 
     @classmethod
     def of(cls, contact: Array) -> "PressedArea":
-        """Return the domain that contains given contacts, with the outline of their places and their range of forces.
+        """Return the domain of given contacts: the outline of their places, and the range of their forces.
 
         If all forces are nearly equal, the range of forces is enlarged.
 
@@ -92,12 +92,12 @@ class PressedArea(Domain):
 
     @cached_property
     def centre(self) -> Array:
-        """Middle of the ranges of (x, y, ln F), shape (3,), with x and y in mm and F in N."""
+        """Middles of the ranges of x, y and ln F, shape (3,), with x and y in mm and F in N."""
         return np.append(_box_middle(np.array(self.corners)), super().centre[2])
 
     @cached_property
     def scale(self) -> Array:
-        """Half widths of the ranges of (x, y, ln F), shape (3,), with x and y in mm and F in N."""
+        """Half widths of the ranges of x, y and ln F, shape (3,), with x and y in mm and F in N."""
         return np.append(0.5 * np.ptp(np.array(self.corners), axis=0), super().scale[2])
 
     @property
@@ -108,7 +108,7 @@ class PressedArea(Domain):
         return f"a place in the pressed area, x from {left:g} to {right:g} mm and y from {bottom:g} to {top:g} mm,"
 
     def is_outside(self, contact: Array) -> Booleans:
-        """Return which contacts are outside the area or the range of forces.
+        """Return whether each contact is outside the area or outside the range of forces.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N. Contacts with NaN do not count as outside.
@@ -120,7 +120,7 @@ class PressedArea(Domain):
         return np.asarray(is_known & ~self.contains(contact))
 
     def contains(self, contact: Array) -> Booleans:
-        """Return which contacts lie in the area and in the range of forces.
+        """Return whether each contact lies in the area and in the range of forces.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N. Contacts with NaN do not lie in the domain.
@@ -133,16 +133,17 @@ class PressedArea(Domain):
 
 
 def _box_middle(corners: Array) -> Array:
-    """Return the middle of the box around corners (x, y) whose sides are parallel to x and y, shape (2,), mm."""
+    """Return the middle of the bounding box of corners (x, y), shape (2,), mm."""
     return np.asarray(0.5 * (corners.min(axis=0) + corners.max(axis=0)))
 
 
 def outline(places: Array) -> Array:
-    """Compute the outline of the area that places cover, enlarged by half the distance of neighbouring places.
+    """Compute the outline of the area that places cover.
 
-    The area consists of triangles whose corners are places (alpha shape, Edelsbrunner et al., 1983). Only triangles
-    with a sufficiently small circumscribed circle are used. The limit of the radius of these circles is the smallest
-    limit with which the triangles contain all places and have a single boundary. Holes are filled.
+    The outline is moved outwards by half the median distance between neighbouring places. The area consists of
+    triangles whose corners are places (alpha shape, Edelsbrunner et al., 1983). Only triangles with a sufficiently
+    small circumscribed circle are used. Larger and larger limits of the radius are tried, until the triangles contain
+    all places and have a single boundary. Holes are filled.
 
     Args:
         places: Positions (x, y), all different, shape (m, 2), mm.
@@ -231,7 +232,7 @@ def _single_boundary(triangles: Integers, n_place: int) -> list[int] | None:
 
 
 def _boundary_neighbours(triangles: Integers) -> dict[int, list[int]]:
-    """Return the neighbours along the boundary of each place on the boundary of an area that consists of triangles.
+    """For each place on the boundary of an area of triangles, return its neighbours along the boundary.
 
     Args:
         triangles: Indices of the places at the corners of each triangle, shape (n, 3).
@@ -253,7 +254,7 @@ def _boundary_neighbours(triangles: Integers) -> dict[int, list[int]]:
 
 
 def _enlarged_polygon(corners: Array, distance: float) -> Array:
-    """Return a polygon whose sides are moved outwards by the same distance.
+    """Enlarge a polygon by moving all its sides outwards by the same distance.
 
     The function represents points and directions in the plane by complex numbers x + i y.
 
@@ -277,7 +278,7 @@ def _enlarged_polygon(corners: Array, distance: float) -> Array:
     next_normal = -1j * sides / np.abs(sides)
     previous_normal = np.roll(next_normal, 1)
     scalar_product = (previous_normal * np.conj(next_normal)).real
-    divisor = np.maximum(1.0 + scalar_product, 1e-9)  # not zero
-    mitre = (previous_normal + next_normal) / divisor
+    denominator = np.maximum(1.0 + scalar_product, 1e-9)  # not zero
+    mitre = (previous_normal + next_normal) / denominator
     limited_mitre = mitre * np.minimum(1.0, LONGEST_MITRE / np.abs(mitre))
     return to_corners(points + distance * limited_mitre)

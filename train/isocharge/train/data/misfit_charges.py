@@ -1,8 +1,8 @@
 """Training charges of the misfit network: charges of good presses, charges of faulty presses, and random charges.
 
-The misfit network must be accurate for arbitrary charges. It is therefore trained on charges of many kinds (`KINDS`)
-and on charges of presses outside the working area. The charges of two simultaneous presses are approximated from the
-charges of the single presses.
+The misfit network must be accurate for arbitrary charges. Its training data therefore contain charges of many kinds
+(`KINDS`) and charges of presses outside the working area. The charges of two simultaneous presses are approximated from
+the charges that each press alone would cause.
 """
 
 from collections.abc import Callable
@@ -85,7 +85,7 @@ If the misfit is larger, the charges of a distant contact may be nearer."""
 def misfit_noise(noise: NoiseModel) -> NoiseModel:
     """Return the noise whose standard deviation is the unit of the misfit.
 
-    This noise is the noise of the training, or the noise `reference` if the training has no noise.
+    The result is the noise of the training or, if the training has no noise, the noise `reference`.
     """
     has_noise = noise.white > 0.0
     return noise if has_noise else noise_model("reference")
@@ -93,7 +93,7 @@ def misfit_noise(noise: NoiseModel) -> NoiseModel:
 
 @dataclass(frozen=True)
 class ExampleOptions:
-    """Options for drawing examples of the misfit network.
+    """Options for drawing training examples for the misfit network.
 
     Attributes:
         candidates: Number of contacts among which the starts of a search for the nearest contact are chosen.
@@ -107,7 +107,7 @@ class ExampleOptions:
     limits: tuple[Array | float, Array | float] = (LOWEST_CHARGE, HIGHEST_CHARGE)
 
     def find_nearest(self, charge_map: ChargeMap, charge: Array, sigma: Array) -> tuple[Array, Array]:
-        """Search for the contact whose charges are nearest to each set of charges.
+        """For each set of charges, search for the contact with the nearest charges.
 
         Args:
             charge_map: Map from contacts to charges.
@@ -150,11 +150,13 @@ def draw_misfit_examples(
         the nearest contact c.
     """
     rng = np.random.default_rng(seed)
-    chosen = presses[rng.integers(len(presses), size=count)]
-    kinds, drawn_charge = draw_charges(rng, chosen.charge, presses.charge, noise)
+    chosen_presses = presses[rng.integers(len(presses), size=count)]
+    kinds, drawn_charge = draw_charges(rng, chosen_presses.charge, presses.charge, noise)
     charge = np.clip(drawn_charge, *options.limits)
     is_near = np.isin(kinds, ("noisy", "moved"))  # charges of these kinds are similar to those of their press
-    residual = _compute_residuals(charge_map, charge, noise.sigma(charge), chosen, is_near, options.find_nearest)
+    residual = _compute_residuals(
+        charge_map, charge, noise.sigma(charge), chosen_presses, is_near, options.find_nearest
+    )
     return np.stack([charge, residual])
 
 
@@ -195,22 +197,22 @@ def _compute_residuals(
     charge_map: ChargeMap,
     charge: Array,
     sigma: Array,
-    chosen: LabelledPresses,
+    source_presses: LabelledPresses,
     is_near: Booleans,
     find_nearest: Callable[[ChargeMap, Array, Array], tuple[Array, Array]],
 ) -> Array:
     """Compute the residuals of charges at the nearest contact.
 
-    Some charges are similar to the charges of the press from which they were made. For these charges, the search for
-    the nearest contact begins at the contact of this press, with a charge map that is scaled in order to give exactly
-    the charges of the press. For all other charges, and if the residuals of the first search are large, a search begins
-    at several of many candidates.
+    Some charges are similar to the charges of the press from which they were made. For such charges, the search for the
+    nearest contact begins at the contact of the press. The charge map is scaled so that it gives the charges of the
+    press at this contact. For all other charges, and if the residuals of the first search are large, a search begins at
+    several contacts, which are chosen from many candidates.
 
     Args:
         charge_map: Map from contacts to charges.
         charge: Charges, shape (n, n_electrode), pC.
         sigma: Standard deviations of the noise of these charges, same shape, pC.
-        chosen: Presses from which the charges were made.
+        source_presses: Presses from which the charges were made.
         is_near: Whether the charges of each row are similar to the charges of their press, shape (n,).
         find_nearest: Function that searches for the nearest contacts among many candidates; see
             `ExampleOptions.find_nearest`.
@@ -220,13 +222,13 @@ def _compute_residuals(
     """
     residual = np.zeros_like(charge)
     near_rows = np.flatnonzero(is_near)
-    start = chosen.contact[near_rows]
-    exact_factor = chosen.charge[near_rows] / charge_map.charges(start)
+    start_contact = source_presses.contact[near_rows]
+    exact_factor = source_presses.charge[near_rows] / charge_map.charges(start_contact)
     map_factor = np.clip(exact_factor, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
     # With the factor f of the map, the residual (Q - f Q(c)) / sigma is equal to (Q / f - Q(c)) / (sigma / f). The
     # charges and their standard deviations are therefore divided by f instead of scaling the map.
     _, residual[near_rows] = explain(
-        charge_map, charge[near_rows] / map_factor, sigma[near_rows] / map_factor, start, min_change=MIN_CHANGE
+        charge_map, charge[near_rows] / map_factor, sigma[near_rows] / map_factor, start_contact, min_change=MIN_CHANGE
     )
 
     # A large residual near the press may be a local minimum. Such charges are therefore also searched for elsewhere.
@@ -245,7 +247,7 @@ def _compute_residuals(
 def draw_charges(
     rng: np.random.Generator, charge: Array, other_charge: Array, noise: Noise
 ) -> tuple[NDArray[Any], Array]:
-    """Draw a kind of charges at random for each press, and make charges of this kind from the charges of the press.
+    """For each press, choose a kind of charges at random, and make charges of this kind from those of the press.
 
     `KINDS` contains the probability of each kind.
 
@@ -262,17 +264,17 @@ def draw_charges(
     kind_names = np.array(list(KINDS))
     kind_index = rng.choice(len(KINDS), size=len(charge), p=list(KINDS.values()))
     kinds = kind_names[kind_index]
-    drawn = np.empty_like(charge)
+    drawn_charge = np.empty_like(charge)
     for kind in KINDS:
         rows = kinds == kind
-        drawn[rows] = _draw_charges_of_kind(kind, rng, charge[rows], other_charge, noise)
-    return kinds, drawn
+        drawn_charge[rows] = _draw_charges_of_kind(kind, rng, charge[rows], other_charge, noise)
+    return kinds, drawn_charge
 
 
 def _draw_charges_of_kind(
     kind: str, rng: np.random.Generator, charge: Array, other_charge: Array, noise: Noise
 ) -> Array:
-    """Draw charges of one kind, one set from the charges of each press.
+    """From the charges of each press, make one set of charges of the given kind.
 
     Args:
         kind: Name of the kind; see `KINDS`.
@@ -308,7 +310,7 @@ def _move_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Arra
 
     Charges of any sign are moved by random multiples of the standard deviation of their noise; see
     `MOVED_LOG_DISTANCES`. Positive charges are multiplied by factors whose logarithms are normally distributed;
-    `MOVED_LOG_STDS` states the range of the standard deviations.
+    `MOVED_LOG_STDS` states the range of the standard deviations of these logarithms.
 
     Args:
         rng: Random number generator.
@@ -329,7 +331,7 @@ def _move_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Arra
 
 
 def _draw_wrong_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Draw relative gains of electrodes, shape (n, n_electrode): about half of them wrong, and the others 1."""
+    """Draw relative gains, shape (n, n_electrode). About half of the gains are wrong, and the others are 1."""
     is_wrong = rng.random(shape) < 0.5
     log_gain = np.where(is_wrong, WRONG_GAIN_STD * rng.standard_normal(shape), 0.0)
     return np.exp(log_gain)
@@ -352,7 +354,7 @@ def _draw_failing_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Arr
 
 
 def _draw_common_factors(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Draw factors from about 0.01 to 100 for each press, shape (n, n_electrode), nearly equal for all electrodes."""
+    """Draw factors from about 0.01 to 100, shape (n, n_electrode). The factors of one press are nearly equal."""
     n_press, _ = shape
     common_factor = 10.0 ** rng.uniform(-2.0, 2.0, (n_press, 1))
     return np.asarray(common_factor * np.exp(COMMON_FACTOR_SCATTER * rng.standard_normal(shape)))
@@ -362,8 +364,8 @@ def _draw_any_charges(rng: np.random.Generator, shape: tuple[int, ...], other_ch
     """Draw random charges from a box that contains the charges of all presses.
 
     For charges of any sign, the levels (`ChannelNoise.level`) are uniformly distributed. For positive charges, the
-    logarithms are uniformly distributed, from 1 pC to the upper limit of a small box or, for some presses, of a large
-    box.
+    logarithms are uniformly distributed. The smallest charge is 1 pC, and the largest charge is the upper limit of a
+    small box or, for some presses, of a large box.
 
     Args:
         rng: Random number generator.
@@ -376,10 +378,11 @@ def _draw_any_charges(rng: np.random.Generator, shape: tuple[int, ...], other_ch
     """
     if isinstance(noise, ChannelNoise):
         level = noise.level(other_charge)
-        lowest = level.min(axis=0)
-        highest = level.max(axis=0)
-        margin = 0.5 * (highest - lowest)  # on both sides, so the box is twice as wide as the range of the charges
-        drawn_level = rng.uniform(lowest - margin, highest + margin, shape)
+        lowest_level = level.min(axis=0)
+        highest_level = level.max(axis=0)
+        # With a margin on both sides, the box is twice as wide as the range of the charges.
+        margin = 0.5 * (highest_level - lowest_level)
+        drawn_level = rng.uniform(lowest_level - margin, highest_level + margin, shape)
         return noise.charge(drawn_level)
 
     n_press, _ = shape
@@ -391,8 +394,8 @@ def _draw_any_charges(rng: np.random.Generator, shape: tuple[int, ...], other_ch
 def combined_charge(first: Array, second: Array, exponent: Array | float) -> Array:
     """Approximate the charges of two simultaneous presses by (Q1^p + Q2^p)^(1/p).
 
-    Q1 and Q2 are the charges that each press alone would cause. The power of a charge Q keeps the sign of the charge,
-    that is, it is defined as sign(Q) |Q|^p.
+    Q1 and Q2 are the charges that each press alone would cause. The power of a charge Q is defined as sign(Q) |Q|^p, so
+    that it has the sign of the charge.
 
     Args:
         first: Charges of the first press alone, shape (n, n_electrode), pC.
@@ -406,6 +409,6 @@ def combined_charge(first: Array, second: Array, exponent: Array | float) -> Arr
     return _signed_power(sum_of_powers, 1.0 / exponent)
 
 
-def _signed_power(charge: Array, power: Array | float) -> Array:
+def _signed_power(charge: Array, exponent: Array | float) -> Array:
     """Raise the magnitude of each charge to a power, and keep the sign of the charge."""
-    return np.asarray(np.sign(charge) * np.abs(charge) ** power)
+    return np.asarray(np.sign(charge) * np.abs(charge) ** exponent)

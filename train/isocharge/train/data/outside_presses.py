@@ -55,7 +55,7 @@ class OutsidePresses:
     def of(cls, sensor: Sensor, probes: tuple[str, ...], force_range: tuple[float, float]) -> "OutsidePresses | None":
         """Simulate a coarse forward map of the whole film for the probe with the largest reach.
 
-        The reach of a probe is the distance of the farthest point of its footprint from the centroid.
+        The reach of a probe is the distance from the centroid of its footprint to the farthest point of the footprint.
 
         Args:
             sensor: The sensor.
@@ -96,9 +96,10 @@ class OutsidePresses:
         return self.charge_map.domain.radius
 
     def draw(self, count: int, seed: int) -> LabelledPresses:
-        """Draw presses with positions that are uniformly distributed over the ring, and with log-uniform forces.
+        """Draw presses with positions uniformly distributed over the ring and with log-uniform forces.
 
-        The squared distances from the centre are uniformly distributed, because the area grows with the square.
+        The squared distances from the centre are uniformly distributed, because the area grows with the square of the
+        distance.
 
         Args:
             count: Number of presses.
@@ -112,7 +113,7 @@ class OutsidePresses:
         return self._simulate(distance, angle, force)
 
     def grid(self) -> LabelledPresses:
-        """Return presses at the middle of each sector of each ring, with `N_FORCES` forces at each place.
+        """Return a grid of presses: `N_FORCES` presses with different forces in the middle of each sector of each ring.
 
         The area outside the working area is divided into `N_RINGS` rings, and each ring into `N_SECTORS` sectors.
         """
@@ -124,10 +125,10 @@ class OutsidePresses:
         return self._simulate(distances.ravel(), angles.ravel(), forces.ravel())
 
     def unnoticed(self, is_unnoticed: Booleans) -> UnnoticedPresses:
-        """Compute the share of presses that are answered wrongly without a flag, in each ring and sector of `grid`.
+        """For each sector of each ring, compute the share of presses with a wrong answer that carries no flag.
 
         Args:
-            is_unnoticed: Whether each press of `grid` is answered wrongly without a flag, shape (n,).
+            is_unnoticed: Whether the answer to each press of `grid` is wrong and carries no flag, shape (n,).
         """
         is_unnoticed_at_place = is_unnoticed.reshape(N_RINGS, N_SECTORS, N_FORCES)
         share_of_forces = is_unnoticed_at_place.mean(axis=2)  # shape (N_RINGS, N_SECTORS)
@@ -147,7 +148,7 @@ class OutsidePresses:
         return np.geomspace(smallest_measured, max_force, N_FORCES)
 
     def _simulate(self, distance: Array, angle: Array, force: Array) -> LabelledPresses:
-        """Return presses at the given places with the given forces, and compute their charges.
+        """Compute the charges of presses at given places with given forces, and return the presses.
 
         Args:
             distance: Distances of the presses from the centre, shape (n,), mm.

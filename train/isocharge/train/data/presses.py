@@ -38,7 +38,7 @@ FEWEST_POSITIONS = 50
 
 @dataclass(frozen=True)
 class LabelledPresses:
-    """Contacts and the charges that were measured or simulated for them.
+    """Contacts with their measured or simulated charges.
 
     Attributes:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -66,7 +66,7 @@ class LabelledPresses:
 
     @property
     def signed(self) -> bool:
-        """Whether at least one charge is not positive, so that it has no logarithm."""
+        """Whether at least one charge is zero or negative, so that it has no logarithm."""
         return bool((self.charge <= 0.0).any())
 
     def within(self, radius: float) -> "LabelledPresses":
@@ -74,7 +74,7 @@ class LabelledPresses:
         return self[np.hypot(self.contact[:, 0], self.contact[:, 1]) <= radius]
 
     def repeated(self, min_count: int) -> "LabelledPresses":
-        """Return the presses in their order, and repeat them from the first press until there are enough.
+        """Return at least `min_count` presses, by repeating all presses in their order.
 
         Args:
             min_count: Smallest number of presses to return. If there are more presses, each press is returned once.
@@ -83,19 +83,20 @@ class LabelledPresses:
         return self[np.arange(count) % len(self)]
 
     def noisy(self, noise: Noise, seed: int) -> Array:
-        """Return the charges with added noise, shape (n, n_electrode), pC, for one seed of the noise."""
+        """Return the charges with random noise, shape (n, n_electrode), pC. The noise is determined by its seed."""
         return noise.add(self.charge, np.random.default_rng(seed))
 
 
 def is_measured(dataset: Dataset) -> bool:
-    """Return whether a dataset was measured, that is, whether its manifest has no settings of a simulator."""
+    """Return whether a dataset was measured. The manifest of a measured dataset has no settings of a simulator."""
     return SOLVER not in dataset.manifest
 
 
 def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array:
-    """Draw contacts whose positions are uniformly distributed over the disk, with log-uniform forces.
+    """Draw contacts with positions uniformly distributed over a disk and with log-uniform forces.
 
-    The squared distances from the centre are uniformly distributed, because the area grows with the square.
+    The squared distances from the centre are uniformly distributed, because the area grows with the square of the
+    distance.
 
     Args:
         rng: Random number generator.
@@ -105,11 +106,11 @@ def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array
     Returns:
         Contacts (x, y, F), shape (count, 3), mm and N.
     """
-    radius = domain.radius * np.sqrt(rng.random(count))
+    distance = domain.radius * np.sqrt(rng.random(count))
     angle = 2.0 * np.pi * rng.random(count)
     min_log_force, max_log_force = np.log(domain.force_range)
     force = np.exp(rng.uniform(min_log_force, max_log_force, count))
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), force], axis=1)
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle), force], axis=1)
 
 
 def domain_of(dataset: Dataset) -> Domain:
@@ -231,8 +232,8 @@ FEWEST_MEASURED = 50
 def held_out(contact: Array) -> Booleans:
     """Determine which measured presses are held out for the measurement of errors.
 
-    Presses at one position are held out together. The positions are chosen in an order that depends only on their
-    coordinates, and that is therefore the same in every subset of the presses.
+    Presses at one position are held out together. The order in which positions are chosen depends only on their
+    coordinates. The order is therefore the same in every subset of the presses.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -246,7 +247,7 @@ def held_out(contact: Array) -> Booleans:
 
 
 def folds_by_place(contact: Array, count: int) -> Integers:
-    """Return the number of the fold of each measured press, from 0 to `count` - 1, shape (n,).
+    """Return the number of the cross-validation fold of each measured press, from 0 to `count` - 1, shape (n,).
 
     Presses at one place are in the same fold. Places are assigned to the folds in the order in which `held_out` chooses
     them.
@@ -259,7 +260,7 @@ def folds_by_place(contact: Array, count: int) -> Integers:
 
 
 def _count_presses_before(contact: Array) -> Integers:
-    """Return, for each press, the number of presses at positions that are chosen before its own position.
+    """For each press, count the presses at all positions that are chosen before its own position.
 
     Positions are chosen in the order of the checksums of their coordinates. This order is random but the same in every
     run.
@@ -282,7 +283,7 @@ def _count_presses_before(contact: Array) -> Integers:
 
 
 def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Dataset:
-    """Return measured presses as a dataset, without the presses whose place, force or charges are unknown.
+    """Convert measured presses into a dataset. Presses with an unknown place, force or charge are left out.
 
     Args:
         presses: The measured presses.
@@ -304,7 +305,7 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
 
 
 def complete(presses: MeasuredPresses) -> Booleans:
-    """Return which presses have a known place, a known force and a known charge of every electrode, shape (n,)."""
+    """Return whether each press has a known place, a known force and a known charge of every electrode, shape (n,)."""
     return presses.placed & np.isfinite(presses.charge_pC).all(axis=1)
 
 

@@ -14,19 +14,19 @@ LINE_WIDTH = 109
 
 
 def source_text(name: str, **values: object) -> str:
-    """Return the text of a file in `sources/` in which each `$name` is replaced by its value."""
+    """Read a file in `sources/`, and replace each `$name` by its value."""
     file = resources.files(__package__) / "sources" / name
     template = Template(file.read_text("utf-8"))
     return template.substitute(values)
 
 
 def c_float(value: float) -> str:
-    """Return the shortest C literal that gives exactly this finite float32 number."""
+    """Return the shortest C literal that represents a finite float32 number exactly."""
     return _with_point(str(np.float32(value))) + "f"
 
 
 def c_double(value: float) -> str:
-    """Return the shortest C literal that gives exactly this finite double."""
+    """Return the shortest C literal that represents a finite double exactly."""
     return _with_point(repr(float(value)))
 
 
@@ -42,7 +42,7 @@ def c_doubles(values: Iterable[float]) -> str:
 
 
 def c_array(name: str, values: NDArray[Any]) -> str:
-    """Return the definition of a constant array with one dimension.
+    """Return the C definition of a constant array with one dimension.
 
     Args:
         name: Name of the array.

@@ -63,14 +63,14 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
 
 
 def settings_origin(device: Device) -> str:
-    """Return words for comments and the README that state where the settings of the signal chain come from."""
+    """Return words that state where the settings of the signal chain come from, for comments and the README."""
     if device is ANY_BOARD:
         return "the defaults, because no device file was given"
     return f'from the device file "{c_comment(device.name)}"'
 
 
 def _stage_numbers(prefix: str, settings: Mapping[str, Any]) -> dict[str, str]:
-    """Return the C literals of the settings of a stage, by the names of their macros without `ISOCHARGE_`.
+    """Return the settings of a stage as C literals, by the names of their macros without `ISOCHARGE_`.
 
     The first macro switches the stage on: its literal is 1 if the stage is on, and 0 otherwise.
 
@@ -91,7 +91,7 @@ def _stage_numbers(prefix: str, settings: Mapping[str, Any]) -> dict[str, str]:
 def _stage_settings(chain: Chain) -> dict[str, dict[str, Any]]:
     """Return the settings of each stage of a signal chain, by the prefix of its macros in C.
 
-    The settings of a stage that is missing in the chain are empty. The switch `on` of a stage is one of its settings.
+    If a stage is missing in the chain, its settings are empty. The switch `on` of a stage is one of its settings.
 
     Args:
         chain: The signal chain.
@@ -162,7 +162,7 @@ SINGLE_PRECISION = "/* This board computes the chain in single precision. */\n#d
 
 
 def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: str = "") -> Path:
-    """Write a model, and the signal chain that belongs to this model, as C99.
+    """Write a model and the signal chain of a board as C99.
 
     Args:
         model: Version folder of the model, as `find_model` returns it.
@@ -190,7 +190,7 @@ def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: 
 
 
 def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[str, str]:
-    """Return the text of each file of an export by its path in the folder of the export.
+    """Return the texts of all files of an export, by their paths in the folder of the export.
 
     Args:
         model: Version folder of the model.
@@ -229,7 +229,7 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
 
 
 def _sketch_files(files: Mapping[str, str], n_electrode: int) -> dict[str, str]:
-    """Return the text of each file of the sketch for Arduino by its path in the folder of the export.
+    """Return the texts of all files of the Arduino sketch, by their paths in the folder of the export.
 
     The sketch has a folder of its own, which contains copies of the sources. It computes in single precision.
 

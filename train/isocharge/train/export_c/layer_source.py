@@ -1,11 +1,11 @@
-"""Generator of the C source of a layer of a network, which is a function with constant arrays.
+"""Generator of the C source of one layer of a network: a function with its constant arrays.
 
-A layer computes the outputs y = f(x W + c) of the inputs x, with the weights W, shape (inputs, outputs), the bias c and
-the activation f. The C function adds the products of a few inputs with their rows of W to all outputs at a time. The
-inner loop of the C function runs over neighbouring outputs, and its number of iterations is constant. With -O2 or a
-higher level of optimisation, compilers therefore vectorise the loop without changing the order of any sum. If two
-perceptrons run side by side, the weight matrix consists of two blocks, and the zeros outside the blocks are left out.
-Each weight that the training rounded to 8 bits is stored in one byte.
+A layer computes its outputs y = f(x W + c) from its inputs x. W are the weights, shape (inputs, outputs), c is the
+bias, and f is the activation. The C function processes a few inputs at a time. Each input is multiplied by its row of
+W, and the products are added to all outputs. The inner loop of the C function runs over neighbouring outputs, and its
+number of iterations is constant. With -O2 or a higher level of optimisation, compilers therefore vectorise the loop
+without changing the order of any sum. If two perceptrons run side by side, the weight matrix consists of two blocks,
+and the zeros outside the blocks are left out. Each weight that the training rounded to 8 bits is stored in one byte.
 """
 
 from collections.abc import Sequence
@@ -95,10 +95,10 @@ def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Bloc
     """Find the blocks of the weights of consecutive layers.
 
     A layer has two blocks if two perceptrons run side by side in it, and otherwise one block. With two perceptrons, the
-    weight matrix is block diagonal: the inputs and outputs of the first perceptron come first, and no weight connects
-    both perceptrons. The layers are examined in reverse order. For the last layer, the caller states which outputs
-    belong to the first perceptron. The rows of a weight matrix then show which inputs belong to the first perceptron,
-    and these inputs are the outputs of the layer before it.
+    weight matrix is block diagonal, because no weight connects both perceptrons. The inputs and outputs of the first
+    perceptron come first. The layers are examined in reverse order. For the last layer, the caller states which outputs
+    belong to the first perceptron. The rows of a weight matrix show which inputs of the layer belong to the first
+    perceptron. The inputs of a layer are the outputs of the layer before it.
 
     Args:
         weights: Weights of each layer except the first layer, whose inputs both perceptrons share.
@@ -117,9 +117,9 @@ def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Bloc
         connects_second_to_first = matrix[n_first_input:, :n_first_output].any()
         is_block_diagonal = n_first_input > 0 and not connects_second_to_first
         if is_block_diagonal:
-            first = (slice(0, n_first_input), slice(0, n_first_output))
-            second = (slice(n_first_input, None), slice(n_first_output, None))
-            blocks.append((first, second))
+            first_block = (slice(0, n_first_input), slice(0, n_first_output))
+            second_block = (slice(n_first_input, None), slice(n_first_output, None))
+            blocks.append((first_block, second_block))
             n_first_output = n_first_input  # the inputs of this layer are the outputs of the layer before it
         else:
             # Both perceptrons share the inputs of this layer, so all layers before it have a single block, too.
@@ -129,7 +129,7 @@ def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Bloc
 
 
 def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
-    """Convert weights to 8-bit integers if all weights of each column are multiples of a scale.
+    """Convert weights to 8-bit integers if the weights of each column are multiples of one number, the scale.
 
     The scale of a column is its largest absolute weight divided by `LARGEST_INT8`.
 
@@ -140,8 +140,8 @@ def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
         Integers and the scales, shape (outputs,). If some weights are no multiples, the unchanged weights and None.
     """
     scale = np.abs(values).max(axis=0) / np.float32(LARGEST_INT8)
-    divisor = np.where(scale > 0.0, scale, 1.0)  # a column of zeros has the scale 0
-    multiples = np.round(values / divisor)
+    nonzero_scale = np.where(scale > 0.0, scale, 1.0)  # a column of zeros has the scale 0
+    multiples = np.round(values / nonzero_scale)
     are_multiples = np.allclose(multiples * scale, values, rtol=INT8_TOLERANCE, atol=0.0)
     if are_multiples:
         return multiples.astype(np.int8), scale
@@ -149,7 +149,7 @@ def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
 
 
 def _product_lines(name: str, block: Block, values: NDArray[Any]) -> list[str]:
-    """Return the lines of C that add the product of the inputs x and one block of the weights to the outputs y.
+    """Return C lines that multiply the inputs x by one block of the weights, and add the products to the outputs y.
 
     Each loop over the outputs adds the products of up to `N_ROWS` inputs, so that y is read and written less often.
 

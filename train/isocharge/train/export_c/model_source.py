@@ -1,17 +1,17 @@
-"""Texts of the files `isocharge_model.h`, `isocharge_model.c` and `self_test.c` for a model.
+"""Generator of the files `isocharge_model.h`, `isocharge_model.c` and `self_test.c` of a model.
 
-The inputs of the first layer in C are the logarithm of one charge, ln q_0, and the logarithms of the ratios of the
-other charges to this charge. The network remains the same function of the charges, but its rounding errors are smaller.
-The charges of a film rise and fall together, and the position changes their ratios. The first layer of a trained
-network therefore has large weights of both signs for logarithms that are nearly equal, so that the terms of its sums
-nearly cancel:
+In C, the inputs of the first layer are the logarithm of one charge, ln q_0, and the logarithms ln(q_k / q_0) for the
+other charges q_k. The network remains the same function of the charges, but its rounding errors are smaller. The force
+changes all charges of a film together, and the position changes the ratios of the charges. The first layer of a trained
+network therefore has large weights of both signs. The logarithms are nearly equal, so that the terms of its sums nearly
+cancel:
 
     sum_k w_k ln q_k = (sum_k w_k) ln q_0 + sum_k w_k ln(q_k / q_0).
 
 On the right-hand side, the charges are subtracted before a logarithm is computed, because ln(q_k / q_0) is computed as
-log1p((q_k - q_0) / q_0). The difference of two charges is exact if their ratio is at most two (Sterbenz 1974), so all
-digits of this logarithm are correct. On the left-hand side, the logarithms are larger, and their last digits are lost
-in the sums.
+log1p((q_k - q_0) / q_0). The difference of two charges is exact if their ratio is at most two (Sterbenz 1974). All
+digits of the logarithm are then correct. On the left-hand side, the logarithms are larger, and their last digits are
+lost in the sums.
 """
 
 from itertools import cycle, islice, pairwise
@@ -109,16 +109,18 @@ def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSour
     perceptron = network.layers
     is_logarithmic = network.features.mean is None
     convert_input_weights = _convert_to_differences if is_logarithmic else _to_single_precision
-    first, *others = perceptron.hidden
-    other_weights = [_to_single_precision(layer.weight) for layer in others]
+    first_layer, *other_layers = perceptron.hidden
+    other_weights = [_to_single_precision(layer.weight) for layer in other_layers]
     last_weight = _to_single_precision(perceptron.last.weight)
     # The outputs before the misfit vector belong to the contact perceptron.
     n_contact_output = network.angle_columns.stop
     *other_blocks, last_blocks = find_blocks([*other_weights, last_weight], n_contact_output)
 
-    first_weight = convert_input_weights(first.weight)
-    hidden = [LayerSource("layer_0", first_weight, _to_single_precision(first.bias), activation=perceptron.activation)]
-    for layer, weight, blocks in zip(others, other_weights, other_blocks, strict=True):
+    first_weight = convert_input_weights(first_layer.weight)
+    hidden = [
+        LayerSource("layer_0", first_weight, _to_single_precision(first_layer.bias), activation=perceptron.activation)
+    ]
+    for layer, weight, blocks in zip(other_layers, other_weights, other_blocks, strict=True):
         name = f"layer_{len(hidden)}"
         bias = _to_single_precision(layer.bias)
         hidden.append(LayerSource(name, weight, bias, blocks, perceptron.activation))
@@ -129,7 +131,7 @@ def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSour
 
 
 def _contact_size(network: FoldedNetwork) -> int:
-    """Return the number of fields of a `Contact` that a network computes, with or without the correlations."""
+    """Return how many fields of a `Contact` a network computes. Without correlations, the number is smaller."""
     return len(Contact._fields) if network.n_angle else N_WITHOUT_CORRELATION
 
 

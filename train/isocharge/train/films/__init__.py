@@ -1,1 +1,1 @@
-"""Network for all films: training data, training, file, and computation of the model of one film."""
+"""Network for all films: its training data, its training, its file, and the computation of the model of one film."""

@@ -1,12 +1,13 @@
-"""Network for all films in the form in which it is trained: a perceptron whose weights depend on the film.
+"""Trainable form of the network for all films: a perceptron whose weights depend on the film.
 
-The inputs are the logarithms of the charges after division by the charge scales of the film (see `film_scaling`). The
-context of a film consists of a few numbers that describe the film. A small network, the context network, converts the
-context into a feature vector psi. The weight matrix of layer l is W_l = W_l0 + sum over k of phi_lk W_lk, with matrices
-W_l0 and W_lk that are the same for all films, and with factors phi_lk that depend on the film. The factors phi_lk and
-the biases of the layers are linear functions of the feature vector psi. The weight matrix of the skip layer is also a
-constant matrix plus a weighted sum of matrices. For the context of a single film, `ConditionalWeights.perceptron`
-computes an ordinary perceptron.
+Each charge is divided by its charge scale, which depends on the film (see `film_scaling`). The inputs of the perceptron
+are the whitened logarithms of the quotients. The context of a film consists of a few numbers that describe the film. A
+small network, the context network, converts the context into a feature vector psi.
+
+The weight matrix of layer l is W_l = W_l0 + sum over k of phi_lk W_lk. The matrices W_l0 and W_lk are the same for all
+films, whereas the factors phi_lk depend on the film. The factors phi_lk and the biases of the layers are linear
+functions of psi. The weight matrix of the skip layer is also a constant matrix plus a weighted sum of basis matrices.
+From the context of a single film, `ConditionalWeights.perceptron` computes an ordinary perceptron with fixed weights.
 """
 
 from dataclasses import dataclass
@@ -46,9 +47,9 @@ INITIAL_PHI_STD = 0.3
 
 @dataclass(frozen=True)
 class FilmInputs:
-    """Computation of the inputs of the network for all films from charges.
+    """Conversion of charges into the inputs of the network for all films.
 
-    The inputs are (ln(clip(Q)) - ln(S) - mean) @ whitening, with the charges Q in pC and the charge scales S of the
+    The inputs are (ln(clip(Q)) - ln(S) - mean) @ whitening. Q are the charges in pC, and S are the charge scales of the
     film. `FilmScaling.log_charge_scale` computes ln(S).
 
     Attributes:
@@ -63,7 +64,7 @@ class FilmInputs:
 
     @classmethod
     def fit(cls, scaling: FilmScaling, presses: FilmPresses) -> "FilmInputs":
-        """Fit the mean and the whitening matrix to noise-free charges of many films.
+        """Compute the mean and the whitening matrix from noise-free charges of many films.
 
         Args:
             scaling: Charge scales and contexts of films.
@@ -79,11 +80,11 @@ class FilmInputs:
 
     @property
     def charge_features(self) -> ChargeFeatures:
-        """Features ln(Q / 1 pC) of charges Q, which are first clipped to the limits of the network."""
+        """Features ln(Q / 1 pC), for which each charge Q is first clipped to the limits of the network."""
         return ChargeFeatures(np.ones(self.mean.size), np.array(LOWEST_CHARGE), np.array(HIGHEST_CHARGE))
 
     def values(self, charge: Tensor, parameters: Array) -> Tensor:
-        """Compute the inputs of the network from charges on several films.
+        """Convert charges of presses on several films into the inputs of the network.
 
         Args:
             charge: Charges, shape (n_film, n, n_electrode), pC.
@@ -109,9 +110,9 @@ class FilmInputs:
 
 
 class ConditionalPerceptron(nn.Module):
-    """Perceptron with a skip layer, whose weights and biases depend on the film.
+    """Perceptron with a skip layer, in which all weights and biases depend on the film.
 
-    One call evaluates the perceptrons of many films.
+    One call evaluates the perceptron for presses on many films.
 
     Args:
         n_input: Number of electrodes.
@@ -131,10 +132,9 @@ class ConditionalPerceptron(nn.Module):
     ) -> None:
         """Create the layers with random weights.
 
-        The weight matrix of each layer is the sum of a constant matrix and `N_BASES` basis matrices, which are
-        multiplied by factors phi. The context network computes features of the film from its context. The factors phi
-        and the biases are linear functions of these features. Before the training, the biases do not depend on the
-        film.
+        The weight matrix of each layer is the sum of a constant matrix and `N_BASES` basis matrices, each multiplied by
+        a factor phi. The context network computes features of the film from its context. The factors phi and the biases
+        are linear functions of these features. Before the training, the biases do not depend on the film.
 
         Args:
             n_input: Number of inputs.
@@ -178,31 +178,32 @@ class ConditionalPerceptron(nn.Module):
         return evaluate(self.definition(context), inputs)
 
     def definition(self, context: Tensor) -> Perceptron[Tensor]:
-        """Return the perceptrons of several films as one perceptron, whose weights have a first axis for the film.
+        """Return the perceptrons of several films as a single `Perceptron`.
 
-        The context network computes the features psi of each film. The weight matrix of each layer is a constant matrix
-        plus basis matrices, which are multiplied by the factors phi of the film. The factors phi and the biases are
-        linear functions of the features psi.
+        The first axis of its weight arrays is the index of the film. The context network computes the features psi of
+        each film. The weight matrix of each layer is the sum of a constant matrix and basis matrices, each multiplied
+        by a factor phi of the film. The factors phi and the biases are linear functions of the features psi.
 
         Args:
             context: Contexts of the films, shape (n_film, n_context).
         """
         n_layer = len(self.constant)
         context_layers = [Layer(linear.weight.T, linear.bias) for linear in self._context_linears()]
-        psi = evaluate_hidden_layers(context_layers, self.activation, context)
-        phi = self.phi(psi).view(len(context), n_layer + 1, N_BASES)  # one row for each layer and for the skip layer
+        film_features = evaluate_hidden_layers(context_layers, self.activation, context)
+        # One row for each layer and for the skip layer
+        basis_factors = self.phi(film_features).view(len(context), n_layer + 1, N_BASES)
 
         layers = []
         for layer_index, (constant, bases, bias) in enumerate(zip(self.constant, self.bases, self.bias, strict=True)):
-            weight = _mix_weights(constant, bases, phi[:, layer_index])
-            film_bias = bias(psi)[:, None]  # shape (n_film, 1, n_output), the same for all presses on a film
+            weight = _mix_weights(constant, bases, basis_factors[:, layer_index])
+            film_bias = bias(film_features)[:, None]  # shape (n_film, 1, n_output), the same for all presses on a film
             layers.append(Layer(weight, film_bias))
-        skip = _mix_weights(self.skip, self.skip_bases, phi[:, n_layer])
+        skip = _mix_weights(self.skip, self.skip_bases, basis_factors[:, n_layer])
         *hidden, last = layers
         return Perceptron(tuple(hidden), last, skip, self.activation)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return the weights as arrays by name, in the form that `ConditionalWeights` expects."""
+        """Return the weights as a dictionary of arrays by name, as `ConditionalWeights` expects them."""
         return {name: values.detach().double().numpy() for name, values in self.state_dict().items()}
 
     def _context_linears(self) -> list[nn.Linear]:

@@ -1,15 +1,18 @@
-"""Scales of the charges of films, and contexts, which are the properties of films on which the scaled charges depend.
+"""Charge scales and contexts of films.
+
+The context of a film contains the properties on which its scaled charges depend.
 
 Let E be Young's modulus, h the thickness, d the geometric mean of d31 and d32, and g the gain of an electrode. The
-charge Q of the electrode under a force F then has the form
+charge Q of the electrode under a force F then has the following form:
 
     Q / (g d E)  =  function of F / (E h), of the position in the frame of the electrodes, and of the context.
 
-The context contains the logarithms of pretension / E, of d31 / d32 and of h. The context also contains the position of
-the film's centre in the frame of the electrodes, the rotation of the electrodes, and the radius of the probe. The noise
-and the limits of the domain are the same for all films, so their influence depends on the scales of the film. The
-context therefore also contains the mean scale of the charges, the scale of the forces, and the gain of each electrode
-relative to the mean gain.
+The context contains the logarithms of three quantities: the ratio of the pretension to E, the ratio of d31 to d32, and
+h. The context also contains the position of the film's centre in the frame of the electrodes, the rotation of the
+electrodes, and the radius of the probe. The noise and the limits of the domain are the same for all films. Their
+influence on a film therefore depends on the scales of its charges and forces. For this reason, the context also
+contains the mean scale of the charges, the scale of the forces, and the gain of each electrode relative to the mean
+gain.
 """
 
 from dataclasses import dataclass
@@ -28,7 +31,7 @@ N_FILMS = 4096
 
 
 class ContextStatistics(NamedTuple):
-    """Mean and standard deviation of the unstandardised context over many films, each of shape (n_context,)."""
+    """Mean and standard deviation of each value of the context over many films, both of shape (n_context,)."""
 
     mean: Array
     std: Array
@@ -36,9 +39,9 @@ class ContextStatistics(NamedTuple):
 
 @dataclass(frozen=True)
 class FilmScaling:
-    """Scales of the charges, transformations of the contacts, and contexts of films.
+    """Charge scales, contexts and coordinate transformations of films.
 
-    The arrays of parameters can have any number of leading dimensions.
+    Arrays of film parameters can have any number of leading dimensions.
 
     Attributes:
         prior: Distribution of the films.
@@ -51,8 +54,8 @@ class FilmScaling:
     def log_charge_scale(self, parameters: Array) -> Array:
         """Compute the logarithms of the charge scales of the electrodes.
 
-        The charge scale of an electrode is the product of Young's modulus, the geometric mean of d31 and d32, and the
-        gain of the electrode, each divided by its value for the described film.
+        The charge scale of an electrode is the product of three ratios: those of Young's modulus, of the geometric mean
+        of d31 and d32, and of the gain of the electrode to their values for the described film.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
@@ -66,7 +69,7 @@ class FilmScaling:
         return np.asarray(_log_gains(parameters) + log_common_scale[..., None])
 
     def rotation(self, parameters: Array) -> Array:
-        """Compute the matrices T of `to_film`, which rotate positions with the electrodes.
+        """Compute the matrices T of `to_film`. Each matrix rotates positions by the angle of the electrodes.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
@@ -80,11 +83,11 @@ class FilmScaling:
         return rotation
 
     def offset(self, parameters: Array) -> Array:
-        """Compute the vectors o of `to_film` in unit coordinates.
+        """Compute the offset vectors o of `to_film` in unit coordinates.
 
         The electrodes of a film are first rotated about the origin and then displaced. The first two components of the
-        vector o are the displacement of the electrodes. The third component is the logarithm of the ratio of the
-        stiffness to that of the described film.
+        vector o are the displacement of the electrodes. The third component is ln(k / k0), with the stiffness k of the
+        film and the stiffness k0 of the described film.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
@@ -114,11 +117,13 @@ class FilmScaling:
         Returns:
             Unit coordinates on the other film, shape (..., 3).
         """
-        rotated = (self.rotation(parameters) @ unit[..., None])[..., 0]  # T u, with u as a column vector
-        return np.asarray(rotated + self.offset(parameters))
+        rotated_unit = (self.rotation(parameters) @ unit[..., None])[..., 0]  # T u, with u as a column vector
+        return np.asarray(rotated_unit + self.offset(parameters))
 
     def context(self, parameters: Array) -> Array:
-        """Compute the contexts of films, standardised with the mean and the standard deviation over the prior.
+        """Compute the standardised contexts of films.
+
+        Each value is standardised with its mean and its standard deviation over the prior.
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
@@ -130,9 +135,9 @@ class FilmScaling:
 
     @cached_property
     def statistics(self) -> ContextStatistics:
-        """Mean and standard deviation of the unstandardised context over films that are drawn from the prior."""
-        raw = self._raw_context(self.prior.draw(np.random.default_rng(0), N_FILMS))
-        return ContextStatistics(raw.mean(axis=0), raw.std(axis=0))
+        """Mean and standard deviation of each context value before standardisation, over films drawn from the prior."""
+        raw_context = self._raw_context(self.prior.draw(np.random.default_rng(0), N_FILMS))
+        return ContextStatistics(raw_context.mean(axis=0), raw_context.std(axis=0))
 
     def _raw_context(self, parameters: Array) -> Array:
         """Compute the contexts of films before they are standardised.
@@ -177,17 +182,17 @@ class FilmScaling:
 
 
 def _shared(parameters: Array, name: str) -> Array:
-    """Return one of the parameters that do not belong to a single electrode, by its name, shape (...)."""
+    """Return the parameter with the given name, which all electrodes share, shape (...)."""
     return np.asarray(parameters[..., SHARED.index(name)])
 
 
 def _log_gains(parameters: Array) -> Array:
-    """Return the logarithms of the gains of the electrodes relative to the described film, shape (..., n_electrode)."""
+    """Return ln(gain / gain of the described film) for each electrode, shape (..., n_electrode)."""
     return parameters[..., len(SHARED) :]
 
 
 def _shift(parameters: Array) -> Array:
-    """Return the shift of the electrodes relative to the described film, shape (..., 2), mm."""
+    """Return the displacement (x, y) of the electrodes from their described place, shape (..., 2), mm."""
     return np.stack([_shared(parameters, "shift_x"), _shared(parameters, "shift_y")], axis=-1)
 
 

@@ -1,12 +1,12 @@
 """Training data of the networks for all films.
 
-The contact network is trained on presses on many films. The gains and the piezoelectric coefficients are exact factors
-of the charges. The training draws new gains and coefficients in every step, which needs no new simulation. The charges
-are therefore stored in three parts, for d31, d32 and d33, which are computed with the gains and coefficients of the
-sensor file.
+The contact network learns from simulated presses on many films. Each charge is proportional to the gain of its
+electrode, and is a linear function of the piezoelectric coefficients. The training can therefore draw new gains and
+coefficients in every step without a new simulation. For this purpose, each charge is stored as three parts, which are
+due to d31, d32 and d33. The parts are computed with the gains and coefficients of the sensor file.
 
-The misfit network is trained on charges of many kinds, with their residuals at the nearest contact, and on charges of
-good presses.
+The misfit network learns from charges of many kinds and from charges of good presses. The targets of its training
+follow from the residuals of the charges at the nearest contact.
 """
 
 from concurrent.futures import Executor
@@ -72,10 +72,10 @@ class FilmPresses:
         return len(self.parameters)
 
     def charge(self) -> Array:
-        """Compute the charges of the presses with the gains and the coefficients of their films.
+        """Compute the charges of the presses. Each film has its own gains and piezoelectric coefficients.
 
-        The parts of a charge for d31, d32 and d33 are multiplied by factors of the film, and the products are added.
-        The sum of the products is multiplied by the gain factor of the electrode:
+        The parts of a charge that are due to d31, d32 and d33 are multiplied by factors of the film, and the products
+        are added. The sum of the products is multiplied by the gain factor of the electrode:
 
             charge = gain factor * sum over the parts (part factor * part).
 
@@ -136,7 +136,7 @@ def draw_film_presses(
 def _press_films(
     prior: FilmPrior, family: FilmFamily, domain: Domain, presses: int, seed: int, job: tuple[int, Array]
 ) -> Singles:
-    """Draw presses on some films, and compute their charges in parts.
+    """Draw presses on some films, and compute the three parts of each charge.
 
     The contacts and the parts of the charges are joined in one array, because a task of the executor returns a single
     array.
@@ -168,10 +168,10 @@ def _press_films(
 
 
 def _compute_response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: Array) -> Array:
-    """Compute the parts of the charges of one film that are due to d31, to d32 and to d33.
+    """For presses on one film, compute the parts of the charges that are due to d31, d32 and d33.
 
     The parts are computed with the piezoelectric coefficients and the gains of the sensor file. `FilmPresses.charge`
-    multiplies the parts by the factors that convert these coefficients and gains into those of the film.
+    converts the parts to the coefficients and gains of the film.
 
     Args:
         prior: Distribution of the films.
@@ -183,16 +183,16 @@ def _compute_response(prior: FilmPrior, family: FilmFamily, parameters: Array, c
         Parts for d31, d32 and d33, shape (n_press, n_electrode, 3), pC.
     """
     # The coefficients and the gains are logarithms of factors, so zero stands for the values in the sensor file.
-    without_factors = parameters.copy()
-    without_factors[[D31, D32]] = 0.0
-    without_factors[GAINS] = 0.0
-    sensor, probe = prior.film(without_factors)
+    described_parameters = parameters.copy()
+    described_parameters[[D31, D32]] = 0.0
+    described_parameters[GAINS] = 0.0
+    sensor, probe = prior.film(described_parameters)
     forward_map = family.forward_map(sensor, probe)
     piezo = prior.sensor.piezo
     no_charge = np.zeros((len(contact), len(prior.sensor.electrodes)))
 
     def charges_with(d31: float, d32: float, d33: float = 0.0) -> Array:
-        """Return the charges of the film with these piezoelectric coefficients, shape (n_press, n_electrode), pC."""
+        """Return the charges for the given piezoelectric coefficients, shape (n_press, n_electrode), pC."""
         if d31 == 0.0 and d32 == 0.0:  # the coefficient of this part is zero in the sensor file
             return no_charge
         other_sensor = replace(forward_map.sensor, piezo=Piezo(d31, d32, d33))
@@ -210,9 +210,10 @@ def _compute_response(prior: FilmPrior, family: FilmFamily, parameters: Array, c
 
 
 def _check_most_charges_are_positive(film_presses: FilmPresses) -> None:
-    """Check that at most the fraction `MAX_NEGATIVE_FRACTION` of the presses has a charge that is zero or negative.
+    """Check that only a few presses have a charge that is zero or negative.
 
-    The network learns from the logarithms of the charges, so it needs positive charges.
+    The largest accepted fraction of such presses is `MAX_NEGATIVE_FRACTION`. The network learns from the logarithms of
+    the charges, so it needs positive charges.
 
     Args:
         film_presses: Presses on the drawn films.
@@ -237,7 +238,7 @@ def _check_most_charges_are_positive(film_presses: FilmPresses) -> None:
 
 
 class SearchMap(FunctionMap):
-    """Charge map for searches, whose derivatives are computed from fewer charges than those of `FunctionMap`."""
+    """Charge map for searches. Its one-sided differences need fewer charges than the differences of `FunctionMap`."""
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """See `LinearisedMap`."""
@@ -246,7 +247,7 @@ class SearchMap(FunctionMap):
 
 @dataclass(frozen=True)
 class FilmsSource:
-    """Films and contacts from which the training data of the misfit network are drawn.
+    """Source of the training data of the misfit network: films, contacts and noise.
 
     Attributes:
         prior: Distribution of the films.
@@ -261,7 +262,9 @@ class FilmsSource:
     noise: NoiseModel
 
     def charge_map(self, parameters: Array) -> FunctionMap:
-        """Return the map of one film from contacts to charges, which are clipped to the limits of the input features.
+        """Return the map from contacts to charges of one film.
+
+        The charges are clipped to the limits of the input features.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -275,7 +278,7 @@ class FilmsSource:
         return FunctionMap(charges, forward_map.electrodes, self.domain)
 
     def search_map(self, parameters: Array) -> SearchMap:
-        """Return the map of `charge_map` for searches.
+        """Return the charge map of one film for searches.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -286,7 +289,7 @@ class FilmsSource:
 
 @dataclass(frozen=True)
 class DrawnFilms:
-    """Charges on several films, and the data from which the targets of the misfit network are computed.
+    """Charges on several films, with residuals or projection matrices as targets of the misfit network.
 
     Attributes:
         parameters: Parameters of the films, shape (n_film, n_parameter).
@@ -324,7 +327,7 @@ def draw_misfit_films(
 
 
 def _draw_charges_of_every_kind(source: FilmsSource, charges: int, seed: int, job: tuple[int, Array]) -> Array:
-    """Draw charges of every kind on one film, from good presses to charges that no contact explains.
+    """Draw charges of every kind on one film: of good presses, of faulty presses, and random charges.
 
     Args:
         source: Distribution and forward maps of the films, contacts and noise.
@@ -348,10 +351,10 @@ def _draw_charges_of_every_kind(source: FilmsSource, charges: int, seed: int, jo
 def draw_near_films(
     source: FilmsSource, films: int, presses: int, seed: int, executor: Executor | None = None
 ) -> DrawnFilms:
-    """Draw films from the prior, and draw good presses with projection matrices on each film.
+    """Draw films from the prior, draw good presses on each film, and compute their projection matrices.
 
-    The projection matrix of a press converts the noise of its charges into their residuals at the nearest contact. No
-    search for this contact is needed, because the charges are linearised about the true contact.
+    The projection matrix of a press converts the noise of its charges into the residuals of the charges at the nearest
+    contact. The charges are linearised about the true contact, so that no search for the nearest contact is needed.
 
     Args:
         source: Distribution and forward maps of the films, contacts and noise.
@@ -374,7 +377,9 @@ def draw_near_films(
 
 
 def _draw_good_presses(source: FilmsSource, presses: int, seed: int, job: tuple[int, Array]) -> Array:
-    """Draw good presses on one film, with the matrices that convert the noise of their charges into residuals.
+    """Draw good presses on one film, and compute the projection matrix of each press.
+
+    A projection matrix converts the noise of the charges into residuals.
 
     Args:
         source: Distribution and forward maps of the films, contacts and noise.

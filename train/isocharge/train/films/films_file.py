@@ -1,4 +1,4 @@
-"""Writer and reader of `films.npz`, the file of a network for all films in the version folder of a model.
+"""Writer and reader of `films.npz`, a file in a version folder that contains a network for all films.
 
     about              JSON: format, sensor, probe, spread, domain, activation, noise
     family.*           the forward maps of the films (`FilmFamily.to_arrays`)
@@ -7,7 +7,8 @@
     mean, whitening    mean and whitening matrix of the inputs
     sha256             checksum of all arrays above
 
-The weights are rounded to `BITS` bits. The bits that are removed are nearly random and could not be compressed.
+The weights are rounded to `BITS` bits. The rounding makes the file smaller, because the removed bits are nearly random
+and could not be compressed.
 """
 
 import hashlib
@@ -114,7 +115,9 @@ def films_from_bytes(data: bytes, where: str) -> FilmsModel:
 
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return the content of an npz file with LZMA compression, which is smaller than with the usual compression.
+    """Return the content of an npz file with LZMA compression.
+
+    The file is smaller than an npz file with the usual compression.
 
     Args:
         arrays: The arrays by name.
@@ -128,7 +131,7 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def _checked_arrays(data: bytes) -> dict[str, np.ndarray]:
-    """Read the arrays of a file, check them, and return all arrays except the checksum, by name.
+    """Read and check the arrays of a file, and return them by name, without the checksum.
 
     Args:
         data: Content of the file.
@@ -232,10 +235,10 @@ def _model_from_arrays(about: dict[str, Any], arrays: Mapping[str, np.ndarray], 
 
 
 def _converted(value: float, factor: float) -> float:
-    """Multiply a number by the factor between two units, and round the product to 15 digits.
+    """Convert a number to another unit: multiply it by a factor, and round the product to 15 digits.
 
-    A number of up to 15 digits is therefore the same after a conversion to another unit and back. If the factor is 1,
-    the number is returned without rounding.
+    A number with at most 15 digits is therefore unchanged after a conversion to another unit and back. If the factor is
+    1, the number is returned without rounding.
     """
     if factor == 1.0:
         return value
@@ -243,7 +246,7 @@ def _converted(value: float, factor: float) -> float:
 
 
 def _arrays_of_part(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np.ndarray]:
-    """Return the arrays of one part of the file, by their names without the prefix of this part."""
+    """Return the arrays of one part of the file by name. The names do not contain the prefix of the part."""
     prefix = f"{part}."
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
@@ -251,8 +254,8 @@ def _arrays_of_part(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np
 def _pack_weights(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarray]:
     """Round weights to integers, with one scale for each row of an array.
 
-    The rows extend along the last axis. A weight is approximately its integer times the scale of its row. The scale is
-    chosen so that the largest magnitude in a row becomes the largest integer of `BITS` bits.
+    The rows extend along the last axis. A weight is approximately its integer times the scale of its row. The scale of
+    a row converts the largest magnitude in the row into the largest integer of `BITS` bits.
 
     Args:
         part: Name of the part of the file.
@@ -273,7 +276,7 @@ def _pack_weights(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarr
 
 
 def _unpack_weights(packed: Mapping[str, np.ndarray], activation: Activation) -> ConditionalWeights:
-    """Convert rounded weights of a file into the weights of a network. This is the inverse of `_pack_weights`.
+    """Convert the rounded weights in a file into the weights of a network. This is the inverse of `_pack_weights`.
 
     Args:
         packed: Integers and scales by their names in the part of the file. The name of a scale ends with ".scale".

@@ -58,9 +58,9 @@ class ConditionalWeights:
     def perceptron(self, context: Array) -> Perceptron[Array]:
         """Compute the perceptron of one film.
 
-        Two context layers compute the features psi of the film. The weight matrix of each layer is a constant matrix
-        plus basis matrices, which are multiplied by factors phi. The factors phi and the biases are linear functions of
-        the features psi.
+        Two context layers compute the features psi of the film from its context. The weight matrix of each layer is the
+        sum of a constant matrix and basis matrices, each multiplied by a factor phi. The factors phi and the biases are
+        linear functions of the features psi.
 
         Args:
             context: Numbers that describe the film, shape (n_context,).
@@ -69,15 +69,16 @@ class ConditionalWeights:
             The perceptron with the weights and biases of this film.
         """
         context_layers = [self._linear(f"context.{name}") for name in CONTEXT_LAYERS]
-        psi = evaluate_hidden_layers(context_layers, self.activation, context)
+        film_features = evaluate_hidden_layers(context_layers, self.activation, context)
         n_layer = sum(name.startswith("constant.") for name in self.arrays)  # each layer has one constant matrix
-        phi = self._apply_linear("phi", psi).reshape(n_layer + 1, -1)  # one row for each layer and for the skip layer
+        # One row for each layer and for the skip layer
+        basis_factors = self._apply_linear("phi", film_features).reshape(n_layer + 1, -1)
         layers = []
         for index in range(n_layer):
-            weight = self._mix_weights(f"constant.{index}", f"bases.{index}", phi[index])
-            bias = self._apply_linear(f"bias.{index}", psi)
+            weight = self._mix_weights(f"constant.{index}", f"bases.{index}", basis_factors[index])
+            bias = self._apply_linear(f"bias.{index}", film_features)
             layers.append(Layer(weight, bias))
-        skip_weight = self._mix_weights("skip", "skip_bases", phi[n_layer])
+        skip_weight = self._mix_weights("skip", "skip_bases", basis_factors[n_layer])
         *hidden, output_layer = layers
         return Perceptron(tuple(hidden), output_layer, skip_weight, self.activation)
 
@@ -104,7 +105,7 @@ class ConditionalWeights:
 
 
 class AddedVariance(NamedTuple):
-    """Variances that are added to the variances that a network reports.
+    """Variances to add to the reported variances of a network.
 
     Attributes:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -117,7 +118,7 @@ class AddedVariance(NamedTuple):
 
 @dataclass(frozen=True)
 class FilmsModel:
-    """A network for all films that a prior describes.
+    """Network for all films of a prior.
 
     Attributes:
         family: Forward maps of the films.
@@ -153,7 +154,7 @@ class FilmsModel:
         return self.scaling.domain
 
     def forward_map(self, parameters: Array) -> ForwardMap:
-        """Return the map from contacts to charges of one film.
+        """Return the forward map of one film, which computes charges from contacts.
 
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
@@ -173,12 +174,12 @@ class FilmsModel:
         correlation: bool = True,
         n_test: int = N_TEST_PRESSES,
     ) -> Fitted:
-        """Compute the network of one film in the form that a release needs.
+        """Compute the network of one film, with test presses and all other values that a release needs.
 
-        The network is first computed from the parameters of the film. The network is then corrected in up to three
-        steps, each of which is fitted to presses on the simulated film. The first step of the correction adapts the
-        network to the factors of the charges. The second step fits the correlations of the network, and the third step
-        includes the added variances.
+        The network is first computed from the parameters of the film. Up to three corrections follow, each of which is
+        fitted to presses on the simulated film. The first correction adapts the network to charges that differ from the
+        simulated charges by known factors. The second correction fits the correlations of the network. The third
+        correction includes the added variances.
 
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
@@ -241,8 +242,8 @@ class FilmsModel:
     def _draw_contacts(self, rng: np.random.Generator, n_test: int, n_train: int) -> tuple[Array, Array]:
         """Draw contacts for the test and contacts for the corrections.
 
-        The largest possible number of contacts is always drawn, and some of them are not used. Therefore, the contacts
-        for the corrections do not depend on the number of contacts for the test.
+        The method always draws the largest possible number of contacts, and returns only as many contacts as are
+        needed. Therefore, the contacts for the corrections do not depend on the number of contacts for the test.
 
         Args:
             rng: Random number generator.
@@ -259,12 +260,11 @@ class FilmsModel:
     def _adapt_to_factors(
         self, network: FoldedNetwork, presses: LabelledPresses, factors: Array, rng: np.random.Generator
     ) -> FoldedNetwork:
-        """Adapt the network of a simulated film to a film whose charges differ by known factors.
+        """Adapt the network of a simulated film to another film whose charges differ by known factors.
 
         Args:
             network: Network of the simulated film.
-            presses: Presses whose charges are already multiplied by the
-                factors.
+            presses: Presses whose charges are already multiplied by the factors.
             factors: Charges of the film divided by the charges of the simulated film, shape (n, n_electrode).
             rng: Random number generator for the noise.
         """
@@ -277,8 +277,8 @@ class FilmsModel:
         """Compute the network of one film without corrections.
 
         The perceptrons for the contact and for the misfit are merged into one perceptron. The first layer of the merged
-        perceptron includes the charge scales of the film. The last layer includes the rotation and the shift of the
-        electrodes.
+        perceptron includes the charge scales of the film. The last layer of the merged perceptron includes the rotation
+        and the shift of the electrodes.
 
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).

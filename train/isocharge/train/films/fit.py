@@ -133,9 +133,9 @@ def fit_films(
 ) -> FilmsModel:
     """Train a network for all films that a prior describes.
 
-    The forward maps of the films are simulated first, and films are drawn from the prior. A second thread then trains
-    the contact perceptron on presses on these films. At the same time, the calling thread draws charges of every kind
-    and good presses, and trains the misfit perceptron on these data.
+    First, the forward maps of the films are simulated, and films are drawn from the prior. A second thread then trains
+    the contact perceptron with presses on these films. At the same time, the calling thread draws charges of every
+    kind, draws good presses, and trains the misfit perceptron with both.
 
     Args:
         prior: Distribution of the films: the described sensor, the probe and the standard deviations of the parameters.
@@ -156,7 +156,7 @@ def fit_films(
     noise = noise_model(config.noise)  # an unknown name raises before the long computation
 
     def saving_executor(name: str) -> Executor | None:
-        """Return an executor that saves the results of its tasks in the run, if there is a run."""
+        """Return an executor that saves the results of its tasks in the run. Without a run, return `executor`."""
         return executor if run is None else run.storing_executor(name, executor)
 
     with threads_and_seed(1, config.seed), second_thread() as thread_executor:
@@ -199,7 +199,7 @@ def fit_films(
 
 
 def films_identity(prior: FilmPrior, config: FilmsConfig) -> dict[str, Any]:
-    """Return all settings that determine the weights of a network, in order to identify a run that can be resumed."""
+    """Return all settings that determine the weights of a network. The settings identify a run that can be resumed."""
     return {
         "sensor": sensor_to_dict(prior.sensor),
         "probe": prior.probe.notation,
@@ -212,7 +212,7 @@ def films_identity(prior: FilmPrior, config: FilmsConfig) -> dict[str, Any]:
 
 
 def _build_family(prior: FilmPrior, config: FilmsConfig, executor: Executor | None) -> FilmFamily:
-    """Simulate the forward maps of all films that a prior describes, with the effects of imperfections of the films.
+    """Simulate the forward maps of all films of a prior, including the effects of imperfections.
 
     Args:
         prior: Distribution of the films.
@@ -249,7 +249,10 @@ def _train_stage(stage: TrainingStage, config: FilmsConfig, run: ResumableRun | 
 
 
 class _Batch(NamedTuple):
-    """Estimated and true contacts of a batch in unit coordinates, each of shape (n, 3)."""
+    """Estimated contacts, logarithms of their standard deviations, and true contacts, each of shape (n, 3).
+
+    All values are in unit coordinates.
+    """
 
     mean: Tensor
     log_std: Tensor
@@ -297,11 +300,11 @@ class _ContactTraining:
 
     @property
     def n_train(self) -> int:
-        """Number of films for the training. The films after the training films are used for validation."""
+        """Number of films for the training. The remaining films are used for validation."""
         return len(self.presses) - self.config.watched
 
     def loss(self, step: int, random: torch.Generator) -> Tensor:
-        """Return the loss of a random batch, in which d31, d32 and the gains of the films are drawn again.
+        """Compute the loss of a random batch. The values of d31, d32 and the gains of the films are drawn again.
 
         The first `warm_up_steps` steps use the warm-up loss, and the other steps use the likelihood loss.
 
@@ -331,7 +334,7 @@ class _ContactTraining:
     def evaluate_batch(
         self, film_rows: np.ndarray, press_rows: np.ndarray, parameters: Array, random: torch.Generator
     ) -> _Batch:
-        """Evaluate the network on the charges of presses, to which noise is added.
+        """Add noise to the charges of presses, and evaluate the network on the noisy charges.
 
         Args:
             film_rows: Rows of the films in `presses`, shape (n_film,).
@@ -362,9 +365,9 @@ class _ContactTraining:
 
 
 def _with_fresh_factors(prior: FilmPrior, parameters: Array, random: torch.Generator) -> Array:
-    """Return the parameters of films with new values of d31, d32 and the gains, which are drawn from the prior.
+    """Draw new values of d31, d32 and the gains from the prior, and return the changed parameters of the films.
 
-    The charges are proportional to factors that follow from these parameters, so new values need no simulation.
+    The charges for the new values follow from the stored parts of the charges, so that no simulation is needed.
 
     Args:
         prior: Distribution of the films.
@@ -386,7 +389,7 @@ def misfit_stage(
     network: ConditionalPerceptron,
     inputs: FilmInputs,
     examples: DrawnFilms,
-    good: DrawnFilms,
+    good_presses: DrawnFilms,
     noise: NoiseModel,
     config: FilmsConfig,
 ) -> TrainingStage:
@@ -398,12 +401,12 @@ def misfit_stage(
         network: The misfit network, whose weights the training changes.
         inputs: Computation of the inputs from charges.
         examples: Charges of every kind (`draw_misfit_films`); the last films are used for validation.
-        good: Good presses (`draw_near_films`). In every step, they get new noise with up to `MAX_NOISE_FACTOR` times
-            the standard deviation of `noise`.
+        good_presses: Good presses (`draw_near_films`). In every step, they get new noise with up to `MAX_NOISE_FACTOR`
+            times the standard deviation of `noise`.
         noise: Noise of good presses.
         config: Settings of the training.
     """
-    training = _MisfitTraining(network, inputs, examples, good, noise, config)
+    training = _MisfitTraining(network, inputs, examples, good_presses, noise, config)
     return TrainingStage(
         "misfit", network, training.loss, training.score, config.misfit_steps, largest_gradient=LARGEST_GRADIENT
     )
@@ -422,41 +425,42 @@ class _MisfitTraining:
         network: ConditionalPerceptron,
         inputs: FilmInputs,
         examples: DrawnFilms,
-        good: DrawnFilms,
+        good_presses: DrawnFilms,
         noise: NoiseModel,
         config: FilmsConfig,
     ) -> None:
-        """Compute the inputs and targets of the examples.
+        """Compute the inputs and the targets of the examples from their charges and residuals.
 
         Args:
             network: The misfit network.
             inputs: Computation of the inputs from charges.
             examples: Charges of every kind and their residuals.
-            good: Good presses and the projections that compute their residuals.
+            good_presses: Good presses and the projections that compute their residuals.
             noise: Noise of good presses.
             config: Settings of the training.
         """
         self.network = network
         self.inputs = inputs
-        self.good = good
+        self.good_presses = good_presses
         self.noise = noise
         self.config = config
         self.example_inputs = inputs.values(as_tensor(examples.charge), examples.parameters)
         self.example_context = inputs.context(examples.parameters)
         self.example_targets = compress_length(torch.tensor(examples.target)).float()
-        self.good_charge = as_tensor(good.charge)
-        self.good_projection = as_tensor(good.target)
+        self.good_charge = as_tensor(good_presses.charge)
+        self.good_projection = as_tensor(good_presses.target)
         n_example_film = len(self.example_inputs)
         n_validation = max(1, round(MISFIT_VALIDATION_FRACTION * n_example_film))
         self.n_train = n_example_film - n_validation
 
-    def loss(self, _: int, random: torch.Generator) -> Tensor:
-        """Return the loss of random examples plus the weighted loss of random good presses.
+    def loss(self, step: int, random: torch.Generator) -> Tensor:
+        """Compute the loss of random examples plus the weighted loss of random good presses.
 
         Args:
-            _: Number of the step, which has no influence.
+            step: Number of the step, which has no influence.
             random: Random number generator.
         """
+        del step
         n_film = self.config.batch_films // 2  # the other half of the films have good presses
         n_press = self.config.batch_presses
         n_charge = self.example_inputs.shape[1]
@@ -468,7 +472,7 @@ class _MisfitTraining:
         return GOOD_PRESS_WEIGHT * self.good_press_loss(n_film, n_press, random) + example_loss
 
     def score(self) -> tuple[float, str]:
-        """Return the loss on the examples for validation and on good presses, and a text with both parts."""
+        """Return the loss on validation examples and good presses, and a text that states both parts of the loss."""
         validation = slice(self.n_train, None)
         misfit_vector = self.network(self.example_inputs[validation], self.example_context[validation])
         example_loss = mean_squared_distance(misfit_vector, self.example_targets[validation]).item()
@@ -478,7 +482,7 @@ class _MisfitTraining:
         return GOOD_PRESS_WEIGHT * good_loss + example_loss, description
 
     def good_press_loss(self, n_film: int, n_press: int, random: torch.Generator) -> Tensor:
-        """Return the loss of random good presses with new noise.
+        """Draw good presses at random, add new noise to their charges, and compute their loss.
 
         The noise of each press is multiplied by a random factor from 1 to `MAX_NOISE_FACTOR`, because the network also
         has to learn larger misfits.
@@ -503,6 +507,6 @@ class _MisfitTraining:
         # The residual is the part of the noise that no change of the contact explains.
         deviation_column = deviation[..., None]  # column vectors, shape (n_film, n_press, n_electrode, 1)
         residual = (self.good_projection[film_column, press_rows] @ deviation_column)[..., 0]
-        parameters = self.good.parameters[film_rows.numpy()]
+        parameters = self.good_presses.parameters[film_rows.numpy()]
         misfit_vector = self.network(self.inputs.values(noisy_charge, parameters), self.inputs.context(parameters))
         return mean_squared_distance(misfit_vector, compress_length(residual))

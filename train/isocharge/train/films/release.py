@@ -1,4 +1,4 @@
-"""Release of a network for all films as a model, with measured errors, a card and a folder."""
+"""Release of a network for all films as a model folder with measured errors and a card."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -42,7 +42,7 @@ ROWS = (
 
 @dataclass(frozen=True)
 class FilmsErrors:
-    """Errors on new films of a prior, and the film that a model assumes before a calibration.
+    """Errors of a network on new films of a prior, and the film that its model assumes before a calibration.
 
     Attributes:
         with_known_film: Errors if the parameters of each film are known.
@@ -60,11 +60,11 @@ class FilmsErrors:
 
 
 def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PRESSES, seed: int = SEED) -> FilmsErrors:
-    """Measure the errors on new films that are drawn from the prior.
+    """Measure the errors of a network on new films, which are drawn from the prior.
 
     The result contains position errors in mm and relative force errors in percent over all presses. The result also
-    contains the rms position errors on the median film and on the worst film. The coverages of the 68 and 95 %
-    intervals are fractions of the coordinates, 0 to 1.
+    contains the rms position errors on the median film and on the worst film. The coverage of the 68 or 95 % intervals
+    is the fraction of coordinates, 0 to 1, that lie in their interval.
 
     Args:
         films: The network.
@@ -102,7 +102,7 @@ def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PR
 def _errors_with_networks(
     films: FilmsModel, network_films: Array, true_contact: Array, noisy_charge: Array
 ) -> Mapping[str, float]:
-    """Compute the errors of contacts that are estimated with the networks of given films.
+    """Estimate contacts with the networks of given films, and compute the errors of the estimates.
 
     The films of the networks can differ from the films on which the presses were made.
 
@@ -125,7 +125,7 @@ def _errors_with_networks(
 
 
 def _draw_presses(films: FilmsModel, true_films: Array, n_press: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Draw presses on several films, with noise in their charges.
+    """Draw presses on several films, and add noise to their charges.
 
     Args:
         films: The network, which contains the forward maps, the domain and the noise.
@@ -147,7 +147,7 @@ def _draw_presses(films: FilmsModel, true_films: Array, n_press: int, rng: np.ra
 
 
 def _error_statistics(contact: Array, std: Array, truth: Array) -> Mapping[str, float]:
-    """Compute statistics of the errors of contacts on several films.
+    """Compute error statistics of contacts that were estimated on several films.
 
     Args:
         contact: Estimated contacts (x, y, F), shape (n_film, n_press, 3), mm and N.
@@ -170,7 +170,7 @@ def _error_statistics(contact: Array, std: Array, truth: Array) -> Mapping[str, 
 
 
 def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command: str = "") -> Release:
-    """Write a model folder that contains a network for all films, `films.npz`, and the model of the assumed film.
+    """Write a model folder with the network for all films (`films.npz`) and the model of the assumed film.
 
     The errors are measured with the rounded weights that the file contains. Presses outside the working area are
     simulated on the assumed film. The metadata state the share of these presses to which the model gives a wrong answer
@@ -200,7 +200,7 @@ def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command:
 
 
 def _outside_presses(films: FilmsModel, parameters: Array) -> OutsidePresses | None:
-    """Simulate the part of one film outside the working area.
+    """Simulate the part of a film that lies outside the working area.
 
     Args:
         films: The network for all films, with the prior of the films and the working area.
@@ -216,7 +216,7 @@ def _outside_presses(films: FilmsModel, parameters: Array) -> OutsidePresses | N
 
 
 def films_card(films: FilmsModel, errors: FilmsErrors, about: ModelMetadata, fitted: Fitted) -> str:
-    """Return the text of the card, `card.md`, of a model that contains a network for all films.
+    """Return the text of `card.md` for a model that contains a network for all films.
 
     Args:
         films: The network for all films.

@@ -1,4 +1,4 @@
-"""Measurement of the errors of a network on presses that were not in its training."""
+"""Measurement of the errors of a network on presses that were not used in its training."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -56,27 +56,27 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
         presses.
     """
     if presses is None:
-        test = fitted.test
+        test_presses = fitted.test
     elif isinstance(presses, Dataset):
-        test = LabelledPresses.of(presses)
+        test_presses = LabelledPresses.of(presses)
     else:
-        test = presses
-    if not test.measured and isinstance(fitted.noise, NoiseModel):
-        return simulated_errors(fitted.predict, test, fitted.noise, seed)
+        test_presses = presses
+    if not test_presses.measured and isinstance(fitted.noise, NoiseModel):
+        return simulated_errors(fitted.predict, test_presses, fitted.noise, seed)
 
     # If a network was trained on its own test presses, the estimates of the cross-validation are used.
     if presses is None and fitted.cross_validated is not None:
         contact, std, _ = fitted.cross_validated
     else:
-        contact, std, _ = fitted.predict(test.charge)
-    all_errors = contact_errors(contact, std, test.contact)
+        contact, std, _ = fitted.predict(test_presses.charge)
+    all_errors = contact_errors(contact, std, test_presses.contact)
     errors = {name: error for name, error in all_errors.items() if name not in ONLY_SIMULATED}
-    errors[HELD_PRESSES] = float(len(test))
+    errors[HELD_PRESSES] = float(len(test_presses))
     return errors | _good_press_misfits(fitted, seed)
 
 
 def _good_press_misfits(fitted: Fitted, seed: int) -> dict[str, float]:
-    """Compute the misfits that only a few good presses exceed, for a network with errors on measured presses.
+    """Compute the misfits that only a few good presses exceed, for a network that is tested on measured presses.
 
     Noise is added to the charges of simulated good presses. For measured good presses, the misfits of the
     cross-validation are used. If there was no cross-validation, the misfits of the network are used.
@@ -176,7 +176,7 @@ def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel,
 
 
 def alarm_threshold(good_misfits: Array) -> float:
-    """Compute the threshold of the alarm, which the misfits of the fraction `FALSE_ALARM_RATE` of good presses exceed.
+    """Compute the misfit above which there is an alarm. The fraction `FALSE_ALARM_RATE` of good presses exceeds it.
 
     Args:
         good_misfits: Misfits of good presses, array of any shape.
@@ -185,9 +185,9 @@ def alarm_threshold(good_misfits: Array) -> float:
 
 
 def is_near_1_N(force: Array) -> Booleans:
-    """Return which forces, N, are close enough to 1 N for a measurement of the detection of faults."""
-    low, high = FORCES_NEAR_1_N
-    return np.asarray((force >= low) & (force <= high))
+    """Return whether each force, N, is close enough to 1 N for the measurement of the detection of faults."""
+    min_force, max_force = FORCES_NEAR_1_N
+    return np.asarray((force >= min_force) & (force <= max_force))
 
 
 def rounded(value: float | np.floating) -> float:
@@ -198,7 +198,7 @@ def rounded(value: float | np.floating) -> float:
 def _measure_detection(
     predict: Predict, presses: LabelledPresses, noise: NoiseModel, threshold: float, seed: int
 ) -> Mapping[str, float]:
-    """Compute the fractions of presses with a faulty electrode whose misfits exceed a threshold.
+    """Simulate a faulty electrode, and compute the fraction of presses whose misfits exceed a threshold.
 
     Args:
         predict: Function that computes the answers of the network.
@@ -212,13 +212,13 @@ def _measure_detection(
     """
     if not len(presses):  # for example, if no force is near 1 N
         return {}
-    charge = presses.noisy(noise, seed)
-    n_electrode = charge.shape[1]
+    noisy_charge = presses.noisy(noise, seed)
+    n_electrode = noisy_charge.shape[1]
 
     def detected_fraction(wrong_gain: float) -> float:
         """Return the fraction of presses that cause an alarm if one electrode has a wrong gain.
 
-        Each electrode is given the wrong gain in turn, and the mean of the fractions is returned.
+        Each electrode has the wrong gain in turn, and the result is the mean over the electrodes.
 
         Args:
             wrong_gain: Gain of the faulty electrode, relative to the true gain; 0 for a dead electrode.
@@ -227,7 +227,7 @@ def _measure_detection(
         for electrode_index in range(n_electrode):
             gains = np.ones(n_electrode)
             gains[electrode_index] = wrong_gain
-            faulty_charges.append(charge * gains)
+            faulty_charges.append(noisy_charge * gains)
         _, _, misfit = predict(np.concatenate(faulty_charges))
         return float(np.mean(misfit > threshold))
 

@@ -67,7 +67,7 @@ def check_graph(
     noise: Noise,
     floors: Sequence[float] = FLOORS["contact"],
 ) -> Singles:
-    """Compare a graph with the network from which it was written.
+    """Compare a graph with its network, and choose charges for the golden vectors.
 
     The outputs are compared for noisy charges of presses and, with larger tolerances, for extreme charges.
 
@@ -85,25 +85,28 @@ def check_graph(
         TrainingError: If an output is not finite, or the graph and the network disagree.
     """
     session = open_session(graph, "the exported graph")
-    ordinary, extreme = _choose_golden_charges(compute_exact, presses, noise)
+    ordinary_charge, extreme_charge = _choose_golden_charges(compute_exact, presses, noise)
     _check_finite_outputs(session, n_electrode=presses.charge.shape[1])
-    _compare(session, compute_exact, extreme, floors, tolerance_factor=EXTREME_FACTOR)
+    _compare(session, compute_exact, extreme_charge, floors, tolerance_factor=EXTREME_FACTOR)
 
     # After the last press, the first press follows again.
     repeated_rows = np.arange(N_COMPARED) % len(presses)
-    noisy = presses[repeated_rows].noisy(noise, seed=3).astype(np.float32)
-    _compare(session, compute_exact, noisy, floors, tolerance_factor=1.0)
-    return np.concatenate([ordinary, extreme])
+    noisy_charge = presses[repeated_rows].noisy(noise, seed=3).astype(np.float32)
+    _compare(session, compute_exact, noisy_charge, floors, tolerance_factor=1.0)
+    return np.concatenate([ordinary_charge, extreme_charge])
 
 
 def _choose_golden_charges(
     compute_exact: OutputFunction, presses: LabelledPresses, noise: Noise
 ) -> tuple[Singles, Singles]:
-    """Choose charges for the golden vectors: three quarters from presses, and one quarter of extreme charges.
+    """Choose charges for the golden vectors.
 
-    Only the half of the presses with the smaller standard deviations of the position is used. At the other presses, a
-    small change of a charge may move the estimated position by millimetres. The rounding of float32 numbers could then
-    cause differences between runtimes that exceed the tolerance of the golden vectors.
+    Three quarters are charges of presses, and one quarter are extreme charges.
+
+    Presses are only used if the standard deviation of their position is at most the median of all presses. For presses
+    with larger standard deviations, a small change of a charge may move the estimated position by millimetres. The
+    rounding of float32 numbers could then cause differences between runtimes that exceed the tolerance of the golden
+    vectors.
 
     Args:
         compute_exact: Function that computes the outputs of the network in double precision.
@@ -115,17 +118,17 @@ def _choose_golden_charges(
     """
     _, std, *_ = compute_exact(presses.charge)
     position_std = std[:, 0] + std[:, 1]  # a measure of the uncertainty of x and y
-    well_determined = presses[np.flatnonzero(position_std <= np.median(position_std))]
+    well_determined_presses = presses[np.flatnonzero(position_std <= np.median(position_std))]
 
     # Half of the golden vectors are presses without noise. A quarter are every second of these presses, with noise.
-    chosen_rows = np.linspace(0, len(well_determined) - 1, N_GOLDEN // 2).astype(int)
-    chosen = well_determined[chosen_rows]
-    every_second = chosen[np.arange(0, len(chosen), 2)]
-    press_charge = np.concatenate([chosen.charge, every_second.noisy(noise, seed=2)])
+    chosen_rows = np.linspace(0, len(well_determined_presses) - 1, N_GOLDEN // 2).astype(int)
+    chosen_presses = well_determined_presses[chosen_rows]
+    second_presses = chosen_presses[np.arange(0, len(chosen_presses), 2)]
+    press_charge = np.concatenate([chosen_presses.charge, second_presses.noisy(noise, seed=2)])
 
     # The last quarter has charges of presses times factors from 0.001 to 1000, zero charges and negative charges.
-    factor = np.geomspace(1e-3, 1e3, len(every_second))
-    extreme_charge = every_second.charge * factor[:, None]  # one factor for all charges of a press
+    factor = np.geomspace(1e-3, 1e3, len(second_presses))
+    extreme_charge = second_presses.charge * factor[:, None]  # one factor for all charges of a press
     extreme_charge[0] = 0.0
     extreme_charge[1] = -extreme_charge[1]
     return press_charge.astype(np.float32), extreme_charge.astype(np.float32)
@@ -134,7 +137,7 @@ def _choose_golden_charges(
 def _check_finite_outputs(session: ort.InferenceSession, n_electrode: int) -> None:
     """Check that all outputs are finite for random combinations of `EXTREME_CHARGES_pC`.
 
-    The network was not trained with such charges, so it extrapolates.
+    The network was not trained with such charges, so its outputs are extrapolations.
 
     Args:
         session: The exported graph.
@@ -187,13 +190,14 @@ def _compare(
         divisor = np.maximum(np.abs(expected), smallest_divisor)
         relative_difference = np.abs(expected - graph_output) / divisor  # shape (n, number of columns)
         press_difference = relative_difference.max(axis=1)
-        quantile = float(np.quantile(press_difference, QUANTILE))
-        largest = float(press_difference.max())
+        quantile_difference = float(np.quantile(press_difference, QUANTILE))
+        largest_difference = float(press_difference.max())
         quantile_tolerance = tolerance_factor * TOLERANCES[name]
         tolerance = EXTREME_FACTOR * TOLERANCES[name]
-        agrees = quantile <= quantile_tolerance and largest <= tolerance
+        agrees = quantile_difference <= quantile_tolerance and largest_difference <= tolerance
         if not agrees:
             raise TrainingError(
                 f"the exported graph disagrees with the network on {name}: expected at most {quantile_tolerance:g} for "
-                f"{QUANTILE:.1%} of the charges and {tolerance:g} for all, got {quantile:.3g} and {largest:.3g}"
+                f"{QUANTILE:.1%} of the charges and {tolerance:g} for all, got {quantile_difference:.3g} and "
+                f"{largest_difference:.3g}"
             )

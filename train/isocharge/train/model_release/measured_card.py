@@ -1,4 +1,4 @@
-"""Card of a model that was trained on measured presses alone, and card section with errors on measured presses."""
+"""Card of a model that was trained on measured presses alone, and the section of a card about measured errors."""
 
 from collections.abc import Mapping
 
@@ -9,7 +9,7 @@ from isocharge.train.model_release.evaluate import HELD_PRESSES
 
 
 def measured_errors_section(errors: Mapping[str, float], heading_end: str, explanation: str) -> str:
-    """Return the section of a card with the errors on measured presses.
+    """Return the section of a card that lists the errors on measured presses.
 
     Args:
         errors: Errors of the model by name.

@@ -38,7 +38,7 @@ IR_VERSION = 8
 
 @dataclass
 class GraphBuilder:
-    """Nodes and constants of a graph in the order in which they are added."""
+    """Builder of a graph, which collects nodes and constants in the order in which they are added."""
 
     nodes: list[onnx.NodeProto] = field(default_factory=list)
     constants: list[onnx.TensorProto] = field(default_factory=list)
@@ -57,7 +57,7 @@ class GraphBuilder:
         return result_name
 
     def add_many(self, operator: str, *inputs: str, to: tuple[str, ...], **attributes: Any) -> tuple[str, ...]:
-        """Add a node with several results, whose names are given by `to`, and return these names."""
+        """Add a node with several results, and return the names of the results, which are those in `to`."""
         self.nodes.append(helper.make_node(operator, list(inputs), list(to), **attributes))
         return to
 
@@ -68,7 +68,12 @@ class GraphBuilder:
         return name
 
     def split(self, data: str, widths: Mapping[str, int]) -> tuple[str, ...]:
-        """Add a node that splits the columns of a tensor into results with the given names and widths."""
+        """Add a node that splits the columns of a tensor into parts, and return the names of the parts.
+
+        Args:
+            data: Name of the tensor.
+            widths: Number of columns of each part, by the name of the part.
+        """
         sizes = self.constant(tuple(widths.values()), np.int64)
         return self.add_many("Split", data, sizes, to=tuple(widths), axis=1)
 
@@ -91,7 +96,7 @@ def write_graph(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
 
 
 def write_contact_graph(network: FoldedNetwork) -> bytes:
-    """Write a network whose only answers are x, y and ln F as an ONNX file.
+    """Write an ONNX file of a network whose only answers are x, y and ln F.
 
     Args:
         network: The network.
@@ -99,12 +104,12 @@ def write_contact_graph(network: FoldedNetwork) -> bytes:
     Returns:
         The ONNX file, with the input `charge_pC` [n, n_electrode] and the output `contact` [n, 3], both float32.
     """
-    build = GraphBuilder()
-    answers = _add_answers(build, network)
-    position, log_force = build.split(answers, {"plane": 2, "log_force": 1})
-    force = build.add("Exp", log_force)
-    build.add("Concat", position, force, to="contact", axis=1)
-    model = _make_model(build, "contact", network.features.n_electrode, {"contact": 3})
+    builder = GraphBuilder()
+    answers = _add_answers(builder, network)
+    position, log_force = builder.split(answers, {"plane": 2, "log_force": 1})
+    force = builder.add("Exp", log_force)
+    builder.add("Concat", position, force, to="contact", axis=1)
+    model = _make_model(builder, "contact", network.features.n_electrode, {"contact": 3})
     return bytes(model.SerializeToString())
 
 
@@ -112,41 +117,41 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     """Return the ONNX model of a network, without metadata.
 
     The nodes after the perceptron convert its answers into the outputs: the contact, its standard deviations, the
-    correlations if the network has them, and the misfit. In this function, tensors are represented by their names.
+    correlations if the network has them, and the misfit. The variables of this function contain the names of tensors.
 
     Args:
         network: The network.
     """
-    build = GraphBuilder()
+    builder = GraphBuilder()
     n_electrode = network.features.n_electrode
     widths = {"plane": POSITION.stop, "logs": LOG_STD.stop - POSITION.stop}
     if network.n_angle:
         widths["angles"] = network.n_angle
     widths["misfit_vector"] = n_electrode
-    answers = _add_answers(build, network)
-    position, logarithms, *optional_angles, misfit_vector = build.split(answers, widths)
+    answers = _add_answers(builder, network)
+    position, logarithms, *optional_angles, misfit_vector = builder.split(answers, widths)
 
     # The second part, `contact_std`, is an output of the graph, so it needs no further node.
-    force, _ = build.split(build.add("Exp", logarithms), {"force": 1, "contact_std": 3})
-    build.add("Concat", position, force, to="contact", axis=1)
+    force, _ = builder.split(builder.add("Exp", logarithms), {"force": 1, "contact_std": 3})
+    builder.add("Concat", position, force, to="contact", axis=1)
     for angles in optional_angles:  # one tensor, or none if the network has no correlations
-        cosines = build.add("Cos", angles)
-        build.add("MatMul", cosines, build.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
+        cosines = builder.add("Cos", angles)
+        builder.add("MatMul", cosines, builder.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
     # The length of the misfit vector is asinh(misfit / MISFIT_UNIT).
-    compressed_misfit = build.add("ReduceL2", misfit_vector, axes=[1], keepdims=1)
-    build.add("Mul", build.add("Sinh", compressed_misfit), build.constant(MISFIT_UNIT), to="misfit")
+    compressed_misfit = builder.add("ReduceL2", misfit_vector, axes=[1], keepdims=1)
+    builder.add("Mul", builder.add("Sinh", compressed_misfit), builder.constant(MISFIT_UNIT), to="misfit")
 
     outputs = {name: width for name, width in OUTPUTS.items() if network.n_angle or name != CORRELATION}
-    return _make_model(build, "isocharge", n_electrode, outputs, producer_name="isocharge")
+    return _make_model(builder, "isocharge", n_electrode, outputs, producer_name="isocharge")
 
 
-def _add_answers(build: GraphBuilder, network: FoldedNetwork) -> str:
-    """Add the nodes of the features and of the perceptron of a network, and return the name of the answers."""
-    features = _add_features(build, network.features)
-    return _add_perceptron(build, features, network.layers)
+def _add_answers(builder: GraphBuilder, network: FoldedNetwork) -> str:
+    """Add nodes that compute the features and the perceptron of a network, and return the name of its answers."""
+    features = _add_features(builder, network.features)
+    return _add_perceptron(builder, features, network.layers)
 
 
-def _add_features(build: GraphBuilder, features: ChargeFeatures) -> str:
+def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
     """Add nodes that compute the input features of the charges.
 
     The charges Q are limited first. The features are ln(Q / typical charge), or asinh(Q / typical charge) - mean if
@@ -154,7 +159,7 @@ def _add_features(build: GraphBuilder, features: ChargeFeatures) -> str:
     `Max` and `Min` replace the operator `Clip`, which has the same limits for all electrodes.
 
     Args:
-        build: Builder of the graph.
+        builder: Builder of the graph.
         features: Limits, typical charges and means of the features.
 
     Returns:
@@ -162,44 +167,44 @@ def _add_features(build: GraphBuilder, features: ChargeFeatures) -> str:
     """
     inverse_typical = 1.0 / features.typical_pC
     if features.mean is None:
-        clipped = build.add("Clip", INPUT, build.constant(features.low_pC), build.constant(features.high_pC))
-        ratio = build.add("Mul", clipped, build.constant(inverse_typical))
-        return build.add("Log", ratio)
-    not_below = build.add("Max", INPUT, build.constant(features.low_pC))
-    clipped = build.add("Min", not_below, build.constant(features.high_pC))
-    ratio = build.add("Mul", clipped, build.constant(inverse_typical))
-    return build.add("Sub", build.add("Asinh", ratio), build.constant(features.mean))
+        clipped = builder.add("Clip", INPUT, builder.constant(features.low_pC), builder.constant(features.high_pC))
+        ratio = builder.add("Mul", clipped, builder.constant(inverse_typical))
+        return builder.add("Log", ratio)
+    not_below = builder.add("Max", INPUT, builder.constant(features.low_pC))
+    clipped = builder.add("Min", not_below, builder.constant(features.high_pC))
+    ratio = builder.add("Mul", clipped, builder.constant(inverse_typical))
+    return builder.add("Sub", builder.add("Asinh", ratio), builder.constant(features.mean))
 
 
-def _add_perceptron(build: GraphBuilder, inputs: str, perceptron: Perceptron[Array]) -> str:
+def _add_perceptron(builder: GraphBuilder, inputs: str, perceptron: Perceptron[Array]) -> str:
     """Add nodes that evaluate a perceptron with hidden layers and a skip layer.
 
     The operator `Gemm` computes inputs @ weights + bias.
 
     Args:
-        build: Builder of the graph.
+        builder: Builder of the graph.
         inputs: Name of the tensor with the inputs.
         perceptron: Weights and biases of the layers, and the activation.
 
     Returns:
         Name of the tensor with the outputs.
     """
-    hidden = inputs
+    hidden_outputs = inputs
     for layer in perceptron.hidden:
-        linear = build.add("Gemm", hidden, build.constant(layer.weight), build.constant(layer.bias))
-        hidden = build.add(perceptron.activation.onnx_operator, linear)
+        linear = builder.add("Gemm", hidden_outputs, builder.constant(layer.weight), builder.constant(layer.bias))
+        hidden_outputs = builder.add(perceptron.activation.onnx_operator, linear)
     output_layer = perceptron.last
-    skip_and_bias = build.add("Gemm", inputs, build.constant(perceptron.skip), build.constant(output_layer.bias))
-    return build.add("Gemm", hidden, build.constant(output_layer.weight), skip_and_bias)
+    skip_and_bias = builder.add("Gemm", inputs, builder.constant(perceptron.skip), builder.constant(output_layer.bias))
+    return builder.add("Gemm", hidden_outputs, builder.constant(output_layer.weight), skip_and_bias)
 
 
 def _make_model(
-    build: GraphBuilder, name: str, n_electrode: int, outputs: Mapping[str, int], **attributes: Any
+    builder: GraphBuilder, name: str, n_electrode: int, outputs: Mapping[str, int], **attributes: Any
 ) -> onnx.ModelProto:
     """Return a model with the input `charge_pC` [n, n_electrode] and outputs [n, width], all float32.
 
     Args:
-        build: Builder with the nodes and constants of the graph.
+        builder: Builder with the nodes and constants of the graph.
         name: Name of the graph.
         n_electrode: Number of charges.
         outputs: Width of each output by its name.
@@ -216,7 +221,7 @@ def _make_model(
             helper.make_tensor_value_info(tensor, TensorProto.FLOAT, ["n", width]) for tensor, width in widths.items()
         ]
 
-    graph = helper.make_graph(build.nodes, name, declare({INPUT: n_electrode}), declare(outputs), build.constants)
+    graph = helper.make_graph(builder.nodes, name, declare({INPUT: n_electrode}), declare(outputs), builder.constants)
     opset = helper.make_opsetid("", OPSET)
     return helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, **attributes)
 
@@ -287,7 +292,7 @@ def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
 
 
 def _activation_of(operators: Sequence[str], where: str) -> Activation:
-    """Return the activation of the hidden layers, read from the node after the first linear layer.
+    """Return the activation of the hidden layers, which is the operator after the first linear layer.
 
     Args:
         operators: Operators of the nodes, in order.
@@ -321,7 +326,7 @@ def _constants_in_order(graph: onnx.GraphProto, where: str) -> Iterator[Array]:
 
 
 def _take_features(constants: Iterator[Array], *, is_signed: bool) -> ChargeFeatures:
-    """Take the constants of the features, which are the first constants of a graph, and return the features.
+    """Read the features from the first constants of a graph.
 
     Args:
         constants: Iterator over the constants, which is advanced.
@@ -389,7 +394,7 @@ def _check_feature_shapes(features: ChargeFeatures, where: str) -> None:
 
 @dataclass(frozen=True)
 class _PlainNode:
-    """Description of a node that does not depend on arbitrary names.
+    """Description of a node without the arbitrary names of its tensors.
 
     Two descriptions are equal if their nodes compute the same results from the same inputs.
 
@@ -413,10 +418,10 @@ class _PlainNode:
 
 
 def _plain_nodes(graph: onnx.GraphProto) -> Iterator[_PlainNode]:
-    """Yield descriptions of the nodes of a graph, which can be compared with those of another graph.
+    """Yield a description of each node of a graph, for a comparison with another graph.
 
     The names of the tensors inside a graph are arbitrary. The name of a tensor is replaced by the number of the node
-    that computes it, and the name of a constant is replaced by the values of the constant.
+    that computes the tensor. The name of a constant is replaced by the values of the constant.
 
     Args:
         graph: The graph.

@@ -93,7 +93,7 @@ HUB_METRICS = {
 
 
 def hub_block(metadata: ModelMetadata) -> str:
-    """Return the block of YAML at the beginning of a card, which model hubs read.
+    """Return the YAML block at the beginning of a card. Model hubs read this block.
 
     The block states the kind of the model and its measured errors.
 
@@ -166,7 +166,7 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
 
 
 def yield_text(metadata: ModelMetadata) -> str:
-    """Return the text about yielding for the row of the forces in a card.
+    """Return a text about the force at which the film yields, for the row of the forces in a card.
 
     The text is empty if the film does not yield within the range of forces.
     """
@@ -179,7 +179,7 @@ def yield_text(metadata: ModelMetadata) -> str:
 
 
 def _interface_section(metadata: ModelMetadata, fitted: Fitted) -> str:
-    """Return the section of the card with the inputs, the outputs and the ranges of validity.
+    """Return the section of the card that states the inputs, the outputs and the ranges of validity.
 
     Args:
         metadata: Metadata of the model.
@@ -213,7 +213,7 @@ Estimates the position and the force of one press from the touch charges of the 
 
 
 def _errors_section(errors: Mapping[str, float], n_press: int) -> str:
-    """Return the section of the card with the errors on simulated presses."""
+    """Return the section of the card that lists the errors on simulated presses."""
     return f"""## Errors on {n_press} presses that were not used in the training
 
 The forces are log-uniform, and the positions are uniform over the working area.
@@ -378,9 +378,9 @@ def _yield_force(fitted: Fitted) -> float | None:
 
 
 def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
-    """Return the corners (x, y), mm, of the smallest regular polygon with `N_CORNERS` corners around a disk.
+    """Return the corners (x, y), mm, of a regular polygon around a disk.
 
-    The centre of the disk is the origin.
+    The polygon has `N_CORNERS` corners, and its sides touch the disk. The centre of the disk is the origin.
 
     Args:
         radius: Radius of the disk, mm.
@@ -392,11 +392,11 @@ def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
 
 
 def model_domain(about: ModelMetadata) -> Domain:
-    """Return the domain of the contacts for which a model was trained, which is read from its metadata.
+    """Read from the metadata of a model the domain of the contacts for which it was trained.
 
-    In models of simulated presses, the working area is the polygon of a disk about the origin. For such a polygon, the
-    domain is the largest disk in the polygon, with a radius rounded to 0.001 mm. For every other working area, the
-    domain is a `PressedArea` with the same corners.
+    In a model of simulated presses, the working area is a polygon around a disk, whose centre is the origin. For such a
+    polygon, the domain is the largest disk in the polygon, with a radius rounded to 0.001 mm. For every other working
+    area, the domain is a `PressedArea` with the same corners.
 
     Args:
         about: Metadata of the model.

@@ -1,9 +1,9 @@
 """Training data and settings of a student, which is a small network that learns the answers of a model.
 
-A student has the inputs and outputs of the model and about 5,000 weights and biases, so it fits into the flash memory
-of a microcontroller. The student learns the contacts and standard deviations that the model estimates. The misfit of
-the student is not learned from the model, but from exact distances of charges, on which the misfit of the model was
-trained, too.
+A student has the same inputs and outputs as the model. It has only about 5,000 weights and biases, so it fits into the
+flash memory of a microcontroller. The student learns the contacts and standard deviations that the model estimates. The
+student does not learn its misfit from the model. Like the model, it learns the misfit from exact distances between
+charges.
 """
 
 from dataclasses import dataclass, replace
@@ -40,7 +40,8 @@ def student_config(weights: Literal["float32", "int8"] = "float32") -> FitConfig
 class StudentCase:
     """Sensor, probes and contacts of a model.
 
-    With these values, presses can be simulated that have the same distribution as in the training of the model.
+    These values determine the distribution of the presses in the training of the model. More presses with this
+    distribution can therefore be simulated.
 
     Attributes:
         sensor: Sensor of the model.
@@ -54,7 +55,7 @@ class StudentCase:
 
     @classmethod
     def of(cls, about: ModelMetadata) -> "StudentCase":
-        """Return the case of a model from its metadata.
+        """Read the sensor, the probes and the contacts of a model from its metadata.
 
         Raises:
             ModelError: If the model was trained on measured presses, which cannot be simulated.
@@ -69,7 +70,7 @@ class StudentCase:
 
 
 def student_data(model: Path, dataset: Dataset) -> TrainingData:
-    """Return the training data of a student, which are presses and the answers of a model to their charges.
+    """Return the training data of a student: presses, and the answers of a model to the charges of the presses.
 
     Args:
         model: Version folder of the model.
@@ -87,7 +88,7 @@ def student_data(model: Path, dataset: Dataset) -> TrainingData:
         )
 
     def estimate(charge: Array) -> tuple[Array, Array]:
-        """Return the contacts (x, y, F) that the model estimates and their standard deviations, (n, 3), mm and N."""
+        """Return estimated contacts (x, y, F) and their standard deviations, both of shape (n, 3), mm and N."""
         answers = predictor.predict_batch(charge)
         contact = np.stack([answers.x_mm, answers.y_mm, answers.force_N], axis=1)
         std = np.stack([answers.x_std_mm, answers.y_std_mm, answers.force_std_N], axis=1)

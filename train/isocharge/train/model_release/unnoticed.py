@@ -1,4 +1,4 @@
-"""Measurement of the share of presses outside the working area to which a model gives a wrong answer without a flag."""
+"""Measurement of the share of wrong answers without a flag, for presses outside the working area of a model."""
 
 import math
 from collections.abc import Iterator
@@ -53,7 +53,9 @@ def unnoticed_presses(fitted: Fitted, about: ModelMetadata) -> UnnoticedPresses 
 
 
 def is_flagged(about: ModelMetadata, contact: Array, std: Array, misfit: Array) -> Booleans:
-    """Return which answers carry a flag other than `stress`. The flag `stress` does not mean that an answer is wrong.
+    """Return whether each answer carries a flag other than `stress`.
+
+    The flag `stress` does not mean that an answer is wrong.
 
     Args:
         about: Metadata of the model.
@@ -74,7 +76,7 @@ def unnoticed_section(unnoticed: UnnoticedPresses | None) -> str:
     """Return the section of a card about presses outside the working area.
 
     The shares of wrong answers without a flag are listed by the distance from the centre, unless the total share is
-    very small. The table has at most `MAX_CARD_ROWS` rows, because neighbouring rings are joined. The section is empty
+    very small. Neighbouring rings are joined, so that the table has at most `MAX_CARD_ROWS` rows. The section is empty
     if the shares were not measured.
 
     Args:
@@ -93,7 +95,7 @@ def unnoticed_section(unnoticed: UnnoticedPresses | None) -> str:
 
 
 def _ring_rows(unnoticed: UnnoticedPresses) -> Iterator[str]:
-    """Yield the rows of the table in a card, each with a range of distances and the share of the rings in this range.
+    """Yield the rows of the table in a card. Each row states a range of distances and the share in this range.
 
     Args:
         unnoticed: Shares of the presses to which the model gives a wrong answer without a flag.

@@ -1,4 +1,4 @@
-"""Report that compares the speed and the error of methods, which are all tested on the same presses.
+"""Report that compares methods by speed and error. All methods are tested on the same presses.
 
 Example:
     The function `write_report` needs datasets, each with the folder of the released model of its sensor.

@@ -1,4 +1,4 @@
-"""Writer of a report, which evaluates each dataset, and writes the JSON record, the pictures and the page.
+"""Evaluation of all datasets of a report, and writer of its JSON record, its pictures and its page.
 
 The folder of the report appears when the report is complete. A stopped report keeps its completed solves and limits,
 and the same call of `write_report` continues the report.
@@ -88,7 +88,7 @@ def write_report(
 
 
 def _file_stems(sensor_names: Sequence[str]) -> list[str]:
-    """Return, for each dataset, the text with which the file names of its pictures begin.
+    """For each dataset, return the text with which the file names of its pictures begin.
 
     The text is the name of the sensor. If several datasets have the same sensor, the number of the dataset, counted
     from 1, is appended to the name.

@@ -105,7 +105,7 @@ TEST_PRESSES_SEED = 7919
 
 @dataclass(frozen=True)
 class EvaluationCase:
-    """Conditions under which all methods are evaluated, which are those of a dataset.
+    """Conditions of a dataset, under which all methods are evaluated.
 
     Attributes:
         sensor: The sensor of the dataset.
@@ -143,7 +143,7 @@ class EvaluationCase:
         return cls(dataset.sensor, probes, domain_of(dataset), is_rotated, noise, seed, press_count)
 
     def test_sweep(self, range_factor: float = 1.0) -> Sweep:
-        """Return the sweep of the test presses, which are distributed as in the dataset, but drawn with another seed.
+        """Return the sweep of the test presses, which have the distribution of the dataset but another seed.
 
         Args:
             range_factor: Factor by which the largest distance and the largest force are multiplied, and by which the
@@ -177,10 +177,10 @@ class EvaluationCase:
 
 
 def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
-    """Return the probes of a dataset, and whether the presses of a probe have several orientations.
+    """Return the probes of a dataset, and whether any of the probes pressed in several orientations.
 
-    If a probe pressed at a single angle, it is returned with this rotation. The angles of an axisymmetric probe are
-    ignored, because they have no effect.
+    If all presses of a probe have the same angle, the probe is returned with this rotation. The angles of an
+    axisymmetric probe are ignored, because they have no effect.
 
     Args:
         samples: The presses of the dataset, each with the notation of its probe and its orientation.
@@ -253,18 +253,18 @@ class ErrorBounds:
         cls,
         case: EvaluationCase,
         charge_map: ChargeSpline,
-        clean: LabelledPresses,
+        clean_presses: LabelledPresses,
         noisy_charge: Array,
         executor: Executor | None = None,
     ) -> "ErrorBounds":
-        """Compute the Cramér-Rao limit of all presses and the Bayes limit of the presses with noise.
+        """Compute the Cramér-Rao limit for all test presses, and the Bayes limit for the first test presses.
 
         The Bayes limit is left out if the case has several probes or several orientations of a probe.
 
         Args:
             case: The case, with sensor, probes, working area, forces and noise.
             charge_map: Charges of the first probe of the case, over exactly the contacts of the case.
-            clean: The test presses without noise.
+            clean_presses: The test presses without noise.
             noisy_charge: Charges of the first m test presses with noise, for the Bayes limit, shape (m, n_electrode),
                 pC.
             executor: Executor of the integrals of the Bayes limit; None to compute them in this process.
@@ -272,7 +272,7 @@ class ErrorBounds:
         Returns:
             Cramér-Rao limits of all presses, and posterior means of the first m presses.
         """
-        cramer_rao = limits_at(charge_map, clean.contact, case.noise)
+        cramer_rao = limits_at(charge_map, clean_presses.contact, case.noise)
         if len(case.probes) > 1 or case.is_rotated:
             return cls(None, cramer_rao)
         problem = BayesProblem(case.sensor, case.probes[0], case.domain.radius, case.domain.force_range, case.noise)

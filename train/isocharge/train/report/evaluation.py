@@ -85,7 +85,7 @@ class Section:
 
 @dataclass(frozen=True)
 class DatasetEvaluation:
-    """Dataset that is prepared for the evaluation of its released model and of all other methods.
+    """Prepared evaluation of a released model and of all other methods on one dataset.
 
     Attributes:
         dataset: The presses for fitting and validation.
@@ -109,7 +109,7 @@ class DatasetEvaluation:
     def prepare(
         cls, dataset: Dataset, model_folder: Path, students: Sequence[Path], settings: Settings
     ) -> "DatasetEvaluation":
-        """Select the presses of a dataset on which the released model can be evaluated, and split them into parts.
+        """Select the presses on which the released model can be evaluated, and split them for fits and tests.
 
         Args:
             dataset: The dataset.
@@ -150,7 +150,7 @@ class DatasetEvaluation:
         return cls(fitting_dataset, ReleasedModel(model_folder), own_students, task, case, settings, held_out_presses)
 
     def identity(self) -> dict[str, Any]:
-        """Return the checksum of the dataset and the folders of the models, by which a stopped report is recognised."""
+        """Return the checksum of the dataset and the folders of the models. Together they identify a stopped report."""
         folders = [self.released.folder, *self.students]
         return {"dataset_sha256": self.dataset.sha256, "models": [str(folder) for folder in folders]}
 
@@ -176,7 +176,7 @@ class DatasetEvaluation:
         return Section(section.content, drawings)
 
     def _measure_on_simulated_presses(self, executor: Executor) -> Section:
-        """Return the section of a simulated dataset, whose test presses are simulated.
+        """Simulate test presses, evaluate all methods on them, and return the section of a simulated dataset.
 
         The test presses are simulated first, and the theoretical limits of the error are computed for these presses.
         All methods are then fitted and measured. Finally, the released model is studied under several noise draws and
@@ -190,32 +190,32 @@ class DatasetEvaluation:
         forward_maps = case.forward_maps(range_factor=1.0, accuracy=settings.accuracy, executor=executor)
         # The test presses come from other solves than the limits, except in a quick report.
         test_maps = self._test_maps(forward_maps, executor)
-        clean = simulate_presses(test_maps, case.test_sweep())
-        noisy_charge = clean.noisy(case.noise, case.seed + TEST_NOISE_SEED)
-        test = replace(clean, charge=noisy_charge)
+        clean_presses = simulate_presses(test_maps, case.test_sweep())
+        noisy_charge = clean_presses.noisy(case.noise, case.seed + TEST_NOISE_SEED)
+        test_presses = replace(clean_presses, charge=noisy_charge)
 
         charge_map = ChargeSpline.of(forward_maps[0])
-        limits = ErrorBounds.of(case, charge_map, clean, noisy_charge[: settings.limited], executor)
+        limits = ErrorBounds.of(case, charge_map, clean_presses, noisy_charge[: settings.limited], executor)
 
         methods = [*self._released_models(), *compared_methods(self.task, charge_map), *self._new_networks()]
         # On simulated presses a method that cannot be fitted raises an error, so there are no reasons to report.
-        fitted_methods, _ = fit_all(methods, self.task, test)
+        fitted_methods, _ = fit_all(methods, self.task, test_presses)
         fitted_by_name = {fitted.method.name: fitted for fitted in fitted_methods}
-        records = measure_methods(fitted_methods, test, settings, limits.posterior_mean)
+        records = measure_methods(fitted_methods, test_presses, settings, limits.posterior_mean)
 
-        draws = studies.NoiseDraws.of(self.released, clean, case, settings.draws)
-        threshold = alarm_threshold(draws.misfit)
+        noise_draws = studies.NoiseDraws.of(self.released, clean_presses, case, settings.draws)
+        threshold = alarm_threshold(noise_draws.misfit)
         content = {
-            **self._description(len(test)),
-            "limits": limits.to_dict(test.contact),
+            **self._description(len(test_presses)),
+            "limits": limits.to_dict(test_presses.contact),
             "methods": records,
             "verdict": compare_with_released(records),
-            "by_force": self._errors_by_force(fitted_by_name, limits, test),
-            "calibration": studies.coverage_by_level(draws),
+            "by_force": self._errors_by_force(fitted_by_name, limits, test_presses),
+            "calibration": studies.coverage_by_level(noise_draws),
             "alarm_threshold": round_significant(threshold),
-            "cases": self._mismatch_results(fitted_by_name, clean, threshold, executor),
+            "cases": self._mismatch_results(fitted_by_name, clean_presses, threshold, executor),
         }
-        return Section(content, _study_drawings(content, case, draws))
+        return Section(content, _study_drawings(content, case, noise_draws))
 
     def _test_maps(self, forward_maps: tuple[ForwardMap, ...], executor: Executor) -> tuple[ForwardMap, ...]:
         """Return the forward maps from which the charges of the test presses are computed.
@@ -234,7 +234,7 @@ class DatasetEvaluation:
     def _errors_by_force(
         self, fitted_by_name: Mapping[str, FittedMethod], limits: ErrorBounds, test: LabelledPresses
     ) -> dict[str, Any]:
-        """Compute the position errors in bins of the force, for the theoretical limits and for some methods.
+        """For the theoretical limits and for some methods, compute the position error in each bin of the force.
 
         The methods are the released model and the methods of `STUDIED_METHODS`. The Bayes limit is left out if it was
         not computed.
@@ -257,7 +257,7 @@ class DatasetEvaluation:
     def _mismatch_results(
         self,
         fitted_by_name: Mapping[str, FittedMethod],
-        clean: LabelledPresses,
+        clean_presses: LabelledPresses,
         threshold: float,
         executor: Executor,
     ) -> list[dict[str, Any]]:
@@ -265,7 +265,7 @@ class DatasetEvaluation:
 
         Args:
             fitted_by_name: Fitted methods by name.
-            clean: The test presses without noise.
+            clean_presses: The test presses without noise.
             threshold: Misfit above which the released model gives an alarm, in standard deviations of the noise.
             executor: Executor of the solves.
 
@@ -275,11 +275,13 @@ class DatasetEvaluation:
         methods = [fitted_by_name[name].method for name in STUDIED_METHODS]
         return [
             studies.measure_mismatch(mismatch, RELEASED, self.released, methods, threshold)
-            for mismatch in studies.mismatches(self.case, clean, self.settings, executor)
+            for mismatch in studies.mismatches(self.case, clean_presses, self.settings, executor)
         ]
 
     def _measure_on_measured_presses(self, test: LabelledPresses) -> Section:
-        """Return the section of a measured dataset, which contains no results that need a simulation of the film.
+        """Evaluate all methods on measured presses, and return the section of the dataset.
+
+        The section contains no results that need a simulation of the film.
 
         Args:
             test: The held-out presses.
@@ -297,7 +299,7 @@ class DatasetEvaluation:
         return Section(content, {})
 
     def _released_models(self) -> list[ComparedMethod]:
-        """Return the released model and then its students, which are not fitted again.
+        """Return the released model and its students. None of them is fitted again.
 
         Each model is listed twice: with all outputs, and reduced to the contact.
         """
@@ -320,7 +322,7 @@ class DatasetEvaluation:
         return methods
 
     def _new_networks(self) -> list[ComparedMethod]:
-        """Return networks that are trained for the comparison, one for each size in the settings."""
+        """Return one untrained network for each size in the settings."""
         case = self.case
         steps = self.settings.steps
         data = TrainingData(

@@ -2,7 +2,7 @@
 
 Each method has one error, which is the root-mean-square position error. Each method has three costs: the time of one
 prediction, the throughput of batches, and the memory. A method is on the Pareto front of a cost unless another method
-is better in one of error and cost, and at least as good in the other.
+is at least as good in both error and cost, and better in one of them.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ def round_significant(value: float | None, digits: int = 4) -> float | None:
 class ContactErrors:
     """Errors of estimated contacts over the presses for which a method returned an estimate.
 
-    A number is None if the method returned no estimate for any press. The names of the attributes are keys of
+    All errors are None if the method returned no estimate for any press. The names of the attributes are keys of
     `report.json`.
 
     Attributes:
@@ -127,7 +127,7 @@ class MethodRecord:
 
     @property
     def is_comparable(self) -> bool:
-        """Whether the method answers all presses from the charges alone, which is the task that is compared."""
+        """Whether the method estimates the contacts of all presses, and from the charges alone."""
         return not self.method.given_force and self.errors.answered == 1.0
 
     @property
@@ -174,7 +174,7 @@ class MethodRecord:
 
 
 def with_pareto_fronts(records: Sequence[MethodRecord]) -> list[MethodRecord]:
-    """Return the records with `pareto_costs`, the costs for which the method is on the Pareto front.
+    """Determine the Pareto front of each cost, and return the records with their `pareto_costs`.
 
     The function `pareto_front` states when a method is on the Pareto front of a cost. Methods that are not comparable
     are on no Pareto front, and are ignored when the fronts are determined.
@@ -199,8 +199,8 @@ def with_pareto_fronts(records: Sequence[MethodRecord]) -> list[MethodRecord]:
 def pareto_front(cost: Array, error: Array) -> Booleans:
     """Determine which methods are on the Pareto front of cost and error.
 
-    A method is on the front unless another method is better in one of cost and error, and at least as good in the
-    other.
+    A method is on the front unless another method is at least as good in both cost and error, and better in one of
+    them.
 
     Args:
         cost: Costs of the methods, shape (n,); smaller is better.
@@ -217,7 +217,7 @@ def pareto_front(cost: Array, error: Array) -> Booleans:
 
 
 def interval_coverage(estimate: Array, std: Array, truth: Array, levels: Array) -> Array:
-    """Compute the fraction of true values that lie in the central intervals of a normal distribution.
+    """Compute the fraction of true values that lie in the central intervals of normal distributions.
 
     Args:
         estimate: Estimated contacts (x, y, F), shape (n, 3), mm and N: the means of the distribution.
@@ -239,7 +239,7 @@ SPEED_NAMES: dict[Cost, str] = {"latency": "single predictions", "throughput": "
 
 
 def compare_with_released(records: Sequence[MethodRecord]) -> dict[str, Any]:
-    """Compare the speed and the error of all comparable methods with the released model.
+    """Compare all comparable methods with the released model in speed and error.
 
     Args:
         records: Records of all methods; the first one is the record of the released model.
@@ -284,7 +284,7 @@ def _faster_records(records: Sequence[MethodRecord], released: MethodRecord, cos
 
 
 def _comparison_sentence(cost: Cost, released: MethodRecord, group: Sequence[MethodRecord], group_name: str) -> str:
-    """Return the sentences that state how many methods of a group are faster and more accurate than the released model.
+    """Return sentences about the methods of a group that are both faster and more accurate than the released model.
 
     The sentences also compare the released model with the most accurate of the faster methods. If no method is faster
     than the released model, a single sentence states this.

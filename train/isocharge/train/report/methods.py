@@ -71,16 +71,16 @@ def fit_all(
     for method in track(methods, "fitting methods"):
         start = time.perf_counter()
         try:
-            fitted = method.fit(task)
+            fitted_method = method.fit(task)
         except (DatasetError, TrainingError) as error:
             if not task.train.measured:
                 raise
             failure_reasons[method.name] = str(error)
             continue
         fit_seconds = time.perf_counter() - start
-        test_inputs = _test_inputs(fitted, test)
-        estimate = fitted.regressor.predict(test_inputs)
-        fitted_methods.append(FittedMethod(fitted, estimate, fit_seconds))
+        test_inputs = _test_inputs(fitted_method, test)
+        estimate = fitted_method.regressor.predict(test_inputs)
+        fitted_methods.append(FittedMethod(fitted_method, estimate, fit_seconds))
     return fitted_methods, failure_reasons
 
 
@@ -105,7 +105,7 @@ def measure_methods(
     Returns:
         The records of the methods, in the order of `fitted_methods`.
     """
-    methods = [fitted.method for fitted in fitted_methods]
+    methods = [fitted_method.method for fitted_method in fitted_methods]
     method_count = len(methods)
     single_contenders = [Contender(method.name, 1, _single_press_call(method, test)) for method in methods]
     batch_contenders = [_batch_contender(method, test, settings.batch) for method in methods]
@@ -116,13 +116,13 @@ def measure_methods(
     batch_timings = timings[method_count:]
 
     records = []
-    for fitted, single_timing, batch_timing in zip(fitted_methods, single_timings, batch_timings, strict=True):
-        records.append(_method_record(fitted, test.contact, posterior_mean, single_timing, batch_timing))
+    for fitted_method, single_timing, batch_timing in zip(fitted_methods, single_timings, batch_timings, strict=True):
+        records.append(_method_record(fitted_method, test.contact, posterior_mean, single_timing, batch_timing))
     return with_pareto_fronts(records)
 
 
 def _test_inputs(method: ComparedMethod, test: LabelledPresses) -> Array:
-    """Return the inputs of a method for the test presses, shape (n, n_input): charges, maybe with the true force."""
+    """Return the inputs of a method, shape (n, n_input): charges of the test presses, and forces if needed."""
     return method.inputs(test.charge, test.contact[:, 2])
 
 
@@ -149,10 +149,10 @@ def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callabl
 
 
 def _batch_contender(method: ComparedMethod, test: LabelledPresses, batch_size: int) -> Contender:
-    """Return the prediction of a batch that is timed for a method.
+    """Return the batch prediction that is timed in order to measure the throughput of a method.
 
-    A small batch is predicted first. If the duration of this prediction shows that the whole batch would take longer
-    than `MAX_BATCH_SECONDS`, the small batch is timed instead of the whole batch.
+    The duration of a small batch is measured first. If the whole batch would take longer than `MAX_BATCH_SECONDS`, the
+    small batch is timed instead of the whole batch.
 
     Args:
         method: The fitted method.
@@ -173,34 +173,34 @@ def _batch_contender(method: ComparedMethod, test: LabelledPresses, batch_size: 
 
 
 def _method_record(
-    fitted: FittedMethod, truth: Array, posterior_mean: Array | None, single_timing: Timing, batch_timing: Timing
+    fitted_method: FittedMethod, truth: Array, posterior_mean: Array | None, single_timing: Timing, batch_timing: Timing
 ) -> MethodRecord:
     """Return the record of a method with its errors, durations and memory.
 
     The record of a method that is given the true force contains no force error.
 
     Args:
-        fitted: Fitted method and its estimates of the contacts.
+        fitted_method: Fitted method and its estimates of the contacts.
         truth: True contacts, shape (n, 3), mm and N.
         posterior_mean: Posterior means (x, y, F) of the first m presses, shape (m, 3), mm and N, for the ratio of the
             error to the Bayes limit. None if the means were not computed.
         single_timing: Durations of predictions of one press.
         batch_timing: Durations of predictions of a batch of presses.
     """
-    errors = ContactErrors.of(fitted.estimate, truth)
-    if fitted.method.given_force:
+    errors = ContactErrors.of(fitted_method.estimate, truth)
+    if fitted_method.method.given_force:
         errors = replace(errors, force_rms_percent=None, force_median_percent=None)
-    ratio = None
+    error_ratio = None
     if posterior_mean is not None:
-        ratio = bayes_ratio(fitted.estimate, posterior_mean, truth)
+        error_ratio = bayes_ratio(fitted_method.estimate, posterior_mean, truth)
     return MethodRecord(
-        method=fitted.method,
+        method=fitted_method.method,
         errors=errors,
-        bayes_ratio=ratio,
+        bayes_ratio=error_ratio,
         single_timing=single_timing,
         batch_timing=batch_timing,
-        memory_bytes=_serialised_bytes(fitted.method),
-        fit_seconds=fitted.fit_seconds,
+        memory_bytes=_serialised_bytes(fitted_method.method),
+        fit_seconds=fitted_method.fit_seconds,
     )
 
 
@@ -224,7 +224,7 @@ def bayes_ratio(estimate: Array, posterior_mean: Array, truth: Array) -> float |
 
 
 def _serialised_bytes(method: ComparedMethod) -> int:
-    """Return the size of a fitted method, bytes: of the ONNX file of a network, or of the pickle of a regressor."""
+    """Return the size of the ONNX file of a network, or of the pickle of another regressor, bytes."""
     regressor = method.regressor
     if isinstance(regressor, OnnxContact | ReleasedModel):
         return len(regressor.graph)

@@ -210,7 +210,7 @@ def _method_row(record: MethodRecord) -> list[str]:
 
 
 def _mismatch_effects(section: SectionContent) -> Iterator[str]:
-    """Yield the blocks about the errors if the film, the probe or the electronics differ from the assumptions.
+    """Yield the blocks about errors with films, probes and electronics that differ from the assumptions.
 
     Args:
         section: Content of the section of a simulated dataset.
@@ -323,7 +323,7 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], text_co
 
 
 def _number_text(value: float | None) -> str:
-    """Format a number for a table, with three significant digits or, if it is 1000 or more, as a rounded integer.
+    """Format a number for a table: with three significant digits below 1000, and as a rounded integer from 1000.
 
     Args:
         value: The number; None for an empty cell.

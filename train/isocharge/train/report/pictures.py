@@ -118,8 +118,8 @@ def _draw_methods(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> No
 def _draw_pareto_front(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> None:
     """Draw the Pareto front as steps.
 
-    The error between two methods of the front is the error of the method with the lower cost. For the throughput, a
-    higher value is a lower cost, so the direction of the steps is reversed.
+    Between two methods, the steps show the error of the method with the lower cost. For the throughput, a higher value
+    is a lower cost, so the direction of the steps is reversed.
 
     Args:
         axes: Axes of matplotlib.
@@ -133,7 +133,7 @@ def _draw_pareto_front(axes: Axes, records: Sequence[MethodRecord], cost: Cost) 
 
 
 def _set_logarithmic_axes(axes: Axes, x_label: str, y_label: str) -> None:
-    """Set both axes to logarithmic scales, which are labelled with plain numbers instead of powers of ten.
+    """Set both axes to logarithmic scales, and label them with plain numbers instead of powers of ten.
 
     An axis that covers less than three decades also has labels at 2 and 5 times the powers of ten.
 

@@ -32,9 +32,9 @@ def select_presses(dataset: Dataset, is_selected: Booleans) -> Dataset:
 
 
 def simulated_presses_for(model: ModelMetadata, dataset: Dataset) -> Dataset:
-    """Return the presses of a simulated dataset that lie in the working area of a model.
+    """Select the presses in the working area of a model from a simulated dataset.
 
-    The radius in the manifest of the returned dataset is the radius of the model's working area.
+    If presses are excluded, the radius in the manifest becomes the radius of the model's working area.
 
     Args:
         model: Metadata of the model.
@@ -91,7 +91,7 @@ def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
 
 
 def measured_presses_for(model: ModelMetadata, dataset: Dataset) -> Dataset:
-    """Return the presses of a measured dataset that lie within the working area and the range of forces of a model.
+    """Select the presses within the working area and the range of forces of a model from a measured dataset.
 
     The manifest of the returned dataset is empty, because the ranges in the original manifest include the excluded
     presses.

@@ -1,4 +1,4 @@
-"""Studies of the released model in addition to its mean error.
+"""Studies of the errors of the released model in addition to its mean error.
 
 One study computes the errors as a function of the place and of the force. Another study computes the coverage of the
 reported standard deviations. A third study computes the errors under conditions that differ from the training: other
@@ -52,12 +52,14 @@ class NoiseDraws:
     misfit: Array
 
     @classmethod
-    def of(cls, released: ReleasedModel, clean: LabelledPresses, case: EvaluationCase, draw_count: int) -> "NoiseDraws":
+    def of(
+        cls, released: ReleasedModel, clean_presses: LabelledPresses, case: EvaluationCase, draw_count: int
+    ) -> "NoiseDraws":
         """Draw the noise of the test presses several times, and estimate all contacts each time.
 
         Args:
             released: The released model.
-            clean: The test presses without noise.
+            clean_presses: The test presses without noise.
             case: The case, with noise and seed.
             draw_count: Number of noise draws for each press.
 
@@ -65,17 +67,17 @@ class NoiseDraws:
             The estimates of all draws, one after the other.
         """
         first_seed = case.seed + NOISE_DRAWS_SEED
-        charges_by_draw = [clean.noisy(case.noise, first_seed + draw) for draw in range(draw_count)]
+        charges_by_draw = [clean_presses.noisy(case.noise, first_seed + draw) for draw in range(draw_count)]
         all_charges = np.concatenate(charges_by_draw)  # shape (draw_count * n_press, n_electrode)
         estimate, std, misfit = released.answer(all_charges)
-        truth = np.tile(clean.contact, (draw_count, 1))
+        truth = np.tile(clean_presses.contact, (draw_count, 1))
         return cls(truth, estimate, std, misfit[:, 0])
 
 
 def errors_by_force(
     domain: Domain, truth: Array, estimates: Mapping[str, Array], cramer_rao_mm: Array
 ) -> dict[str, Any]:
-    """Compute the root-mean-square position error of several methods in logarithmic bins of the force.
+    """For several methods, compute the root-mean-square position error in logarithmic bins of the force.
 
     Args:
         domain: The range of forces.
@@ -190,7 +192,7 @@ class Mismatch:
 
 
 def mismatches(
-    case: EvaluationCase, clean: LabelledPresses, settings: Settings, executor: Executor | None = None
+    case: EvaluationCase, clean_presses: LabelledPresses, settings: Settings, executor: Executor | None = None
 ) -> Iterator[Mismatch]:
     """Yield the presses of all mismatches: other noise, other probes, another pretension, wrong gains, dead electrodes.
 
@@ -198,14 +200,14 @@ def mismatches(
 
     Args:
         case: The conditions that the models assume.
-        clean: The test presses of the case without noise.
+        clean_presses: The test presses of the case without noise.
         settings: Settings of the report: the other probes, the accuracy, and whether the pretension is changed.
         executor: Executor of the solves; None to solve in this process.
     """
     noise_seed = case.seed + MISMATCH_NOISE_SEED
     for factor in NOISE_FACTORS:
         noise = NoiseModel(f"x {factor:g}", factor * case.noise.white, factor * case.noise.gain)
-        yield Mismatch("noise", noise.name, clean.contact, clean.noisy(noise, noise_seed))
+        yield Mismatch("noise", noise.name, clean_presses.contact, clean_presses.noisy(noise, noise_seed))
 
     probe_accuracy = max(MISMATCH_ACCURACY, settings.accuracy)
     for notation in settings.shapes:
@@ -218,10 +220,10 @@ def mismatches(
         name = f"+{PRETENSION_ERROR_MPa:g} MPa"
         yield _solved_mismatch("pretension", name, case_of_other_film, MISMATCH_ACCURACY, executor)
 
-    noisy_charge = clean.noisy(case.noise, noise_seed)
+    noisy_charge = clean_presses.noisy(case.noise, noise_seed)
     rng = np.random.default_rng(noise_seed)
-    yield from _gain_mismatches(case, clean.contact, noisy_charge, rng)
-    yield from _dead_electrodes(case, clean.contact, noisy_charge, rng)
+    yield from _gain_mismatches(case, clean_presses.contact, noisy_charge, rng)
+    yield from _dead_electrodes(case, clean_presses.contact, noisy_charge, rng)
 
 
 def _solved_mismatch(
@@ -245,7 +247,7 @@ def _solved_mismatch(
 def _gain_mismatches(
     case: EvaluationCase, truth: Array, noisy_charge: Array, rng: np.random.Generator
 ) -> Iterator[Mismatch]:
-    """Yield presses with random errors of all gains, and then presses with one wrong gain for each electrode.
+    """Yield presses with random errors in all gains and then, for each electrode, presses with only its gain wrong.
 
     The random errors are drawn anew for each press.
 
@@ -266,7 +268,7 @@ def _gain_mismatches(
 def _dead_electrodes(
     case: EvaluationCase, truth: Array, noisy_charge: Array, rng: np.random.Generator
 ) -> Iterator[Mismatch]:
-    """Yield, for each electrode, presses in which this electrode measures only the white noise.
+    """For each electrode, yield presses in which this electrode measures only white noise.
 
     Args:
         case: Case that contains the sensor and the noise.

@@ -1,1 +1,1 @@
-"""Training data from the simulation of a sensor that measured presses correct, for films that cannot be calibrated."""
+"""Training data for films that cannot be calibrated, from a simulation that is corrected by measured presses."""

@@ -33,7 +33,7 @@ SCATTER_RATIO = 1.3
 
 @dataclass(frozen=True)
 class CorrectedFilm:
-    """Film whose charges are computed by the forward map of a described sensor and corrected by measured presses.
+    """Film whose charges are computed by a forward map and corrected by measured presses.
 
     Attributes:
         forward_map: Forward map of the sensor as described.
@@ -60,7 +60,7 @@ class CorrectedFilm:
 
 
 def correct_film(presses: MeasuredPresses, forward_map: ForwardMap, domain: Domain, noise: NoiseModel) -> CorrectedFilm:
-    """Correct a forward map by measured presses.
+    """Correct a forward map with measured presses.
 
     Presses with gross errors are left out, and a warning about these presses is logged.
 
@@ -76,9 +76,9 @@ def correct_film(presses: MeasuredPresses, forward_map: ForwardMap, domain: Doma
     residuals = Residuals.of(presses, forward_map, noise)
     correction, is_gross = _robust_correction(residuals)
     if is_gross.any():
-        left_out = presses[is_gross]
-        left_out_rows = row_words(left_out.lines, left_out.row_noun)
-        _log.warning("%s: left out, since these presses differ from all others; look at them again", left_out_rows)
+        excluded_presses = presses[is_gross]
+        excluded_rows = row_words(excluded_presses.lines, excluded_presses.row_noun)
+        _log.warning("%s: left out, since these presses differ from all others; look at them again", excluded_rows)
 
     # The scatter is the root of chi-squared over its degrees of freedom. The degrees of freedom are the number of
     # residuals minus the effective number of fitted coefficients, and at least one.
@@ -98,7 +98,7 @@ def _robust_correction(residuals: Residuals) -> tuple[Correction, Booleans]:
 
     A press has a gross error if its chi-squared after the correction is more than `GROSS_ERROR_RATIO` times the median.
     Every fit of the correction changes chi-squared. The presses with gross errors are therefore determined again after
-    every fit, until they no longer change.
+    every fit, until they no longer change. The correction is refitted at most `MAX_ROUNDS` times.
 
     Args:
         residuals: Differences between measured presses and a forward map.

@@ -1,10 +1,11 @@
 """Smooth correction of the charges of a forward map, fitted to measured presses by generalised least squares.
 
-The correction is a factor on the charge of each electrode. The logarithm of this factor is a sum of polynomials in the
-place and in the logarithm of the force, which `calibration.discrepancy` defines. The covariance of the residuals
-contains the noise of the charges, and the errors of the measured places and forces. These errors are converted to
-errors of the charges by the derivatives of the map. Several sizes of the correction are tried, and the most probable
-size is used. If the most probable size is zero, the charges are not corrected.
+The correction is a factor on the charge of each electrode. The logarithm of the factor is a sum of polynomials, which
+`calibration.discrepancy` defines. The variables of the polynomials are the place and the logarithm of the force. The
+covariance of the residuals contains the noise of the charges, and the errors of the measured places and forces. The
+derivatives of the map convert errors of places and forces into errors of charges. Several sizes of the correction are
+tried, and the corrections are averaged with the probabilities of the sizes as weights. If the most probable size is
+zero, the charges are not corrected.
 """
 
 from dataclasses import dataclass
@@ -58,9 +59,8 @@ class Residuals:
     def of(cls, presses: MeasuredPresses, charge_map: ChargeMap, noise: NoiseModel) -> "Residuals":
         """Compute the residuals of presses whose places, forces and charges are known.
 
-        A residual is the logarithm of the ratio of the measured charge to the charge of the map. The covariance of the
-        residuals is the sum of two parts, which are caused by the noise of the charges and by the errors of the
-        measured contacts.
+        A residual is ln(measured charge / charge of the map). The covariance of the residuals is the sum of two parts.
+        One part is caused by the noise of the charges, and the other part by the errors of the measured contacts.
 
         Args:
             presses: Measured presses without missing values.
@@ -121,17 +121,21 @@ class Correction:
         return not self.coefficients.any()
 
     def log_factor(self, contact: Array) -> Array:
-        """Return the change of ln Q, shape (n, n_electrode), at contacts (x, y, F), shape (n, 3), mm and N."""
+        """Return the logarithms of the factors, shape (n, n_electrode).
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        """
         return np.asarray(terms(contact, self.domain) @ self.coefficients)
 
 
 def fit_correction(residuals: Residuals) -> Correction:
     """Fit a correction to residuals by generalised least squares.
 
-    For each electrode, the logarithm of the correction is a sum of polynomials. The size of the correction is the prior
-    standard deviation of the coefficients of these polynomials. Each size in `SIZES` is a hypothesis, and the size zero
-    means that there is no correction. The coefficients are averaged over the hypotheses, with the probabilities of the
-    hypotheses as weights.
+    For each electrode, the logarithm of the correction is a sum of polynomials. The prior standard deviation of the
+    polynomials' coefficients is called the size of the correction. Each size in `SIZES` is a hypothesis, and the size
+    zero means that there is no correction. The coefficients are averaged over the hypotheses, with the probabilities of
+    the hypotheses as weights.
 
     Args:
         residuals: Differences between measured presses and a forward map.
@@ -168,9 +172,9 @@ def fit_correction(residuals: Residuals) -> Correction:
 
 
 def _normal_equations(residuals: Residuals, domain: Domain, n_coefficient: int) -> LinearModel:
-    """Return the sum of the squared residuals of all presses as a quadratic function of the coefficients.
+    """Express the sum of the squared residuals of all presses as a quadratic function of the coefficients.
 
-    The function is computed for one chunk of presses after the other, which limits the memory.
+    The presses are processed in chunks, which limits the memory.
 
     Args:
         residuals: Differences between measured presses and a forward map.
@@ -193,11 +197,11 @@ def _normal_equations(residuals: Residuals, domain: Domain, n_coefficient: int) 
 
 
 def _linear_model(residuals: Residuals, domain: Domain) -> LinearModel:
-    """Return the sum of the squared residuals as a function of the coefficients of the correction.
+    """Express the sum of the squared residuals as a quadratic function of the coefficients.
 
     Let P be the polynomials of a press, c the coefficients, and l the measured ln(Q / charge of the map). The whitened
     residuals of the press are W (P c - l), which are linear in c. The whitening matrix W is the inverse of the Cholesky
-    factor of the covariance, so that the covariance of the whitened residuals is the unit matrix.
+    factor of the covariance. The covariance of the whitened residuals is therefore the unit matrix.
 
     Args:
         residuals: Residuals of n presses.
@@ -205,7 +209,7 @@ def _linear_model(residuals: Residuals, domain: Domain) -> LinearModel:
     """
     whitening = np.linalg.inv(np.linalg.cholesky(residuals.covariance))  # shape (n, n_electrode, n_electrode)
     log_ratio_column = residuals.log_ratio[:, :, None]
-    uncorrected = -(whitening @ log_ratio_column)[:, :, 0]  # residuals with c = 0, shape (n, n_electrode)
+    uncorrected_residuals = -(whitening @ log_ratio_column)[:, :, 0]  # residuals with c = 0, shape (n, n_electrode)
 
     # Derivatives of residual g of press n with respect to the coefficient of term t for electrode e, shape (n, g, t, e)
     polynomials = terms(residuals.contact, domain)
@@ -213,13 +217,13 @@ def _linear_model(residuals: Residuals, domain: Domain) -> LinearModel:
     n_coefficient = term_count() * residuals.log_ratio.shape[1]
     design = derivatives.reshape(-1, n_coefficient)
     deviation_from_prior_mean = np.zeros(n_coefficient)  # the prior mean of the coefficients is c = 0
-    return LinearModel.of(design, uncorrected.ravel(), deviation_from_prior_mean)
+    return LinearModel.of(design, uncorrected_residuals.ravel(), deviation_from_prior_mean)
 
 
 def _log_ratio(ratio: Array) -> Array:
-    """Return the logarithms of ratios of any sign.
+    """Compute the logarithms of ratios, also for ratios that are zero or negative.
 
-    Below `MIN_RATIO`, where the charges are mostly noise, the tangent of the logarithm is used.
+    Below the ratio `MIN_RATIO`, where the charges are mostly noise, the logarithm is replaced by its tangent.
     """
     logarithm = np.log(np.maximum(ratio, MIN_RATIO))
     tangent = np.minimum(ratio / MIN_RATIO - 1.0, 0.0)

@@ -73,7 +73,7 @@ def rig_data(rig: Rig, *, training_presses: int = TRAINING_PRESSES, seed: int = 
     presses whose charges the corrected map computes. A fifth of the measured presses is held out as test data.
 
     A warning is logged if presses are left out. Another warning is logged if the measured presses differ from the
-    corrected map by more than their noise and the errors of their contacts.
+    corrected map more than noise and errors of the contacts explain.
 
     Args:
         rig: The measured presses, 50 or more, with their sensor and probe.
@@ -146,7 +146,7 @@ def _usable_presses(rig: Rig, domain: Domain) -> MeasuredPresses:
 
 
 def _draw_dataset(film: CorrectedFilm, count: int, seed: int) -> Dataset:
-    """Draw presses whose charges the corrected map computes, as a dataset on which a network can be trained.
+    """Draw random presses, compute their charges with the corrected map, and return them as a dataset.
 
     Args:
         film: Corrected film.
@@ -175,7 +175,7 @@ def _draw_dataset(film: CorrectedFilm, count: int, seed: int) -> Dataset:
 
 
 def _provenance(film: CorrectedFilm, presses: MeasuredPresses, is_held_out: Booleans) -> Provenance:
-    """Return the section of the model card, the metadata and the files of a model of the corrected film.
+    """Describe the origin of a model of the corrected film: section of the card, metadata and files.
 
     Args:
         film: Corrected film.

@@ -82,7 +82,7 @@ class NetworkConfig(Settings, frozen=True):
     weights: Literal["float32", "int8"] = "float32"
 
     def __post_init__(self) -> None:
-        """Check the settings, and raise WrongKey for the first setting that is wrong.
+        """Check the settings, and raise WrongKey for the first wrong setting.
 
         If the widths of both networks are given, both networks must have the same number of hidden layers, because they
         are folded into one perceptron.
@@ -122,7 +122,7 @@ class NetworkConfig(Settings, frozen=True):
         return (sizes.misfit_width,) * self._layer_count(sizes)
 
     def _layer_count(self, sizes: DefaultSizes) -> int:
-        """Return the number of hidden layers, which is the number of given widths or the default number.
+        """Return the number of hidden layers: the number of given widths, or the default number if no widths are given.
 
         Args:
             sizes: Default sizes, which are used if no widths are given.
@@ -179,7 +179,7 @@ class TrainingConfig(Settings, frozen=True):
         return self.misfit_steps if self.misfit_steps is not None else DefaultSizes.of(n_electrode).misfit_steps
 
     def misfit_charge_count(self, n_electrode: int) -> int:
-        """Return the number of sets of charges from which the misfit network learns.
+        """Return the number of sets of charges in the training of the misfit network.
 
         Args:
             n_electrode: Number of electrodes, which determines the result if the setting is None.
@@ -203,7 +203,7 @@ class FitConfig(Settings, frozen=True):
     training: TrainingConfig = TrainingConfig()
 
     def for_electrodes(self, n_electrode: int) -> "FitConfig":
-        """Return a copy of the settings in which the default sizes for a number of electrodes replace None."""
+        """Return a copy of the settings, with each missing size replaced by its default for a number of electrodes."""
         network = replace(
             self.network,
             hidden=self.network.contact_widths(n_electrode),
@@ -222,7 +222,7 @@ class FitConfig(Settings, frozen=True):
         return json.decode(json.encode(self), type=dict[str, Any])
 
     def checked(self) -> "FitConfig":
-        """Check the ranges of all settings as if they were read from a file, and return a copy of the settings.
+        """Check the ranges of all settings as for settings from a file, and return a copy of the settings.
 
         Raises:
             ConfigError: If a setting is out of its range.

@@ -1,6 +1,6 @@
-"""Additional answers of a trained network for the correlations between its errors of x, y and ln F.
+"""Additional outputs of a trained network, which give the correlations between its errors of x, y and ln F.
 
-The other answers of the network do not change. Every matrix of correlations between three errors is the Gram matrix of
+The other outputs of the network do not change. Every matrix of correlations between three errors is the Gram matrix of
 three unit vectors. The vectors (1, 0, 0), (cos a, sin a, 0) and (cos b, sin b cos c, sin b sin c) have unit length for
 all angles a, b and c, so they always give a valid correlation matrix. The vectors are also the rows of the Cholesky
 factor of this matrix. Products of sines and cosines can be written as sums of cosines. The correlations are therefore
@@ -9,9 +9,9 @@ linear in eight cosines:
     xy = cos a,  xF = cos b,
     yF = (cos(a - b) + cos(a + b)) / 2 + (cos(a - b - c) + cos(a - b + c) - cos(a + b - c) - cos(a + b + c)) / 4.
 
-In the exported graph, one node computes the cosines, and one node computes their weighted sums. The angles are linear
-functions of the last hidden layer of the contact perceptron and of the input features. The linear functions are fitted
-to the errors of the network by maximum likelihood.
+In the exported graph, one node computes the cosines, and another node computes their weighted sums. The angles are
+linear functions of the last hidden layer of the contact perceptron and of the input features. The linear functions are
+fitted to the errors of the network by maximum likelihood.
 """
 
 import logging
@@ -83,9 +83,9 @@ The arguments are a, b, a - b, a + b, a - b - c, a - b + c, a + b - c and a + b 
 def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: NoiseModel, seed: int) -> FoldedNetwork:
     """Return a network that also estimates the correlations between its errors of x, y and ln F.
 
-    Three angles a, b and c determine the correlations, as the description of this module explains. Each angle is a
-    linear function of the input features and of the hidden units that influence the contact. The linear functions are
-    fitted to the errors of the network for presses with noise. The other outputs of the network do not change.
+    Three angles a, b and c determine the correlations (see the description of this module). Each angle is a linear
+    function of the input features and of the hidden units that influence the contact. The linear functions are fitted
+    to the errors of the network on presses with noise. The other outputs of the network do not change.
 
     Args:
         network: The trained network.
@@ -131,11 +131,11 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
 
 
 def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
-    """Fit the linear layer that computes the angles a, b and c.
+    """Fit a linear layer that computes the angles a, b and c.
 
-    The inputs are whitened for the fit. The returned layer includes this whitening. The minimised function is
+    The inputs are whitened for the fit. The returned layer includes this whitening. The fit minimises
     `correlation_loss` plus a penalty on the squared weights. The first step of the L-BFGS method has a length of about
-    1. The variables of the minimisation are therefore the bias and the weights divided by `FIRST_STEP`.
+    1. For a shorter first step, the variables of the minimisation are the bias and the weights divided by `FIRST_STEP`.
 
     Args:
         inputs: Inputs of the layer, shape (n, k).
@@ -181,37 +181,37 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
 
 
 def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Array:
-    """Minimise a loss by the L-BFGS method, which is started again if a line search fails.
+    """Minimise a loss by the L-BFGS method, and start the method again if a line search fails.
 
-    The search ends if all derivatives are below a tolerance, or after `MAX_ITERATIONS` iterations. If the line search
-    has failed in all `MAX_STARTS` starts, the search ends as well, and a warning is logged.
+    The search ends if all derivatives are below a tolerance, or after `MAX_ITERATIONS` iterations. If a line search
+    fails after each of `MAX_STARTS` starts, the search also ends, and a warning is logged.
 
-    A position contains parameters divided by `FIRST_STEP`. The derivatives with respect to the position are therefore
+    The variables are parameters divided by `FIRST_STEP`. The derivatives with respect to the variables are therefore
     `FIRST_STEP` times the derivatives with respect to the parameters.
 
     Args:
-        loss: Function that returns the loss and its gradient at a position.
-        start: Position at which the search starts, shape (n,).
+        loss: Function that returns the loss and its gradient for given variables.
+        start: Variables at which the search starts, shape (n,).
 
     Returns:
-        Position at which the search ended, shape (n,).
+        Variables at which the search ended, shape (n,).
     """
-    tolerance = FIRST_STEP * GRADIENT_TOLERANCE  # for derivatives with respect to the position
+    tolerance = FIRST_STEP * GRADIENT_TOLERANCE  # for derivatives with respect to the variables
     # With ftol = 0, a small change of the loss does not end the search.
     options = {"ftol": 0.0, "gtol": tolerance, "maxcor": N_UPDATES}
-    position = start
+    variables = start
     remaining_iterations = MAX_ITERATIONS
     for _ in range(MAX_STARTS):
         start_options = options | {"maxiter": remaining_iterations}
-        result = minimize(loss, position, jac=True, method="L-BFGS-B", options=start_options)
-        position = result.x
+        result = minimize(loss, variables, jac=True, method="L-BFGS-B", options=start_options)
+        variables = result.x
         remaining_iterations -= result.nit
         is_converged = np.abs(result.jac).max() <= tolerance
         if is_converged or remaining_iterations <= 0:
-            return np.asarray(position)
+            return np.asarray(variables)
     largest_gradient = np.abs(result.jac).max() / FIRST_STEP  # in the last start, with respect to the parameters
     _log.warning("the training of the correlations has not converged: the gradient is %.1g", largest_gradient)
-    return np.asarray(position)
+    return np.asarray(variables)
 
 
 def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tuple[float, Array | Singles]:

@@ -1,11 +1,12 @@
-"""Training of a network on measured presses alone, for a sensor that is not simulated.
+"""Training of a network only on measured presses, for a sensor without a simulation.
 
 For a cross-validation, five networks are trained, each without the presses at a fifth of the places. The errors of the
-model are estimated from the answers of each network to the presses that were left out of its training. The same answers
-determine factors by which the standard deviations are multiplied. With these factors, the confidence intervals contain
-the true values as often as they should (split conformal prediction, Papadopoulos et al., 2002). The mean answer of the
-five networks has smaller errors than the answer of a single network. One further network learns this mean answer
-(Hinton et al., 2015). The released model is therefore as small and fast as the models of simulated sensors.
+model are estimated from the answers of the five networks to the presses that were left out of their training. The same
+answers determine factors by which the standard deviations are multiplied. With these factors, the confidence intervals
+contain the true values as often as they should (split conformal prediction, Papadopoulos et al., 2002). The mean answer
+of the five networks has smaller errors than the answer of a single network. One further network learns this mean answer
+(Hinton et al., 2015). Only the further network is released, so the model is as small and fast as the models of
+simulated sensors.
 
 The noise of the charges is estimated from the presses themselves (`isocharge.train.data.channel_noise`). In every
 training step, random noise with half of the estimated size is added to the charges as a regularisation.
@@ -94,9 +95,9 @@ def fit_presses(
 ) -> Fitted:
     """Train a network on measured presses of any sensor with three to eight channels.
 
-    Several networks are trained for a cross-validation. One further network is then trained on the mean outputs of
-    these networks (distillation) and on misfits. A warning is logged if presses are left out. Another warning is logged
-    if all presses have nearly the same force.
+    Several networks are trained for a cross-validation. One further network is trained on the mean outputs of these
+    networks (distillation), and on misfits. A warning is logged if presses are left out. Another warning is logged if
+    all presses have nearly the same force.
 
     Args:
         presses: At least 500 presses at 50 places. Presses with an unknown place, force or charge are left out.
@@ -168,7 +169,7 @@ def fit_presses(
 
 
 def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, object]:
-    """Return all values on which the trained weights depend. They identify a resumable run."""
+    """Return all values on which the trained weights depend, as the identity of a resumable run."""
     return {
         "presses_sha256": presses_sha256(presses),
         "electrodes": list(presses.electrodes),
@@ -179,7 +180,7 @@ def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, o
 
 
 def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
-    """Select the presses whose place, force and charges are all known, and check that they suffice for a training.
+    """Select the presses with known place, force and charges, and check that their number suffices for a training.
 
     A warning is logged if presses are left out. Another warning is logged if all presses have nearly the same force.
 
@@ -220,10 +221,11 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
 
 
 def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]:
-    """Compute the factors by which standard deviations must be multiplied in order to agree with the observed errors.
+    """Compute the factors by which standard deviations must be multiplied to agree with the observed errors.
 
-    With a first factor, the intervals of one standard deviation contain 68 % of the true values. With a second factor,
-    the 95 % intervals contain 95 % of the true values. The result is the geometric mean of these two factors.
+    Each factor is the geometric mean of two other factors. With the first of them, the intervals of one standard
+    deviation contain 68 % of the true values. With the second of them, the 95 % intervals contain 95 % of the true
+    values.
 
     Args:
         contact: Contacts (x, y, F) that were estimated by networks that were not trained on these presses, shape (n,
@@ -239,7 +241,7 @@ def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]
 
 
 def _std_factor(deviation: Array) -> float:
-    """Compute one of the factors that `std_factors` returns.
+    """Compute the factor for the position or the factor for the force; see `std_factors`.
 
     Args:
         deviation: Absolute errors divided by their standard deviations, any shape.
@@ -250,10 +252,10 @@ def _std_factor(deviation: Array) -> float:
 
 
 def _with_defaults_for_measured(config: TrainingConfig, n_electrode: int) -> TrainingConfig:
-    """Return a copy of the settings in which missing numbers of steps and charges have defaults for measured presses.
+    """Return a copy of the settings with default numbers of steps and charges for measured presses.
 
-    Measured presses are few and noisy. Their defaults are therefore larger than the defaults for simulated presses of
-    sensors with few electrodes.
+    Numbers that are given in the settings are not replaced. Measured presses are few and noisy. Therefore, the default
+    numbers for measured presses are larger than those for simulated presses of sensors with few electrodes.
 
     Args:
         config: Settings in which the numbers may be missing.
@@ -294,7 +296,7 @@ def _train_fold_networks(
     """
 
     def train(fold_index: int, steps: int) -> Descent:
-        """Train the network of one fold with a number of steps, and return the finished training.
+        """Train the network of one fold with a given number of steps, and return the finished training.
 
         The presses of this fold are used for validation. The presses of all other folds are used for training.
 
@@ -326,11 +328,11 @@ def _train_fold_networks(
 
 
 def _train_with_best_steps(network: TrainablePerceptron, train: Callable[[int], Descent], largest_steps: int) -> int:
-    """Train a network with more and more steps, and keep the weights of the best training.
+    """Train a network repeatedly with more and more steps, and keep the weights of the best training.
 
     Each training begins with the same initial weights, and has twice as many steps as the previous training. The
-    function stops if the validation score of a training is not better than that of the previous training, or if the
-    number of steps would exceed `largest_steps`.
+    function stops if the validation score does not improve from one training to the next, or if the number of steps
+    would exceed `largest_steps`.
 
     Args:
         network: Network to train. Its present weights are the initial weights.
@@ -356,7 +358,7 @@ def _train_with_best_steps(network: TrainablePerceptron, train: Callable[[int], 
 
 
 def _cross_validated_contact(fold_networks: list[InverseNetwork], charge: Array, fold: Integers) -> tuple[Array, Array]:
-    """Estimate the contact of each press with the network that was not trained on this press.
+    """Estimate the contact of each press with a network that was not trained on this press.
 
     Args:
         fold_networks: Networks, one for each fold, which were trained on the presses of all other folds.
@@ -387,8 +389,8 @@ def _distillation_stage(
 ) -> TrainingStage:
     """Define the training of a network on the mean outputs of other networks (distillation).
 
-    The inputs are copies of the charges of the presses with noise of several sizes, in random order. The last copies
-    are used for validation. The number of copies for validation is half the number of presses.
+    The inputs are copies of the charges, with noise of several sizes and in random order. The last copies are used for
+    validation, and their number is half the number of presses.
 
     Args:
         network: Network to train.
@@ -413,17 +415,17 @@ def _distillation_stage(
     network.contact.fit_linear_part(network.inputs(charge[:n_train]), target_mean[:n_train])
 
     def divergence(rows: Tensor | slice) -> Tensor:
-        """Return the divergence between the outputs of the network and the targets for some rows of the inputs."""
+        """Return the divergence between the outputs of the network and the targets for selected rows of the inputs."""
         mean, log_std = network.posterior(charge[rows])
         return distillation_loss(mean, log_std, target_mean[rows], target_log_std[rows])
 
-    def loss(_: int, random: torch.Generator) -> Tensor:
+    def loss(_: int, random: torch.Generator) -> Tensor:  # the loss is the same in every step
         """Return the divergence for a random batch."""
         batch_rows = torch.randint(n_train, (config.batch,), generator=random)
         return divergence(batch_rows)
 
     def score() -> tuple[float, str]:
-        """Return the divergence for the validation charges, and a text that reports it."""
+        """Return the divergence for the validation charges, and a text about this divergence."""
         validation_loss = divergence(slice(n_train, None)).item()
         return validation_loss, f"{validation_loss:.4f} from the mean of {len(fold_networks)} networks"
 
@@ -443,7 +445,8 @@ def _misfit_examples(
 ) -> Array:
     """Draw charges of many kinds, and compute their residuals with respect to the nearest contact.
 
-    The charges of contacts near a measured press are approximated by a plane, which is fitted to neighbouring presses.
+    Near each measured press, the charges as functions of the contact are approximated by a plane. This plane is fitted
+    to neighbouring presses.
 
     Args:
         presses: All presses.
@@ -480,7 +483,7 @@ def _saved_or_drawn(draw: Callable[[], Array], run: ResumableRun | None) -> Arra
 def _cross_validated_misfit(
     presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, fold: Integers
 ) -> Array:
-    """Compute the misfit of each press with local planes through the presses of all other folds.
+    """Compute the misfit of each press, using local planes that are fitted to the presses of all other folds.
 
     Args:
         presses: All presses.
@@ -492,11 +495,11 @@ def _cross_validated_misfit(
         Misfits, shape (n, 1), in standard deviations of the noise.
     """
     unit_contact = domain.to_unit(presses.contact)
-    level = noise.level(presses.charge)  # charges on a scale on which the noise has the standard deviation 1
+    charge_level = noise.level(presses.charge)  # charges on a scale on which the noise has the standard deviation 1
     misfit = np.empty((len(presses), 1))
     for fold_index in range(N_FOLDS):
         is_in_fold = fold == fold_index
-        planes = LocalPlanes.through(unit_contact[~is_in_fold], level[~is_in_fold])
-        residual = planes.residuals(level[is_in_fold])
+        planes = LocalPlanes.through(unit_contact[~is_in_fold], charge_level[~is_in_fold])
+        residual = planes.residuals(charge_level[is_in_fold])
         misfit[is_in_fold] = np.linalg.norm(residual, axis=1, keepdims=True)
     return misfit

@@ -113,7 +113,7 @@ class TrainingStage:
 
 
 class Descent:
-    """One run of a training stage, which can be continued from a checkpoint.
+    """One run of a training stage. An interrupted run can be continued from a checkpoint.
 
     Args:
         stage: Network, loss and validation score.
@@ -127,7 +127,7 @@ class Descent:
     """
 
     def __init__(self, stage: TrainingStage, rate: float, patience: int, seed: int) -> None:
-        """Prepare a training that begins with the present weights of the network.
+        """Prepare a training, which begins with the present weights of the network.
 
         Args:
             stage: Network, loss and validation score.
@@ -146,7 +146,7 @@ class Descent:
         self.best_weights = copy.deepcopy(stage.network.state_dict())
 
     def run(self, resumable_run: ResumableRun | None = None) -> None:
-        """Train the network, and give it the weights with the best validation score.
+        """Train the network, and finally restore the weights with the best validation score.
 
         The training ends after all steps of the stage, or earlier if the validation score no longer improves.
 
@@ -177,7 +177,7 @@ class Descent:
         self.stage.network.load_state_dict(self.best_weights)
 
     def take_step(self) -> Tensor:
-        """Change the weights by one step of the optimisers, and return the loss before this step.
+        """Change the weights by one step of the optimisers, and return the loss before the change.
 
         After the warm-up steps, a gradient whose norm exceeds `largest_gradient` is scaled down to this norm.
         """
@@ -199,9 +199,9 @@ class Descent:
         return loss
 
     def _evaluate(self, loss: float) -> None:
-        """Compute the validation score, keep the weights if they are the best so far, and report the progress.
+        """Compute the validation score, keep the weights if the score is the best so far, and report the progress.
 
-        Weights of the warm-up steps are never kept, because these steps minimise another loss.
+        Weights from the warm-up are never kept, because the warm-up steps minimise another loss.
 
         Args:
             loss: Loss of the latest batch.
@@ -255,14 +255,14 @@ class Descent:
 
 
 def tensor_bytes(state: object) -> bytes:
-    """Convert tensors, numbers and texts to bytes, which a `ResumableRun` can save."""
+    """Convert tensors, numbers and texts to bytes that a `ResumableRun` can save."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
     return buffer.getvalue()
 
 
 def tensors_from_bytes(data: bytes) -> Any:
-    """Return the tensors, numbers and texts that `tensor_bytes` has converted to bytes.
+    """Convert the result of `tensor_bytes` back to tensors, numbers and texts.
 
     No code in the bytes is executed.
     """
@@ -270,7 +270,7 @@ def tensors_from_bytes(data: bytes) -> Any:
 
 
 def _relative_rate(progress: float) -> float:
-    """Return the learning rate relative to its largest value.
+    """Return the learning rate divided by its largest value.
 
     The relative rate first increases from `INITIAL_RATE` to 1 along half a period of a cosine. The relative rate then
     decreases from 1 to 0 along another half period of a cosine.

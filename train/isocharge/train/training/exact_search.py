@@ -1,9 +1,9 @@
 """Comparison of a trained network with an exact search for the contacts.
 
 The search finds the contact whose charges are nearest to the measured charges (maximum likelihood). If the noise is
-small, no estimator has a smaller rms error (Kay 1993, 7.5). If the charges hardly determine a contact, the errors of a
-good network are smaller than those of the search. A network with much larger errors than the search was trained too
-briefly, or has too few weights for its sensor.
+small, no estimator has a smaller rms error than this search (Kay 1993, 7.5). If the charges hardly determine a contact,
+a good network has smaller errors than the search. If a network has much larger errors than the search, its training was
+too short, or it has too few weights for its sensor.
 """
 
 import numpy as np
@@ -33,13 +33,13 @@ def error_cautions(
         noise: Noise that is added to the charges.
         seed: Seed of the noise.
     """
-    compared = presses[np.arange(len(presses)) < MAX_PRESSES]
-    charge = compared.noisy(noise, seed)
+    compared_presses = presses[np.arange(len(presses)) < MAX_PRESSES]
+    charge = compared_presses.noisy(noise, seed)
     network_contact, _, _ = network.predict(charge)
     # The search starts at the true contacts, so that it ends at the nearest solution.
-    search_contact, _ = nearest_contact(charge_map, noise, charge, compared.contact)
-    network_errors = ContactErrorStatistics.of(network_contact, compared.contact)
-    search_errors = ContactErrorStatistics.of(search_contact, compared.contact)
+    search_contact, _ = nearest_contact(charge_map, noise, charge, compared_presses.contact)
+    network_errors = ContactErrorStatistics.of(network_contact, compared_presses.contact)
+    search_errors = ContactErrorStatistics.of(search_contact, compared_presses.contact)
     position_ratio = network_errors.position_rms_mm / search_errors.position_rms_mm
     force_ratio = network_errors.force_rms_percent / search_errors.force_rms_percent
     if max(position_ratio, force_ratio) <= MAX_ERROR_RATIO:

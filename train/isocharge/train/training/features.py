@@ -1,4 +1,4 @@
-"""Whitened input features of a network, which are fitted to the charges of presses."""
+"""Input features of a network, with a whitening that is fitted to the charges of presses."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ MIN_SINGULAR_VALUE = 1e-12
 
 @dataclass(frozen=True)
 class WhitenedFeatures:
-    """Input features with zero mean and unit covariance, which are (charge features - mean) @ matrix.
+    """Input features (charge features - mean) @ matrix, which have zero mean and unit covariance.
 
     Attributes:
         charge_features: Charge features, which are logarithms or inverse hyperbolic sines of the charges.
@@ -44,7 +44,7 @@ class WhitenedFeatures:
 
     @classmethod
     def fit_signed(cls, charge: Array, typical: Array) -> "WhitenedFeatures":
-        """Fit whitened inverse hyperbolic sines to charges of both signs.
+        """Create whitened features for charges of both signs, which are inverse hyperbolic sines of the charges.
 
         Args:
             charge: Charges of presses, shape (n, n_electrode), pC.
@@ -65,7 +65,7 @@ class WhitenedFeatures:
 
 
 def logarithmic_features(mean_logarithm: Array) -> ChargeFeatures:
-    """Return features for positive charges, which are the logarithms of charge / typical charge.
+    """Return features for positive charges: the logarithms of charge / typical charge.
 
     The typical charge of an electrode is the power of two nearest to the geometric mean of its charges. A division by a
     power of two is exact in float32. The logarithms of the quotients are near 0, where float32 has the smallest errors.
@@ -81,9 +81,9 @@ def logarithmic_features(mean_logarithm: Array) -> ChargeFeatures:
 
 
 def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
-    """Return features for charges of both signs, which are the inverse hyperbolic sines of charge / typical charge.
+    """Return features for charges of both signs: the inverse hyperbolic sines of charge / typical charge.
 
-    The features limit each charge to the range of the given charges, which is enlarged by a margin on both sides.
+    Before the conversion, each charge is limited to the range of the given charges plus a margin on both sides.
 
     Args:
         charge: Charges of presses, shape (n, n_electrode), pC.
@@ -104,7 +104,7 @@ def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
 def whitening(values: Array, min_relative_std: float = 0.0) -> tuple[Array, Array]:
     """Compute the whitening transform of values by a principal component analysis.
 
-    The transformed values (values - mean) @ matrix have a covariance that is the identity matrix.
+    The covariance of the transformed values (values - mean) @ matrix is the identity matrix.
 
     Args:
         values: Values, shape (n, k).

@@ -1,9 +1,9 @@
 """Training of a network on presses.
 
 The contact perceptron learns the mean and the standard deviation of the contact by maximum likelihood, with fresh noise
-on the charges in every step. In the first steps, it learns only the mean, by least squares. If a teacher is given, the
-contact perceptron learns the teacher's answers to these charges instead. The misfit perceptron learns from charges of
-many kinds, whose distance from the nearest contact of the domain is computed beforehand.
+on the charges in every step. In the first steps, it learns only the mean by least squares. If a teacher is given, the
+contact perceptron learns the teacher's answers to these charges instead. The misfit perceptron learns the residuals of
+many kinds of charges with respect to the nearest contact. These residuals are computed before the training.
 """
 
 import logging
@@ -74,8 +74,8 @@ N_STD_PRESSES = 30_000
 def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run: ResumableRun | None = None) -> Fitted:
     """Train a network on presses, fold it into the form of a release, and calibrate its standard deviations.
 
-    A warning is logged if two contacts of the requested domain have the same charges, and if the errors of the network
-    are clearly larger than the errors of an exact search.
+    A warning is logged if two contacts of the requested domain have the same charges. Another warning is logged if the
+    errors of the network are clearly larger than the errors of an exact search.
 
     Args:
         source: A dataset, simulated or measured, or other training data, for example of a student.
@@ -125,7 +125,8 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
 def _fold_and_calibrate(trained: "TrainedNetwork", config: TrainingConfig) -> FoldedNetwork:
     """Fold a trained network, and fit its standard deviations and its correlations to its errors.
 
-    The standard deviations are only fitted to simulated presses, whose noise is known.
+    The standard deviations are fitted only if the presses are simulated, because the noise of measured presses is not
+    known.
 
     Args:
         trained: The network in PyTorch and its presses.
@@ -142,10 +143,9 @@ def _fold_and_calibrate(trained: "TrainedNetwork", config: TrainingConfig) -> Fo
 
 
 def _is_noise_known(data: TrainingData, noise: NoiseModel) -> bool:
-    """Return whether the charges of the presses get noise with known standard deviations greater than zero.
+    """Return whether the training adds noise to charges that have no other noise.
 
-    Measured charges already have noise, whose standard deviations are not known. A training without noise has the
-    standard deviation zero.
+    Measured charges already contain noise with unknown standard deviations.
 
     Args:
         data: Training data.
@@ -157,7 +157,7 @@ def _is_noise_known(data: TrainingData, noise: NoiseModel) -> bool:
 def _provenance(
     data: TrainingData, folded_charges: ChargeSeries | None, cautions: tuple[str, ...], config: FitConfig
 ) -> Provenance:
-    """Return the provenance of the training data with the settings of the training.
+    """Return the provenance of the training data, to which the settings of the training are added.
 
     Args:
         data: Training data.
@@ -179,7 +179,7 @@ def _provenance(
 
 
 def fit_identity(data: TrainingData, config: FitConfig) -> dict[str, object]:
-    """Return everything that determines the weights, as the identity of a resumable run."""
+    """Return all values on which the trained weights depend, as the identity of a resumable run."""
     identity: dict[str, object] = {
         "dataset_sha256": data.sha256,
         "noise": config.training.noise_model.to_dict(),
@@ -194,7 +194,7 @@ def fit_identity(data: TrainingData, config: FitConfig) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class TrainedNetwork:
-    """A trained network in PyTorch, the presses that it was trained on, and the film outside the working area."""
+    """A trained network in PyTorch, the presses of its training, and the presses outside the working area."""
 
     network: InverseNetwork
     split: Split
@@ -202,9 +202,9 @@ class TrainedNetwork:
 
 
 def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | None = None) -> TrainedNetwork:
-    """Train the contact perceptron and, at the same time in a second thread, the misfit perceptron.
+    """Train the contact perceptron and the misfit perceptron at the same time, in two threads.
 
-    The second thread first simulates the whole film, while this thread splits the presses. The second thread then
+    The second thread first simulates the whole film, while the first thread splits the presses. The second thread then
     trains the misfit perceptron on examples from the working area and from the rest of the film.
 
     Args:
@@ -235,7 +235,7 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
         inner_examples = examples.inner()
 
         def train_misfit() -> OutsidePresses | None:
-            """Train the misfit perceptron, and return the film outside the working area if it is simulated."""
+            """Train the misfit perceptron, and return the presses outside the working area if they are simulated."""
             outside = None
             film_presses = whole_film.result() if whole_film is not None else None
             if film_presses is not None:
@@ -265,7 +265,7 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
 
 
 def _check_electrodes(config: NetworkConfig, sensor: Sensor) -> None:
-    """Raise a `ConfigError` if a configuration requires another number of electrodes than the sensor has."""
+    """Raise a `ConfigError` if a configuration is for another number of electrodes than that of the sensor."""
     names = sensor.electrode_names
     if config.electrodes not in (0, len(names)):
         raise ConfigError(
@@ -276,10 +276,10 @@ def _check_electrodes(config: NetworkConfig, sensor: Sensor) -> None:
 
 @contextmanager
 def threads_and_seed(count: int, seed: int) -> Iterator[None]:
-    """Set the seed and the number of threads of PyTorch in a block, and restore the caller's values after it.
+    """Set the seed and the number of threads of PyTorch for a `with` block (context manager).
 
-    BLAS and OpenMP get the same number of threads. The threads of these libraries wait actively at barriers, so a busy
-    second core would make them many times slower.
+    BLAS and OpenMP get the same number of threads. After the block, the previous values are restored. The threads of
+    these libraries wait actively at barriers, so a busy second core would make the libraries many times slower.
 
     Args:
         count: Number of threads.
@@ -299,9 +299,10 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
 def train_perceptron(
     stage: TrainingStage, perceptron: TrainablePerceptron, config: FitConfig, run: ResumableRun | None
 ) -> None:
-    """Train a perceptron; with 8-bit weights, round its hidden weights and then train the other weights further.
+    """Train a perceptron, and if necessary round its hidden weights to 8 bits.
 
-    The further training continues to count the steps of the first training, so that its loss has no warm-up.
+    After the rounding, the other weights are trained further. The further training continues to count the steps of the
+    first training, so that its loss has no warm-up.
 
     Args:
         stage: Loss, validation score and number of steps.
@@ -317,7 +318,7 @@ def train_perceptron(
     perceptron.round_hidden_matrices()
 
     def further_loss(step: int, random: torch.Generator) -> Tensor:
-        """Return the loss of a step, with its number counted from the beginning of the first training."""
+        """Return the loss of a step, whose number is counted from the beginning of the first training."""
         return stage.loss(stage.steps + step, random)
 
     rounded_stage = replace(
@@ -340,12 +341,12 @@ def contact_stage(
     teacher: Teacher | None = None,
     linear_targets: LinearTargets | None = None,
 ) -> TrainingStage:
-    """Return the training of the contact perceptron on charges with fresh noise.
+    """Define the training of the contact perceptron on charges with fresh noise.
 
     Before the training, the linear part of the perceptron is fitted by least squares. The training begins with a
-    warm-up. If there are linear targets, the mean of the network learns from them in the warm-up and until
-    `LINEAR_TARGET_FRACTION` of the steps. The remaining steps minimise the likelihood of the contacts, or the distance
-    from the teacher's answers.
+    warm-up. If there are linear targets, the mean of the network learns from them during the first
+    `LINEAR_TARGET_FRACTION` of the steps, including the warm-up. The remaining steps maximise the likelihood of the
+    contacts, or minimise the distance from the teacher's answers.
 
     Args:
         network: The network, whose contact perceptron is trained.
@@ -371,7 +372,7 @@ def contact_stage(
     linear_steps = round(LINEAR_TARGET_FRACTION * steps)
 
     def loss(step: int, random: torch.Generator) -> Tensor:
-        """Return the loss of a random batch with new noise, in the phase to which the step belongs."""
+        """Return the loss of a random batch with new noise. The form of the loss depends on the step."""
         rows = torch.randint(len(charge), (batch,), generator=random)
         if linear_targets is not None and step < linear_steps:
             return linear_loss(linear_targets.draw(rows, random), unit_contact[rows], is_warm_up=step < warm_up_steps)
@@ -408,7 +409,7 @@ def contact_stage(
         return mean_and_std_loss + correlation_loss(angles, error, log_std)
 
     def correlation_loss(angles: Tensor, error: Tensor, log_std: Tensor) -> Tensor:
-        """Return the weighted loss of the correlations, which are learned from errors in standard deviations."""
+        """Return the weighted loss of the correlations between errors that are divided by their standard deviations."""
         return CORRELATION_WEIGHT * robust_correlation_loss(angles, error * torch.exp(-log_std))
 
     def score() -> tuple[float, str]:

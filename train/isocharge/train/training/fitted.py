@@ -1,4 +1,4 @@
-"""The result of a training, which is a network with all information that a release needs."""
+"""Result of a training: a network with all information that a release needs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -32,7 +32,7 @@ class Provenance:
 
 
 class Answers(NamedTuple):
-    """Estimates of networks from the charges of n presses.
+    """Contacts, standard deviations and misfits that a network estimates from the charges of n presses.
 
     Attributes:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.

@@ -1,9 +1,9 @@
-"""Definition of a whole network that computes contacts from charges, and its evaluation with NumPy in double precision.
+"""Whole network that computes contacts from charges, and is evaluated with NumPy in double precision.
 
 The network has three parts:
 
-- The input features are computed from the charges. For example, they are the logarithms of positive charges
-  (`isocharge.common.charge_features`).
+- The input features are functions of the charges (`isocharge.common.charge_features`). For positive charges, they are
+  logarithms.
 - A perceptron (`isocharge.common.perceptron`) computes a vector from the input features. The entries of this vector are
   called answers. The whitening of the features and the units of the answers are folded into the first and the last
   layer of the perceptron (`isocharge.train.training.folding`).
@@ -86,7 +86,7 @@ class FoldedNetwork:
         return slice(N_CONTACT_ANSWERS, N_CONTACT_ANSWERS + self.n_angle)
 
     def answers(self, charge: Array) -> Array:
-        """Compute the answers of the perceptron, from which the outputs are computed.
+        """Compute the answers of the perceptron, which `outputs_from_answers` converts to outputs.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
@@ -122,7 +122,7 @@ class FoldedNetwork:
         return self.outputs_from_answers(self.answers(charge))
 
     def outputs_from_answers(self, answers: Array) -> tuple[Array, ...]:
-        """Compute the outputs of the model from the answers, which are the outputs of the last layer.
+        """Compute the outputs of the model from the answers of the perceptron.
 
         Args:
             answers: Answers, shape (n, n_answer): x, y and ln F, the logarithms of the standard deviations, the angles
@@ -147,7 +147,7 @@ class FoldedNetwork:
         return tuple(outputs)
 
     def with_scaled_std(self, position_factor: float, force_factor: float) -> "FoldedNetwork":
-        """Return a network whose standard deviations of position and force are multiplied by two given factors."""
+        """Return a network that multiplies its standard deviations of position and force by two given factors."""
         weight, bias = self.layers.last
         bias_change = np.zeros_like(bias)
         bias_change[LOG_STD] = np.log([position_factor, position_factor, force_factor])
@@ -164,7 +164,7 @@ class FoldedNetwork:
         """
 
         def insert_columns(values: Array, angle_values: Array) -> Array:
-            """Insert the columns of the angles after the columns of the contact, before those of the misfit vector."""
+            """Insert the columns of the angles between the columns of the contact and those of the misfit vector."""
             contact_values, misfit_values = np.split(values, [N_CONTACT_ANSWERS], axis=-1)
             return np.concatenate([contact_values, angle_values, misfit_values], axis=-1)
 

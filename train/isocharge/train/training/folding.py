@@ -2,7 +2,7 @@
 
 In a prediction for a single press, the overhead of each node of the graph takes more time than the arithmetic. The
 whitening of the inputs is therefore included in the first layer, and the scaling of the outputs is included in the last
-layer. Two perceptrons with the same inputs become one perceptron, whose later layers have block-diagonal weights.
+layer. Two perceptrons with the same inputs become one perceptron. Its later layers have block-diagonal weights.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +23,7 @@ LOG_FORCE_STD = slice(LOG_STD.stop - 1, LOG_STD.stop)
 def fold(
     perceptrons: Sequence[Perceptron[Array]], mean: Array, matrix: Array, answer_map: Layer[Array]
 ) -> Perceptron[Array]:
-    """Fold several perceptrons into one perceptron, which computes answers from features that are not whitened.
+    """Fold several perceptrons into one perceptron that computes answers from features without whitening.
 
     The whitening of the features becomes part of the first layer and of the skip layer. The linear map from the outputs
     to the answers becomes part of the last layer and of the skip layer.
@@ -79,7 +79,7 @@ def linear_answer_map(domain: Domain, rotation: Array, offset: Array, n_electrod
     """Return the linear map from the outputs of the contact perceptron and the misfit perceptron to the answers.
 
     The outputs contain the logarithm of the relative standard deviation of the force. The answers contain the logarithm
-    of the absolute standard deviation, which is larger by ln F. The map therefore adds ln F.
+    of its absolute standard deviation. The map therefore adds ln F to the logarithm.
 
     Args:
         domain: Domain that defines the centre and the scale of the unit coordinates.
@@ -105,7 +105,7 @@ def linear_answer_map(domain: Domain, rotation: Array, offset: Array, n_electrod
 
 
 def _join_perceptrons(perceptrons: Sequence[Perceptron[Array]]) -> Perceptron[Array]:
-    """Join several perceptrons with the same inputs into one perceptron that computes the outputs of all of them."""
+    """Join several perceptrons with the same inputs into one perceptron, which computes all their outputs."""
     # Each entry of `first` and `others` contains the layers of all perceptrons at one depth.
     first, *others = zip(*(perceptron.hidden for perceptron in perceptrons), strict=True)
     hidden = [_join_layers(first, np.hstack)]  # the first layers have the same inputs
@@ -119,7 +119,7 @@ def _join_perceptrons(perceptrons: Sequence[Perceptron[Array]]) -> Perceptron[Ar
 
 
 def _join_layers(layers: Sequence[Layer[Array]], join_weights: Callable[[Sequence[Array]], Array]) -> Layer[Array]:
-    """Join several layers into one layer, whose outputs are the outputs of all these layers in order.
+    """Join several layers into one layer, which computes the outputs of all these layers in order.
 
     Args:
         layers: Layers to join.

@@ -9,14 +9,15 @@ estimate (Aitken 1936), which is linear in the noise:
 Here J contains the derivatives of the charges with respect to the contact, W is the inverse of the covariance of the
 noise, and P is the inverse of the covariance of all contacts.
 
-The target m has two advantages over the contact c. First, m is nearly a function of the charges, while c also contains
-the scatter of a single draw of the noise. Second, A does not depend on the size of the noise. Therefore the network can
-learn from larger noise, which shows it more clearly how its estimate has to change with the charges. Both matter for
-sensors with many electrodes: three directions of their charges are caused by a change of the contact, and the network
-has to learn that the noise in all other directions has no influence on the estimate.
+The posterior mean m is a better target for the network than the contact c, for two reasons. First, m is nearly a
+function of the charges, while the relation between c and the charges contains random noise. Second, A hardly depends on
+the size of the noise. Therefore, the noise can be enlarged in the training, so that the network learns more clearly how
+m changes with the charges. Both reasons matter for sensors with many electrodes. A change of the contact changes their
+charges along only three directions. The network has to learn that noise along all other directions has no influence on
+m.
 
-The estimate is only linear in the noise if the contact hardly changes within the noise. The target of every other press
-is its contact, and its noise is not enlarged.
+The posterior mean is linear in the noise only if the standard deviation of the contact is small. For every other press,
+the target is the contact, and the noise is not enlarged.
 """
 
 from dataclasses import dataclass
@@ -46,7 +47,7 @@ UNIT_PRECISION = 3.0
 
 
 class TargetBatch(NamedTuple):
-    """Presses with noise, and what the network learns from them.
+    """Charges with noise, and the targets that the network learns from these charges.
 
     Attributes:
         charge: Charges with noise, shape (n, n_electrode), pC.
@@ -61,7 +62,7 @@ class TargetBatch(NamedTuple):
 
 @dataclass(frozen=True)
 class LinearTargets:
-    """Presses without noise, and the linear estimates of their contacts.
+    """Presses without noise, and matrices with which targets follow the noise that is added later.
 
     Attributes:
         charge: Charges without noise, shape (n, n_electrode), pC.
@@ -109,7 +110,7 @@ class LinearTargets:
         )
 
     def draw(self, rows: Tensor, random: torch.Generator) -> TargetBatch:
-        """Add new noise to the charges of some presses, and compute the targets.
+        """Add new noise to the charges of some presses, and compute the targets for these charges.
 
         Args:
             rows: Numbers of the presses, shape (n,).
@@ -118,5 +119,5 @@ class LinearTargets:
         charge = self.charge[rows]
         noise_factor = self.noise_factor[rows]
         noise = noise_factor * fresh_noise(charge, self.noise, random)
-        change = (self.gain[rows] @ noise[:, :, None])[:, :, 0]  # A n, shape (n, 3)
-        return TargetBatch(charge + noise, self.contact[rows] + change, noise_factor)
+        contact_change = (self.gain[rows] @ noise[:, :, None])[:, :, 0]  # A n, shape (n, 3)
+        return TargetBatch(charge + noise, self.contact[rows] + contact_change, noise_factor)

@@ -1,4 +1,4 @@
-"""Loss functions of the contact and misfit perceptrons, and the noise that is added to the charges in every step."""
+"""Loss functions of the contact and misfit perceptrons, and noise that is added to charges during the training."""
 
 import numpy as np
 import torch
@@ -51,15 +51,15 @@ def fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor
 
 
 def with_fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor:
-    """Return charges with noise that is drawn by `fresh_noise`. The arguments are those of `fresh_noise`."""
+    """Add noise to charges. The noise and the arguments are those of `fresh_noise`."""
     return charge + fresh_noise(charge, noise, random)
 
 
 def warm_up_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
-    """Compute the loss of the first steps: least squares for the mean.
+    """Compute the loss of the warm-up, in which the mean is fitted by least squares.
 
-    The standard deviations are fitted to the errors of the mean, but their gradient does not reach the mean. A Gaussian
-    likelihood with free standard deviations would find the mean slowly.
+    The standard deviations are fitted to the errors of the mean, but they do not influence the mean. If the mean and
+    the standard deviations were fitted together by a Gaussian likelihood, the mean would be found slowly.
 
     Args:
         mean: Estimated unit coordinates, shape (n, 3).
@@ -72,7 +72,7 @@ def warm_up_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
 
 
 def likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
-    """Compute the negative logarithm of a Gaussian likelihood without its constant.
+    """Compute the negative logarithm of a Gaussian likelihood, without the constant term.
 
     Args:
         mean: Estimated unit coordinates, shape (n, 3).
@@ -84,7 +84,7 @@ def likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
 
 
 def weighted_likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
-    """Compute a loss with the same minimum as `likelihood_loss`, in which uncertain presses count more.
+    """Compute a loss with the same minimum as `likelihood_loss`, but with larger weights for uncertain presses.
 
     Args:
         mean: Estimated unit coordinates, shape (n, 3).
@@ -95,7 +95,9 @@ def weighted_likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> T
 
 
 def linear_target_loss(mean: Tensor, log_std: Tensor, target: Tensor, error: Tensor) -> Tensor:
-    """Compute the loss of `weighted_likelihood_loss` for a mean that learns from targets which follow the noise.
+    """Compute a loss like `weighted_likelihood_loss`, but with different targets for mean and standard deviation.
+
+    The mean learns from targets that follow the noise, and the standard deviations learn from separately given errors.
 
     Args:
         mean: Estimated unit coordinates, shape (n, 3).
@@ -109,11 +111,11 @@ def linear_target_loss(mean: Tensor, log_std: Tensor, target: Tensor, error: Ten
 def _weighted_mean_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
     """Compute the weighted squared errors of the mean.
 
-    The gradient of a Gaussian likelihood with respect to the mean is divided by the variance. Where a network
-    overestimates the standard deviation, it therefore learns the mean slowly (Seitzer et al., 2022, arXiv 2203.09168).
-    In this loss, the squared errors of a Gaussian likelihood are multiplied by the estimated standard deviation to the
-    power of `2 * STD_EXPONENT`. The mean of these factors over the presses is 1. The standard deviations are constants
-    in this loss.
+    The gradient of a Gaussian likelihood with respect to the mean is divided by the variance. Therefore, a network
+    learns the mean slowly where it overestimates the standard deviation (Seitzer et al., 2022, arXiv 2203.09168). In
+    this loss, the squared errors of a Gaussian likelihood are multiplied by the estimated standard deviation to the
+    power of `2 * STD_EXPONENT`. These factors are scaled so that their mean over the presses is 1. The standard
+    deviations are constants in this loss, so they receive no gradient.
 
     Args:
         mean: Estimated unit coordinates, shape (n, 3).
@@ -131,7 +133,7 @@ def _weighted_mean_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor
 
 
 def _std_loss(log_std: Tensor, error: Tensor) -> Tensor:
-    """Compute the negative logarithm of a Gaussian likelihood in which only the standard deviations are variables.
+    """Compute the negative logarithm of a Gaussian likelihood as a function of only the standard deviations.
 
     Args:
         log_std: Logarithms of the standard deviations, shape (n, 3).
@@ -144,12 +146,12 @@ def _std_loss(log_std: Tensor, error: Tensor) -> Tensor:
 
 
 def robust_correlation_loss(angles: Tensor, deviation: Tensor) -> Tensor:
-    """Compute the negative logarithm of a likelihood of correlated errors with unit variances, without its constant.
+    """Compute the negative logarithm of a likelihood of correlated errors with unit variances.
 
-    The loss trains the hidden layers to represent the correlations. The likelihood is Gaussian for whitened errors up
-    to `MAX_NORMAL_ERROR`. Larger errors have a likelihood with longer tails, so that single presses do not dominate the
-    gradient. No gradient flows into the errors. This loss therefore does not train the outputs for mean and standard
-    deviation.
+    The constant term is omitted. The loss trains the hidden layers to represent the correlations. The likelihood is
+    Gaussian for whitened errors up to `MAX_NORMAL_ERROR`. For larger errors, the likelihood has longer tails, so that
+    single presses do not dominate the gradient. The errors receive no gradient. Therefore, this loss does not train the
+    outputs for the mean and the standard deviation.
 
     Args:
         angles: Angles a, b and c of `isocharge.train.training.correlation` minus a right angle, shape (n, 3), rad.
@@ -171,9 +173,10 @@ def robust_correlation_loss(angles: Tensor, deviation: Tensor) -> Tensor:
 
 
 def _long_tailed_square(values: Tensor) -> Tensor:
-    """Return the squares of values up to `MAX_NORMAL_ERROR`, and a logarithm of larger values.
+    """Return the square of each value up to `MAX_NORMAL_ERROR`, and a logarithmic function of each larger value.
 
-    The logarithm has the same value and the same slope as the square at `MAX_NORMAL_ERROR`.
+    At `MAX_NORMAL_ERROR`, the logarithmic function has the same value and the same slope as the square. The signs of
+    the values do not matter.
     """
     squares = values**2
     largest_square = MAX_NORMAL_ERROR**2
@@ -204,10 +207,11 @@ def mean_squared_distance(vector: Tensor, target: Tensor) -> Tensor:
 
 
 def focused_squared_distance(vector: Tensor, target: Tensor, focus: float) -> Tensor:
-    """Compute a weighted mean of the squared distances between vectors, in which long targets have small weights.
+    """Compute a weighted mean of the squared distances between vectors, with small weights for long targets.
 
     The weight is proportional to 1 / (1 + |target|^2 / focus^2). With these weights, the network becomes most accurate
-    for misfits up to the threshold of the flag `misfit`. The exact value of a larger misfit matters little.
+    for misfits up to the threshold of the flag `misfit`. The exact value of a misfit far above this threshold matters
+    little.
 
     Args:
         vector: Estimated vectors, shape (n, n_electrode).
@@ -220,7 +224,7 @@ def focused_squared_distance(vector: Tensor, target: Tensor, focus: float) -> Te
 
 
 def validation_score(mean: Tensor, log_std: Tensor, target: Tensor, domain: Domain, samples: str) -> tuple[float, str]:
-    """Compute the likelihood loss on validation data, and a text with the errors for the progress report.
+    """Compute the likelihood loss for validation data, and a text about the errors for the progress report.
 
     Args:
         mean: Estimated unit coordinates, shape (n, 3).

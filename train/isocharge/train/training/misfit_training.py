@@ -70,7 +70,7 @@ It is twice the smallest threshold of the flag `misfit`.
 class MisfitExamples:
     """Source of the examples from which the misfit network learns.
 
-    The examples are saved in the run, because the search for the nearest contacts takes long.
+    The examples are saved in the run, because the search for the nearest contacts takes a long time.
 
     Attributes:
         split: Presses for training, and the charge field in which the search finds the nearest contacts.
@@ -85,7 +85,7 @@ class MisfitExamples:
     run: ResumableRun | None
 
     def inner(self) -> Array:
-        """Draw examples from presses inside the working area with the function `draw_misfit_examples`.
+        """Draw examples from presses inside the working area; see `draw_misfit_examples`.
 
         Returns:
             Charges, pC, and residuals, shape (2, n, n_electrode).
@@ -102,7 +102,7 @@ class MisfitExamples:
         return self._saved_or_drawn("misfit-charges", draw)
 
     def with_outside(self, inner_examples: Array, outside: OutsidePresses | None) -> Array:
-        """Replace a share of the examples by examples of presses outside the working area.
+        """Replace a fraction of the examples by examples of presses outside the working area.
 
         Args:
             inner_examples: Result of `inner`.
@@ -145,14 +145,14 @@ class MisfitExamples:
 
     @property
     def _has_positive_charges(self) -> bool:
-        """Whether all charges are positive. In this case, the input features are logarithms."""
+        """Whether all charges are positive. The input features of positive charges are logarithms."""
         return self.features.charge_features.mean is None  # only features of charges of both signs have a mean
 
     @property
     def _options(self) -> ExampleOptions:
         """Options for drawing examples.
 
-        Charges of both signs are clipped to the limits of the input features.
+        For charges of both signs, the options limit the charges to the range of the input features.
         """
         starts = MANY_SEARCH_STARTS if self._has_many_electrodes else SEARCH_STARTS
         if self._has_positive_charges:
@@ -163,7 +163,7 @@ class MisfitExamples:
     def _noise(self) -> Noise:
         """Return the noise of presses without faults.
 
-        If the charges have both signs, the noise of each channel is returned separately.
+        For charges of both signs, the result contains a separate value for each channel.
         """
         noise = misfit_noise(self.config.noise_model)
         if self._has_positive_charges:
@@ -171,7 +171,7 @@ class MisfitExamples:
         return ChannelNoise.alike(noise, self.features.charge_features.n_electrode)
 
     def _saved_or_drawn(self, name: str, draw: Callable[..., Array]) -> Array:
-        """Return the examples that the run has saved under a name. If there are no such examples, draw and save them.
+        """Return the examples that the run has saved under a name. If the run has saved none, draw and save examples.
 
         Args:
             name: Name of the examples in the run.
@@ -203,16 +203,16 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_UNIT))  # compressed length of a residual of length `FOCUS_MISFIT`
 
     def distance(rows: Tensor | slice) -> Tensor:
-        """Return the weighted mean of the squared distances between outputs and targets, for some of the examples."""
+        """Return the weighted mean of the squared distances between outputs and targets for selected examples."""
         return focused_squared_distance(network.misfit_vector(inputs[rows]), targets[rows], focus)
 
-    def loss(_: int, random: torch.Generator) -> Tensor:
+    def loss(_: int, random: torch.Generator) -> Tensor:  # the loss is the same in every step
         """Return the weighted mean of the squared distances for a random batch of the training examples."""
         batch_rows = torch.randint(n_train, (config.batch,), generator=random)
         return distance(batch_rows)
 
     def score() -> tuple[float, str]:
-        """Return the weighted mean of the squared distances for the validation examples, and a text that reports it."""
+        """Return the weighted mean of the squared distances for the validation examples, and a text about this mean."""
         validation_loss = distance(slice(n_train, None)).item()
         return validation_loss, f"{validation_loss:.4f} on watched charges"
 

@@ -1,15 +1,15 @@
-"""Network for training in PyTorch, which estimates contacts, standard deviations and misfits from charges.
+"""Trainable network in PyTorch that estimates contacts, standard deviations and misfits from charges.
 
 The inputs are whitened logarithms of the charges (`isocharge.train.training.features`). The force scales all charges by
-nearly the same factor. The common factor of the charges therefore depends mostly on the force, and their ratios depend
-mostly on the position. A first perceptron estimates the means of x, y and ln F and the logarithms of their standard
-deviations.
+nearly the same factor. Therefore, the common factor of the charges depends mostly on the force, and the ratios of the
+charges depend mostly on the position. A first perceptron estimates the means of x, y and ln F and the logarithms of
+their standard deviations.
 
 A second perceptron estimates the misfit vector (Q - Q(c)) / sigma. Here, Q are the measured charges, sigma are the
-standard deviations of their noise, and Q(c) are the charges of the contact c for which the vector is shortest. The
-length of the misfit vector is the misfit. If the measured charges are exactly those of a contact, the vector is zero.
-Near such charges, the vector is a smooth function of the charges, but its length is not. The length of the vector
-ranges from a tenth to thousands, so it is compressed by the function asinh.
+standard deviations of their noise, and Q(c) are the charges of a contact c. The contact c is chosen so that the vector
+is as short as possible. The length of the misfit vector is the misfit. If the measured charges agree exactly with the
+charges of a contact, the vector is zero. Near such charges, the vector is a smooth function of the charges, but its
+length is not. The length of the vector may be a tenth or several thousand, so it is compressed by the function asinh.
 """
 
 from collections.abc import Sequence
@@ -59,8 +59,8 @@ class TrainablePerceptron(nn.Module):
     """A perceptron with a skip layer (`isocharge.common.perceptron`).
 
     The logarithm of the force is nearly a linear function of the logarithms of the charges. The network must estimate
-    the logarithm of the force with an error of about a thousandth of its range. With the skip layer, the hidden layers
-    only need to learn the nonlinear part of this function.
+    the logarithm of the force with an error of about a thousandth of its range. The skip layer learns the linear part
+    of this function, so that the hidden layers only need to learn the nonlinear part.
 
     Args:
         n_input: Number of inputs.
@@ -86,12 +86,12 @@ class TrainablePerceptron(nn.Module):
         nn.init.zeros_(self.skip.weight)
 
     def sharpen_first_layer(self) -> None:
-        """Draw the first layer again with larger weights, so that its units are nonlinear at random places.
+        """Replace the weights of the first layer by larger random weights, so that its units are clearly nonlinear.
 
         Near the rim of the working area, the posterior mean of the contact is a strongly nonlinear function of the
-        charges. Units that are nearly linear for all inputs learn such a function slowly. Each unit therefore gets a
-        random direction in the space of the inputs and a random slope along this direction. The argument of its
-        activation is zero at a random centre.
+        charges. Units that are nearly linear for all inputs learn such a function slowly. Therefore, each unit gets a
+        random direction in the space of the inputs, a random slope along this direction, and a random centre. At the
+        centre, the argument of the activation is zero.
         """
         first, *_ = self.linear_layers()
         n_unit = first.out_features
@@ -106,8 +106,8 @@ class TrainablePerceptron(nn.Module):
     def fit_linear_part(self, inputs: Tensor, targets: Tensor) -> None:
         """Fit the first outputs to targets by linear least squares, and store the coefficients in the skip layer.
 
-        At the beginning of the training, the hidden layers then contribute little to these outputs. During the
-        training, they learn the nonlinear part of the outputs.
+        The weights from the hidden layers to these outputs are reduced, so that the hidden layers contribute little at
+        first. During the training, the hidden layers learn the nonlinear part of the outputs.
 
         Args:
             inputs: Inputs, shape (n, n_input).
@@ -136,7 +136,7 @@ class TrainablePerceptron(nn.Module):
         return evaluate(self.definition(), inputs)
 
     def definition(self) -> Perceptron[Tensor]:
-        """Return the definition of the perceptron, which contains the trained tensors themselves instead of copies."""
+        """Return the definition of the perceptron, which refers to the trained tensors without copying them."""
         *hidden, last = (Layer(layer.weight.T, layer.bias) for layer in self.linear_layers())
         return Perceptron(tuple(hidden), last, self.skip.weight.T, self.activation)
 
@@ -156,7 +156,7 @@ class TrainablePerceptron(nn.Module):
     def round_hidden_matrices(self) -> None:
         """Round the weights between hidden layers to 8 bits, and exclude these weights from further training.
 
-        Each rounded weight is the product of an integer from -127 to 127 and a scale. All weights of an output have the
+        Each rounded weight is the product of a scale and an integer from -127 to 127. All weights of an output have the
         same scale.
         """
         for matrix in self.hidden_matrices():
@@ -168,10 +168,10 @@ class TrainablePerceptron(nn.Module):
 
 
 class InverseNetwork(nn.Module):
-    """The whole network, which consists of the contact perceptron and the misfit perceptron.
+    """Network that consists of the contact perceptron and the misfit perceptron.
 
-    The contact perceptron estimates unit coordinates. Unit coordinates are x, y and ln F, scaled such that each of them
-    ranges from -1 to 1 in the domain.
+    The contact perceptron estimates unit coordinates. Unit coordinates are x, y and ln F after a shift and a scaling,
+    so that each of them ranges from -1 to 1 in the domain.
 
     Args:
         domain: Contacts for which the network is trained.
@@ -212,7 +212,7 @@ class InverseNetwork(nn.Module):
         return self.features.charge_features.n_electrode
 
     def inputs(self, charge: Tensor) -> Tensor:
-        """Compute the inputs of both perceptrons, which are whitened features. Finite charges give finite inputs.
+        """Compute whitened features, which are the inputs of both perceptrons. Finite charges give finite inputs.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
@@ -236,7 +236,7 @@ class InverseNetwork(nn.Module):
         return mean, log_std
 
     def posterior_with_angles(self, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Estimate the unit coordinates, their standard deviations and the angles of their correlations.
+        """Estimate the unit coordinates, their standard deviations, and the angles that determine their correlations.
 
         The module `isocharge.train.training.correlation` explains the angles. The angles are trained together with the
         network, so that the hidden layers contain information about the correlations. A released model has other
@@ -338,7 +338,7 @@ def _fold(network: InverseNetwork, perceptrons: Sequence[Perceptron[Array]], ans
 
 
 def _contact_to_numpy(network: InverseNetwork) -> Perceptron[Array]:
-    """Return the contact perceptron as NumPy arrays, without the outputs for the angles of the correlations."""
+    """Return the contact perceptron as NumPy arrays, without its outputs for the angles of the correlations."""
     perceptron = network.contact.to_numpy()
     weight, bias = perceptron.last
     last = Layer(weight[:, :N_CONTACT_ANSWERS], bias[:N_CONTACT_ANSWERS])

@@ -1,4 +1,4 @@
-"""Changes of the last layer of a trained network by ridge regression. The hidden layers are not trained again."""
+"""Functions that fit only the last layer of a trained network again, by ridge regression."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -59,12 +59,12 @@ class Regression:
 def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent_charge: Array, contact: Array) -> FoldedNetwork:
     """Adapt a network to charges that differ from the charges of its training.
 
-    The new network is fitted such that its estimates from `charge` agree with the estimates of the given network from
+    The new network is fitted so that its estimates from `charge` agree with the estimates of the given network from
     `equivalent_charge`. First, a linear map from the features of `charge` to the features of `equivalent_charge` is
-    included in the first layer. Then the last layer is fitted to the differences that remain between the estimates.
+    included in the first layer. Then the last layer is fitted to the remaining differences between the estimates.
     Finally, the standard deviations are fitted to the errors of the new network by maximising the Gaussian likelihood.
-    The maximum is found by Fisher's scoring (McCullagh and Nelder 1989, section 2.5), which is a regression on the
-    squares of error / standard deviation.
+    The maximum is found by Fisher's scoring (McCullagh and Nelder 1989, section 2.5). Each step of this method is a
+    regression on the squares of error / standard deviation.
 
     Args:
         network: The given network.
@@ -92,7 +92,7 @@ def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent_charge: A
         return targets
 
     def std_targets(outputs: Array) -> Array:
-        """Return the present outputs, but with standard deviations that are changed by one scoring step."""
+        """Return the present outputs with new standard deviations, which one scoring step computes."""
         return _scoring_step(outputs, log_contact, MAX_ERROR, expected_square=1.0)
 
     # Fit the last layer first to the contacts, and then in several scoring steps to the standard deviations.
@@ -103,10 +103,10 @@ def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent_charge: A
 
 
 def _scoring_step(outputs: Array, log_contact: Array, largest_error: float, expected_square: float) -> Array:
-    """Change the standard deviations in the outputs of a network by one step of Fisher's scoring.
+    """Change the standard deviations among the outputs of a network by one step of Fisher's scoring.
 
     The step adds (e^2 / expected_square - 1) / 2 to the logarithm of each standard deviation. In this formula, e is the
-    error divided by the standard deviation, but at most `largest_error`.
+    absolute error divided by the standard deviation, and is limited to `largest_error`.
 
     Args:
         outputs: Outputs of the last layer, shape (n, n_answer).
@@ -119,13 +119,13 @@ def _scoring_step(outputs: Array, log_contact: Array, largest_error: float, expe
     """
     error = np.abs(outputs[:, MEAN] - log_contact) * np.exp(-relative_log_std(outputs))  # in standard deviations
     limited_error = np.minimum(error, largest_error)
-    changed = outputs.copy()
-    changed[:, LOG_STD] += 0.5 * (limited_error**2 / expected_square - 1.0)
-    return changed
+    changed_outputs = outputs.copy()
+    changed_outputs[:, LOG_STD] += 0.5 * (limited_error**2 / expected_square - 1.0)
+    return changed_outputs
 
 
 def _linear_fit(inputs: Array, outputs: Array) -> Layer[Array]:
-    """Fit a linear layer that computes given outputs from given inputs with the smallest sum of squared errors.
+    """Fit a linear layer that computes given outputs from given inputs, by least squares.
 
     Args:
         inputs: Inputs of the layer, shape (n, n_input).
@@ -143,9 +143,8 @@ def fit_std(network: FoldedNetwork, charge: Array, contact: Array) -> FoldedNetw
 
     Where the map from contacts to charges nearly folds, the errors have longer tails than a normal distribution. If the
     Gaussian likelihood were maximised, the confidence intervals would contain more contacts than they should. The
-    errors are therefore limited to `CORE_ERROR` standard deviations. The standard deviations are chosen such that the
-    mean square of the limited errors is equal to that of a normal variable with the same limit (Huber 1964, proposal
-    2).
+    errors are therefore limited to `CORE_ERROR` standard deviations. The standard deviations are chosen so that the
+    mean square of the limited errors is the same as for a normal variable with the same limit (Huber 1964, proposal 2).
 
     Args:
         network: The trained network.
@@ -159,7 +158,7 @@ def fit_std(network: FoldedNetwork, charge: Array, contact: Array) -> FoldedNetw
     expected_square = _mean_square_of_limited_normal(CORE_ERROR)
 
     def std_targets(outputs: Array) -> Array:
-        """Return the present outputs, but with standard deviations that are changed by one scoring step."""
+        """Return the present outputs with new standard deviations, which one scoring step computes."""
         return _scoring_step(outputs, log_contact, CORE_ERROR, expected_square=expected_square)
 
     features = network.features.evaluate(charge)
@@ -180,7 +179,7 @@ def _mean_square_of_limited_normal(limit: float) -> float:
 
 
 def add_variance(network: FoldedNetwork, charge: Array, variance: Array) -> FoldedNetwork:
-    """Return a network whose estimated variances are larger by given amounts.
+    """Return a network whose estimated variances are increased by given variances.
 
     The last layer is fitted to the larger standard deviations at the given charges.
 
@@ -206,9 +205,10 @@ def add_variance(network: FoldedNetwork, charge: Array, variance: Array) -> Fold
 def refit_last_layer(
     perceptron: Perceptron[Array], features: Array, regressions: list[Regression]
 ) -> Perceptron[Array]:
-    """Fit the last layer and the skip layer to new outputs by a ridge regression of the changes of their weights.
+    """Fit the last layer and the skip layer to new outputs by ridge regressions, which penalise changes of the weights.
 
-    Weights of the last layer that are zero remain zero, so that each output depends on the same hidden units as before.
+    Weights of the last layer that are zero remain zero. Each output therefore depends on the same hidden units as
+    before.
 
     Args:
         perceptron: The given perceptron.

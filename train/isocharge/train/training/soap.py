@@ -1,6 +1,6 @@
 """The optimiser SOAP, which applies Adam in the eigenbasis of the second moments of the gradient.
 
-For the gradient G of each weight matrix, the optimiser averages the matrices G G^T and G^T G over the steps. In the
+Let G be the gradient of a weight matrix. The optimiser averages the matrices G G^T and G^T G over the steps. In the
 basis of the eigenvectors of these averages, the entries of the gradient are nearly uncorrelated. Adam scales each entry
 separately. In this basis, Adam therefore comes close to a second-order method (Vyas et al., 2024, arXiv 2409.11321,
 algorithm 3). The eigenvectors change slowly, and are updated every few steps by one orthogonal iteration.
@@ -23,9 +23,9 @@ EPSILON = 1e-10
 class Soap:
     """The optimiser SOAP. Parameters with one dimension, such as biases, are trained by Adam.
 
-    The class has only those methods of PyTorch's optimisers that a training needs. The class is not derived from
-    `torch.optim.Optimizer`, because the creation of the first object of that class imports PyTorch's compiler, which
-    takes long.
+    The class has only a few methods of PyTorch's optimisers, which suffice for a training. The class is not derived
+    from `torch.optim.Optimizer`, because the first object of that class imports PyTorch's compiler, which takes a long
+    time.
 
     Args:
         params: Parameters, or groups of parameters in the form that all optimisers of PyTorch accept. A parameter with
@@ -45,7 +45,7 @@ class Soap:
     ) -> None:
         """Prepare the optimiser. The class describes the arguments.
 
-        Parameters that are given without a group form one group with the settings `lr` and `betas`.
+        Parameters that do not belong to a group form one group with the settings `lr` and `betas`.
         """
         defaults: dict[str, Any] = {"lr": lr, "betas": betas}
         self.param_groups: list[dict[str, Any]] = []
@@ -85,7 +85,7 @@ def _update(
     """Change one parameter and its state by one step of SOAP (Vyas et al., 2024, algorithm 3).
 
     The averaged gradient is rotated into the eigenbasis. The entries of the rotated gradient are divided by their root
-    mean squares, as in Adam. The result is rotated back and gives the direction of the step.
+    mean squares, as in Adam. The result is rotated back, and is the direction of the step.
 
     Args:
         parameter: Parameter to change.
@@ -121,7 +121,9 @@ def _update(
 
 
 def _initial_state(gradient: Tensor) -> dict[str, Any]:
-    """Return the state of a parameter before its first step, with averages of zero and identity matrices as eigenbases.
+    """Return the state of a parameter before its first step.
+
+    The averages are zero, and the eigenbases are identity matrices.
 
     Args:
         gradient: Gradient of the parameter, which is an array of matrices, shape (..., n_row, n_column), or a vector. A
@@ -142,7 +144,7 @@ def _initial_state(gradient: Tensor) -> dict[str, Any]:
 
 
 def _update_basis(state: dict[str, Any]) -> None:
-    """Update both eigenbases by one orthogonal iteration, which brings them nearer to the eigenvectors."""
+    """Bring both eigenbases closer to the eigenvectors by one orthogonal iteration."""
     for name in ("row", "column"):
         basis = state[f"{name}_basis"]
         state[f"{name}_basis"] = torch.linalg.qr(state[f"{name}_moment"] @ basis).Q

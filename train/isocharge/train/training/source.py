@@ -1,4 +1,4 @@
-"""Training data of a network, which are simulated or measured presses or the answers of another model."""
+"""Training data of a network: simulated presses, measured presses, or the answers of another model."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -16,11 +16,11 @@ from isocharge.train.training.network import as_tensor
 
 @dataclass(frozen=True)
 class Teacher:
-    """A model whose answers a smaller network learns (knowledge distillation, Hinton et al., 2015).
+    """A model from which a smaller network learns (knowledge distillation, Hinton et al., 2015).
 
-    The true contact of a press is only one sample from the posterior distribution of the contact, given its noisy
-    charges. A good model estimates this distribution without the scatter of single samples. A small network therefore
-    learns faster from the answers of such a model than from the true contacts.
+    For given noisy charges, the true contact is only one sample from the posterior distribution of the contact. A good
+    model estimates this distribution without the scatter of single samples. A small network therefore learns faster
+    from the answers of such a model than from the true contacts.
 
     Attributes:
         label: Name and version of the model.
@@ -34,7 +34,7 @@ class Teacher:
     answer: Callable[[Array], tuple[Array, Array]]
 
     def posterior(self, charge: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
-        """Estimate the means of the unit coordinates and the logarithms of their standard deviations with the model.
+        """Estimate the means of the unit coordinates and the logarithms of their standard deviations, using the model.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
@@ -51,7 +51,7 @@ class Teacher:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingData:
-    """Presses for the training of one network, and presses for measuring its errors.
+    """Presses for the training of one network, and presses for the measurement of its errors.
 
     Attributes:
         sensor: Sensor to which the presses belong.

@@ -1,4 +1,4 @@
-"""Split of presses into three parts, which are used for training, for validation and for the test."""
+"""Split of presses into three parts: for training, for validation and for the test."""
 
 from dataclasses import dataclass, replace
 
@@ -50,11 +50,11 @@ class Split:
 
     @classmethod
     def of(cls, data: TrainingData, training: TrainingConfig) -> "Split":
-        """Split presses into three parts for training, for validation and for the test, and fit a charge field.
+        """Split presses into three parts for training, validation and test, and fit a charge field to them.
 
         The charge field is a map from contacts to charges. A first charge field is fitted to all presses. This first
         field determines the largest disk in which the map certainly does not fold. Only the presses within this disk
-        are used.
+        are distributed among the three parts.
 
         Args:
             data: Presses of the sensor.
@@ -102,7 +102,7 @@ class Split:
 def _split_presses(
     presses: LabelledPresses, training: TrainingConfig
 ) -> tuple[LabelledPresses, LabelledPresses, LabelledPresses]:
-    """Split presses by position into presses for training, for validation and for the test.
+    """Split presses by position into three parts: for training, for validation and for the test.
 
     If the presses are measured, the same presses are always used for the test. Simulated presses are split at random.
 

@@ -1,4 +1,4 @@
-"""Evaluation of input features and perceptrons with PyTorch, which is used for training."""
+"""Evaluation of input features and perceptrons with PyTorch, as the training requires."""
 
 from collections.abc import Sequence
 
@@ -26,15 +26,15 @@ def evaluate_features(features: ChargeFeatures, charge: Tensor) -> Tensor:
         """Convert an array to a tensor with the data type of the charges."""
         return torch.as_tensor(values, dtype=charge.dtype)
 
-    clipped = charge.clamp(as_charge_type(features.low_pC), as_charge_type(features.high_pC))
-    ratio = clipped / as_charge_type(features.typical_pC)
+    clipped_charge = charge.clamp(as_charge_type(features.low_pC), as_charge_type(features.high_pC))
+    ratio = clipped_charge / as_charge_type(features.typical_pC)
     if features.mean is None:
         return torch.log(ratio)
     return torch.asinh(ratio) - as_charge_type(features.mean)
 
 
 def evaluate_hidden_layers(layers: Sequence[Layer[Tensor]], activation: Activation, inputs: Tensor) -> Tensor:
-    """Apply hidden layers to inputs, one after the other.
+    """Apply hidden layers to inputs, one layer after the other.
 
     Args:
         layers: Weights and biases of the hidden layers.

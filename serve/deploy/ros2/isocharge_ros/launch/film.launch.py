@@ -12,7 +12,7 @@ DEFAULT_PARAMETER_FILE = str(Path(get_package_share_directory("isocharge_ros")) 
 
 
 def generate_launch_description():
-    """Return the description of the node, which ROS 2 starts, and starts again whenever the node has ended."""
+    """Describe the node to ROS 2, which starts the node, and starts it again whenever it has ended."""
     parameters = DeclareLaunchArgument(
         "parameters", default_value=DEFAULT_PARAMETER_FILE, description="file of the node's parameters"
     )

@@ -1,8 +1,8 @@
-"""Messages of the gRPC service `inference.GRPCInferenceService`, and functions that convert these messages.
+"""Message classes of the gRPC service, and functions that read requests and write responses.
 
-The classes of the messages are created from the compiled file `inference.proto` in a separate descriptor pool. A
-program can therefore use another implementation of the protocol at the same time, although the messages of both
-implementations have the same names.
+The service is called `inference.GRPCInferenceService`. The message classes are created from the compiled file
+`inference.proto` in a separate descriptor pool. A program can therefore also import another implementation of the
+protocol, although the messages of both implementations have the same names.
 """
 
 from importlib.resources import files
@@ -49,8 +49,9 @@ CONTENT_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
 def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> InferRequest:
     """Read a ModelInferRequest, and return the charges and the requested outputs.
 
-    The message is first converted to the JSON object that an HTTP request would contain. This object is then parsed. If
-    the charges are sent as raw contents, the outputs of the response are also sent as raw contents.
+    The message is first converted to the JSON object that the equivalent HTTP request would contain. The function
+    `parse_request` then reads the JSON object. If the charges are sent as raw contents, the outputs of the response are
+    also sent as raw contents.
 
     Args:
         message: The ModelInferRequest.
@@ -76,7 +77,7 @@ def read_request(message: Any, loaded: LoadedVersion, max_presses: int) -> Infer
 
 
 def _input_object(tensor: Any, raw_charges: bytes | None) -> dict[str, Any]:
-    """Convert an input tensor to the JSON object that an HTTP request would contain.
+    """Convert an input tensor to the JSON object that describes the tensor in an HTTP request.
 
     Args:
         tensor: Message that contains the name, the number type and the shape of the tensor. It may also contain the
@@ -102,9 +103,9 @@ def _input_object(tensor: Any, raw_charges: bytes | None) -> dict[str, Any]:
 
 
 def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
-    """Return the parameters of a tensor that this server does not support.
+    """Return the unsupported parameters of a tensor, each with the value True.
 
-    The server must refuse these parameters, because they change the meaning of a request.
+    The server must refuse unsupported parameters, because they change the meaning of a request.
     """
     return {name: True for name in ("shared_memory_region", "classification") if name in tensor.parameters}
 
@@ -112,8 +113,8 @@ def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
 def write_response(answer: InferAnswer) -> Any:
     """Convert the outputs of a model to a ModelInferResponse.
 
-    If an output was requested as a binary tensor, its values are sent as raw contents. Otherwise they are sent as a
-    list of texts or numbers.
+    If an output was requested as a binary tensor, its values are sent as raw contents. The values of every other output
+    are sent as a list of texts or numbers.
     """
     _, response_type = METHODS["ModelInfer"]
     message = response_type()

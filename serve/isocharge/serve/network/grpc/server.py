@@ -1,6 +1,6 @@
 """gRPC server that makes a `Service` available on a port. The server runs in its own event loop.
 
-No thread waits for the messages of an open call. Calls without messages therefore do not delay other clients.
+No thread waits for the messages of an open call. A call that sends no messages therefore does not delay other clients.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ If a client begins further calls on the connection, they wait in the client.
 
 @contextmanager
 def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> Iterator[str]:
-    """Return a context manager that runs a gRPC server while its block runs.
+    """Return a context manager that runs a gRPC server until the `with` block ends.
 
     Args:
         handler: Handler of the HTTP server. The gRPC server uses its models, limits and token. Clients send the token
@@ -61,7 +61,7 @@ def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) 
 
 @contextmanager
 def _event_loop() -> Iterator[asyncio.AbstractEventLoop]:
-    """Return a context manager that runs an event loop in its own thread while its block runs.
+    """Return a context manager that runs an event loop in a separate thread until the `with` block ends.
 
     Yields:
         The event loop.
@@ -104,7 +104,7 @@ async def _start(handler: Handler, address: str, tls: Tls | None) -> tuple[grpc.
 
 
 def _options(limits: ServerLimits) -> list[tuple[str, int]]:
-    """Return the options with which grpcio applies the limits of a server."""
+    """Convert the limits of a server to options of the package grpcio."""
     return [
         ("grpc.max_receive_message_length", limits.body_bytes),
         ("grpc.max_metadata_size", limits.header_bytes),
@@ -118,7 +118,7 @@ def _options(limits: ServerLimits) -> list[tuple[str, int]]:
 
 
 def _listen(server: grpc.aio.Server, address: str, tls: Tls | None) -> int:
-    """Let a server listen on an address, and return the port on which it listens.
+    """Bind a server to an address, and return the port on which the server listens.
 
     Args:
         server: The server, which has not been started yet.

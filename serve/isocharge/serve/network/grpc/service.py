@@ -2,9 +2,9 @@
 
 The service uses the same models, limits and token as the HTTP server.
 
-Every method is declared as a method that receives a stream of messages. The token and the limits can therefore be
-checked before the first message of a call arrives. If a new call exceeds the largest number of open calls, the service
-ends another call, namely the call that has waited longest for a message from its client.
+Every method of the service is declared as a method that receives a stream of messages. The token and the limits can
+therefore be checked before the first message of a call arrives. If a new call exceeds the limit on open calls, the
+service ends the call that has waited longest for a message from its client.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ STREAM = "ModelStreamInfer"
 
 @dataclass
 class _Call:
-    """Properties of a call that the counters and the log need.
+    """Properties of a call that are counted and logged.
 
     Attributes:
         model: Label `name/version` of the requested model, or None if no loaded model was requested.
@@ -53,10 +53,10 @@ class _Call:
 
 
 class Service:
-    """Service that answers calls with the models, the token and the limits of a handler."""
+    """gRPC service that answers calls with the models, the token and the limits of a `Handler`."""
 
     def __init__(self, handler: Handler) -> None:
-        """Store the models, the limits, the token and the counters, and the functions that answer the methods.
+        """Store the objects that the service shares with the HTTP server, and the function that answers each method.
 
         Args:
             handler: Handler of the HTTP server. The service uses its models, limits, token and counters.
@@ -73,10 +73,10 @@ class Service:
         self._functions = self._functions_of_methods()
 
     def _functions_of_methods(self) -> dict[str, Callable[[Any], Any]]:
-        """Return the functions that answer the methods, by the name of the method.
+        """Return the function that answers each method, by the name of the method.
 
-        The argument of a function is the message of the request. A function returns either the message of the response,
-        or the content of this message as a JSON object, or None if the response is empty.
+        Each function receives the message of a request. Each function returns the message of the response, the content
+        of this message as a JSON object, or None if the response is empty.
         """
         store = self._store
         return {
@@ -103,7 +103,7 @@ class Service:
         return grpc.method_handlers_generic_handler(SERVICE, methods)
 
     async def _handle(self, name: str, _: object, context: grpc.aio.ServicerContext) -> Any:
-        """Answer a call, count the call with its status, and write a line about the call to the log if there is a log.
+        """Answer a call, count the call by its status, and log the call if there is a log.
 
         Args:
             name: Name of the method.
@@ -183,8 +183,8 @@ class Service:
     async def _answer_stream(self, context: grpc.aio.ServicerContext, call: _Call) -> None:
         """Send a response to each message of a stream until the client ends the stream.
 
-        The first message must arrive within `header_seconds`, and each later message within `idle_seconds` after a
-        response. The client must read each response within `body_seconds`.
+        The first message must arrive within `header_seconds`, and each later message within `idle_seconds` after the
+        previous response. The client must read each response within `body_seconds`.
 
         Args:
             context: Context of the call, from which messages are read and to which responses are written.
@@ -247,7 +247,7 @@ class Service:
     def _infer_in_stream(self, request: Any) -> Any:
         """Return the response to one request of a stream.
 
-        If an error occurs, the response contains the message of the error. The stream can therefore continue.
+        If an error occurs, the response contains the error message. An error therefore does not end the stream.
         """
         _, response_type = METHODS[STREAM]
         status = "OK"
@@ -261,7 +261,7 @@ class Service:
 
     @contextmanager
     def _count_open_call(self) -> Iterator[None]:
-        """Return a context manager that counts a call as open while its block runs.
+        """Return a context manager that counts a call as open until the `with` block ends.
 
         If there are already too many open calls, the service ends the call that has waited longest for a message.
 
@@ -293,7 +293,7 @@ class Service:
     async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
         """Wait for the next message of a call.
 
-        While this call waits for a message, the service may end it because of a new call.
+        While a call waits for a message, the service may end the call to make room for a new call.
 
         Args:
             context: Context of the call.
@@ -315,7 +315,7 @@ class Service:
 
 
 def _status_and_message(error: Exception) -> tuple[str, str]:
-    """Return the gRPC status and the message with which a call is ended after an error."""
+    """Return the gRPC status and the error message with which a failed call is ended."""
     if isinstance(error, TimeoutError):
         return "DEADLINE_EXCEEDED", "the call waited too long for its client, or others needed its place"
     _, grpc_status = statuses(error)

@@ -1,14 +1,15 @@
-"""HTTP/1.1 on one connection, with limits on the size and the duration of requests.
+"""HTTP/1.1 protocol of one connection, with limits on the size and the duration of requests.
 
-Most requests are answered at once in the event loop, because most answers take only microseconds. If an answer may take
-longer, it is computed in another thread. Later requests of the same connection then wait until this answer is sent.
+Most requests are answered at once in the event loop, because most answers take only microseconds. An answer that may
+take longer is computed in another thread. Later requests of the same connection wait until that answer was sent.
 
 Each connection stores a deadline, by which the client must send further data or read the response. The server regularly
-calls `close_overdue`, which compares all deadlines with the present time. There is no timer for each request, because a
-timer would take as much time as parsing a request.
+calls `close_overdue`, which compares all deadlines with the current time. The server does not start a timer for each
+request, because a timer would take as much time as parsing the request.
 
 A client may send thousands of requests at once, and all connections share one thread. Long data are therefore parsed in
-slices. After `TURN_SECONDS`, the event loop serves the other connections before it parses further slices.
+slices. Whenever parsing has taken `TURN_SECONDS`, the event loop serves the other connections before it parses further
+slices.
 """
 
 import asyncio
@@ -60,7 +61,7 @@ class Connection(asyncio.Protocol):
     """
 
     def __init__(self, handler: Handler, connections: "set[Connection]", loop: asyncio.AbstractEventLoop) -> None:
-        """Create the state of a connection on which no data have arrived yet.
+        """Create the state of a new connection, on which no data have arrived yet.
 
         Args:
             handler: Handler that answers the requests.
@@ -111,7 +112,8 @@ class Connection(asyncio.Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin the connection.
 
-        If there are too many connections, end another connection that is unused, or refuse this connection.
+        If there are too many connections, the oldest unused connection is ended. If every other connection is in use,
+        the new connection is refused.
         """
         self._transport = transport
         peer = transport.get_extra_info("peername")
@@ -126,7 +128,7 @@ class Connection(asyncio.Protocol):
             self._refuse(refusal(503, f"all {self._limits.connections} connections are taken; try again later"))
 
     def _end_oldest_unused(self) -> bool:
-        """End the oldest of the other connections on which no complete request has arrived.
+        """End the oldest other connection on which no complete request has arrived.
 
         The oldest connection is the connection with the earliest deadline.
 
@@ -151,8 +153,8 @@ class Connection(asyncio.Protocol):
         """Process data that the client has sent.
 
         Short data are parsed at once. Long data are parsed in slices, and other connections are served between the
-        slices. While an answer is being computed, or while the client does not read its responses, data are only
-        stored. If a request has the same head as the previous request, the head is not parsed again.
+        slices. While an answer is being computed, or while the client does not read its responses, data are stored but
+        not parsed. If a request has the same head as the previous request, the head is not parsed again.
         """
         if self._is_refused or self._transport.is_closing():
             return
@@ -206,8 +208,8 @@ class Connection(asyncio.Protocol):
     def shutdown(self) -> None:
         """Close the connection, because the server is being stopped.
 
-        If a request is incomplete, or if its answer is being computed, the connection is closed after the response was
-        sent.
+        If a request is incomplete, or if its answer is being computed, the connection is closed only after the response
+        was sent.
         """
         self._is_stopping = True  # the next response closes the connection
         has_open_request = self._phase is not Phase.IDLE or self._answering is not None
@@ -219,7 +221,7 @@ class Connection(asyncio.Protocol):
     def end_overdue(self) -> None:
         """End the connection, because its deadline has passed.
 
-        If a request has begun, the reason is sent to the client.
+        If a request has begun, a response that states the reason is sent to the client.
         """
         if self._phase is Phase.IDLE or self._is_refused:
             self._transport.abort()
@@ -233,8 +235,7 @@ class Connection(asyncio.Protocol):
     def _parse_stored_data(self) -> None:
         """Parse slices of the stored data for at most `TURN_SECONDS`.
 
-        If some data are not parsed in this time, the event loop calls this method again after it has served other
-        connections.
+        If stored data remain, the event loop calls this method again after it has served the other connections.
         """
         self._next_turn = None
         turn_end = time.perf_counter() + TURN_SECONDS
@@ -252,7 +253,7 @@ class Connection(asyncio.Protocol):
         self._resume_reading()
 
     def _resume_reading(self) -> None:
-        """Resume reading data if all stored data are parsed, and otherwise pause reading.
+        """Resume reading if all stored data have been parsed, and pause reading otherwise.
 
         If all requests are answered and the client sends no more data, the connection is closed.
         """
@@ -266,16 +267,17 @@ class Connection(asyncio.Protocol):
                 self._transport.close()
 
     def _new_parser(self) -> httptools.HttpRequestParser:
-        """Return a new parser of requests, which calls the methods of this connection whose names begin with `on_`."""
+        """Return a new request parser, which calls the `on_...` methods of this connection."""
         parser = httptools.HttpRequestParser(self)
         # Data after the last request of a connection are ignored. They would otherwise cause an error.
         parser.set_dangerous_leniencies(lenient_data_after_close=True)
         return parser
 
     def _parse(self, data: bytes) -> None:
-        """Parse a piece of data, and check the size of a request that is still incomplete afterwards.
+        """Parse a piece of data. If a request is still incomplete afterwards, check its size.
 
-        The parser calls the methods whose names begin with `on_`. They answer each complete request.
+        The parser calls the `on_...` methods of this connection. The method `on_message_complete` answers each complete
+        request.
         """
         self._piece_bytes = len(data)
         self._unchecked_bytes += self._piece_bytes
@@ -295,8 +297,8 @@ class Connection(asyncio.Protocol):
     def _check_incomplete_request(self) -> None:
         """Check the size of an incomplete request, and set a deadline if a new phase has begun.
 
-        The content of the body is not counted, because it has its own limit. The size of the headers is counted. If the
-        body is sent in chunks, the sizes of its trailers and chunk extensions are also counted.
+        The content of the body is not counted, because the body has its own limit. The size of the headers is counted.
+        If the body is sent in chunks, the sizes of the trailers and of the chunk extensions are also counted.
         """
         if self._unchecked_bytes > self._limits.header_bytes:
             self._refuse_headers()
@@ -310,8 +312,8 @@ class Connection(asyncio.Protocol):
     def _parse_without_upgrade(self, data_after_headers: bytes) -> None:
         """Parse a request again without its header `Upgrade`.
 
-        HTTP allows a server to ignore this header. A new parser is needed, because the present parser assumes that
-        another protocol follows after the headers.
+        HTTP allows a server to ignore the header `Upgrade`. A new parser is needed, because the present parser assumes
+        that the data after the headers belong to another protocol.
 
         Args:
             data_after_headers: Rest of the piece, which has not been parsed.
@@ -328,10 +330,10 @@ class Connection(asyncio.Protocol):
         self._parse(b"\r\n".join([request_line, *header_lines, b"", data_after_headers]))
 
     def on_message_begin(self) -> None:
-        """Begin a new request, whose request line the parser has not read yet.
+        """Reset the state of the request, because a new request begins.
 
-        The parser does not report at which position in the present piece of data the request begins. The bytes of the
-        piece are therefore counted only for the first request in the piece.
+        The parser does not report where in a piece of data a request begins. The bytes of a piece are therefore counted
+        only for the first request in the piece.
         """
         self._phase = Phase.HEADERS
         self._unchecked_bytes = self._piece_bytes if self._piece_begins_with_request else 0
@@ -342,13 +344,13 @@ class Connection(asyncio.Protocol):
         self._body = bytearray()
 
     def on_url(self, url: bytes) -> None:
-        """Append a part of the target, which is the URL in the request line."""
+        """Append the next part of the URL in the request line."""
         self._url += url
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Store a header, with its name in lower case.
+        """Convert the name of a header to lower case, and store the header.
 
-        Headers after the body, which are called trailers, are ignored.
+        Trailers, which are headers after the body, are ignored.
         """
         if self._phase is Phase.BODY:
             return
@@ -387,8 +389,8 @@ class Connection(asyncio.Protocol):
     def on_message_complete(self) -> None:
         """Answer the complete request, unless it was refused.
 
-        If an answer is being computed in another thread, the request must wait for this answer. A request with a
-        protocol upgrade is not answered here, because it is parsed again without its header `Upgrade`.
+        If the answer to an earlier request is still being computed, the new request waits for that answer. A request
+        for a protocol upgrade is not answered yet, because it is parsed again without its header `Upgrade`.
         """
         if self._is_refused or self._transport.is_closing() or self._parser.should_upgrade():
             return
@@ -422,9 +424,9 @@ class Connection(asyncio.Protocol):
         self.deadline = math.inf
 
     async def _answer_in_order(self, head: Head, body: bytes) -> None:
-        """Answer a request in another thread, and then the requests that have arrived in the meantime.
+        """Answer a request in another thread, and then answer the requests that have arrived in the meantime.
 
-        If a later request also needs another thread, the requests after it wait for its answer.
+        If one of the later requests also needs another thread, all requests after it wait for its answer.
 
         Args:
             head: Request line and headers of the request.
@@ -446,8 +448,9 @@ class Connection(asyncio.Protocol):
     def _remember(self, data: bytes) -> None:
         """Store the head of the latest request, so that a request with the same head does not have to be parsed.
 
-        Clients send the same head again and again. If the bytes of the head and the size of the body are equal, the
-        result of the parser would also be equal. The head is only stored if the request arrived alone and in one piece.
+        Most clients send the same head repeatedly. If two requests have equal heads and bodies of the same size, the
+        parser would return the same result for both heads. The head is stored only if the request arrived alone and in
+        one piece.
 
         Args:
             data: The data that contain the request.
@@ -477,7 +480,7 @@ class Connection(asyncio.Protocol):
         self._set_deadline(self._limits.idle_seconds)
 
     def _set_deadline(self, seconds: float) -> None:
-        """Set the deadline to a time from now.
+        """Set the deadline to the current time plus a given duration.
 
         The deadline is not changed while the client does not read its responses, or while an answer is being computed.
 
@@ -498,9 +501,10 @@ class Connection(asyncio.Protocol):
         self._refuse(refusal(431, f"the request line and headers are longer than {limit} bytes"))
 
     def _refuse(self, response: Response) -> None:
-        """Refuse the present request with a response that states the reason, and read no more requests.
+        """Send a response that refuses the present request, and read no more requests.
 
-        The connection is closed when the client closes it, or after `LINGER_SECONDS`.
+        The connection remains open until the client closes it, but not longer than `LINGER_SECONDS`. With TLS, the
+        connection is closed as soon as the response was sent.
         """
         if self._is_refused or self._transport.is_closing():
             return

@@ -1,4 +1,4 @@
-"""Head of an HTTP/1.1 request, and conversion of a response to the bytes that are sent."""
+"""Head of an HTTP/1.1 request, and functions that decode the path of a request and encode a response."""
 
 import urllib.parse
 from functools import lru_cache
@@ -33,7 +33,7 @@ class Head(NamedTuple):
 
 
 def response_bytes(response: Response, *, is_last: bool, with_body: bool = True) -> bytes:
-    """Convert a response to the bytes that are sent.
+    """Encode a response as the bytes that are sent to the client.
 
     The bytes are the status line, the headers, a blank line and the body.
 
@@ -53,7 +53,7 @@ def response_bytes(response: Response, *, is_last: bool, with_body: bool = True)
 
 @lru_cache(64)
 def request_path(url: bytes) -> str:
-    """Return the path in the target of a request line, and decode its percent-encoding.
+    """Return the path of a request target after decoding its percent-encoding.
 
     Args:
         url: Target of the request line, which may also contain a query.

@@ -1,4 +1,4 @@
-"""HTTP server, which listens, accepts connections, makes TLS handshakes, and stops when it receives a signal."""
+"""HTTP server that accepts connections, makes TLS handshakes, and stops when it receives a signal."""
 
 import asyncio
 import signal
@@ -28,8 +28,8 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT)
 class HttpServer:
     """HTTP server of models.
 
-    The server listens from the moment when it is created until `close` is called. It answers requests while `run` is
-    executed.
+    The server begins to listen when it is created, and answers requests while the method `run` is executed. The method
+    `close` releases the address of the server.
 
     Attributes:
         url: URL that clients use.
@@ -100,7 +100,7 @@ class HttpServer:
         await self._finish(loop)
 
     async def _finish(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Wait at most `GRACE_SECONDS` until all open requests are finished, and then end the remaining connections."""
+        """Wait for open requests for at most `GRACE_SECONDS`, and then end the remaining connections."""
         for connection in list(self._connections):
             connection.shutdown()
         grace_end = loop.time() + GRACE_SECONDS
@@ -115,7 +115,7 @@ class HttpServer:
 
         Unfinished TLS handshakes are counted as connections. If there are too many connections, the oldest unfinished
         handshake is cancelled. If there is no unfinished handshake, or if the server does not use TLS, the class
-        `Connection` applies the limit instead.
+        `Connection` enforces the limit instead.
         """
         self._socket.setblocking(False)
         while True:

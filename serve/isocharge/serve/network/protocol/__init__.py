@@ -1,6 +1,6 @@
 """Open Inference Protocol, version 2, independent of the transport.
 
-This package computes the answers and statuses of requests.
+This package computes the response to each request and the status of the response.
 
 May import: network, prediction, model.
 

@@ -31,9 +31,9 @@ def server_metadata() -> dict[str, Any]:
 
 
 def model_metadata(loaded: LoadedVersion, store: ModelStore) -> dict[str, Any]:
-    """Return the names, number types and shapes of the tensors of a model, and its metadata.
+    """Return the metadata of a model, and the names, number types and shapes of its tensors.
 
-    The metadata are under the key `properties`. Each value is a JSON text, as in the file of the model.
+    The metadata are under the key `properties`. Each value of the metadata is a JSON text, as in the model file.
     """
     metadata = loaded.metadata
     return {

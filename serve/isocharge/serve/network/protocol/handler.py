@@ -1,9 +1,10 @@
-"""Computation of the responses to HTTP requests of the Open Inference Protocol.
+"""Handler that computes the responses to HTTP requests of the Open Inference Protocol.
 
 The class `Handler` does not depend on the server that receives the requests. A request consists of method, path,
 headers and body. A response consists of status, headers and body. Any thread may answer requests. Most responses take
 microseconds to compute, and a response to the largest batch takes milliseconds. Some responses take longer, for example
-because a model is loaded. The method `may_block` returns whether the response for a path may take a long time.
+because a model is loaded. The method `may_block` returns whether computing the response for a path may take a long
+time.
 """
 
 import re
@@ -67,8 +68,8 @@ _PATTERNS = [(_pattern(template), route) for route in ROUTES for template in rou
 def match_path(path: str) -> Match:
     """Return the route of a path, and the name and the version of the model in the path.
 
-    If the path contains no name or no version, this part of the result is empty. If the server has no route for the
-    path, the result is `NO_ROUTE`.
+    If the path contains no name or no version, the name or the version in the result is empty. If the server has no
+    route for the path, the result is `NO_ROUTE`.
     """
     for pattern, route in _PATTERNS:
         path_match = pattern.fullmatch(path)
@@ -112,7 +113,7 @@ class Handler:
         self._service = Service(store, self.limits, metrics, partial(openapi_document, ROUTES, store))
 
     def may_block(self, path: str) -> bool:
-        """Return whether a response to a request for this path may take a long time.
+        """Return whether computing the response for a path may take a long time.
 
         The server should then compute the response in another thread, so that other requests are not delayed.
         """
@@ -120,7 +121,7 @@ class Handler:
         return route is not None and route.may_block
 
     def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
-        """Answer one request, count the request, and write a line about it to the log if there is a log.
+        """Answer one request, count the request, and log the request if there is a log.
 
         Args:
             method: Method in capitals.

@@ -1,4 +1,4 @@
-"""JSON body of a request for an inference. The schema in the OpenAPI document is also derived from these types."""
+"""JSON body of a request for an inference. The OpenAPI schema is derived from the same types."""
 
 from typing import Annotated, Any, Literal
 
@@ -18,7 +18,7 @@ class Parameters(Struct, frozen=True):
 
 
 class InputTensor(Struct, frozen=True):
-    """Input tensor with the charges, pC. The numbers are checked after the shape was checked."""
+    """Input tensor with the charges, pC. The shape is checked before the numbers."""
 
     name: Literal["charge_pC"]
     datatype: Literal["FP32", "FP64"]

@@ -1,9 +1,9 @@
 """Inference of the Open Inference Protocol.
 
 An inference has three steps: the server reads the request, runs the model, and writes the response. The body of a
-request or of a response is a JSON text, which may be followed by binary tensors. If binary tensors follow, a header
-contains the length of the JSON text. The gRPC service converts its messages to the same JSON objects, and also calls
-`parse_request`.
+request or of a response is a JSON text, which may be followed by binary tensors. If binary tensors follow, an HTTP
+header contains the length of the JSON text. The gRPC service converts its messages to JSON objects of the same form,
+and passes these objects to `parse_request`.
 """
 
 import struct
@@ -130,7 +130,7 @@ def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, 
 def parse_request(
     content: dict[str, Any], binary: bytes | memoryview, loaded: LoadedVersion, max_presses: int
 ) -> InferRequest:
-    """Convert the JSON object of a request for an inference to an `InferRequest`.
+    """Convert the JSON object in a request for an inference to an `InferRequest`.
 
     Args:
         content: The JSON object.
@@ -287,7 +287,7 @@ def _packer(count: int) -> Callable[..., None]:
 
 
 def _from_array(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
-    """Convert values of any type to charges, or raise an error.
+    """Convert values to charges. If the values have a wrong type or shape, raise an error.
 
     Args:
         values: Value of the key `data` of the request, which may have any type.
@@ -317,9 +317,9 @@ def _from_array(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> S
 def _as_array(values: Any) -> np.ndarray[Any, Any]:
     """Convert a list, or a list of lists, to an array.
 
-    NumPy would convert true and false to 1 and 0. If the values contain true or false, the array therefore has the type
-    object. If the values cannot be converted to an array, the result is an array that contains None, which also has the
-    type object. The caller refuses arrays of this type.
+    If the values contain true or false, the array has the type object, because NumPy would otherwise convert true and
+    false to 1 and 0. If the values cannot be converted, the result is an array that contains only None. This array has
+    the type object, too. The caller refuses every array of the type object.
     """
     dtype = object if _contains_booleans(values) else None  # with None, NumPy chooses the type
     try:
@@ -357,9 +357,10 @@ def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
 
 
 def binary_tensor(rows: Rows) -> bytes:
-    """Convert the values of an output to a binary tensor, which is little-endian.
+    """Convert the values of an output to a little-endian binary tensor.
 
-    Numbers are written as float32. Before each text, its length in bytes is written as a 32-bit unsigned integer.
+    Numbers are written as float32. Each text is preceded by its length in bytes, which is written as a 32-bit unsigned
+    integer.
     """
     if not rows.dtype.hasobject:  # the values are numbers
         return rows.astype("<f4", copy=False).tobytes()
@@ -427,7 +428,8 @@ def _infer_single_press(
 ) -> tuple[dict[str, Rows], int, int]:
     """Run a model on the charges of one press.
 
-    The session of the model uses memory that is allocated once and reused. This is faster than a call of `session.run`.
+    The session of the model uses memory that is allocated once and reused. Reusing the memory is faster than calling
+    `session.run`.
 
     Args:
         loaded: Version of the model that is run.
@@ -453,7 +455,7 @@ def _infer_single_press(
 
 
 def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
-    """Return the flags of each press as one text, in which commas separate the flags, shape (n, 1).
+    """Return the flags of each press as one text with commas between the flags, shape (n, 1).
 
     Args:
         loaded: Version of the model that was run.

@@ -1,4 +1,4 @@
-"""OpenAPI document of the HTTP server, which is derived from the routes of the server."""
+"""OpenAPI document that describes the routes of the HTTP server."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -90,7 +90,7 @@ def _schemas(routes: Iterable[Route]) -> dict[str, Any]:
     """Return the schemas of all bodies and answers of the given routes, by name.
 
     The content of a schema is either given as a JSON object, or derived from a type. A derived schema may refer to
-    further schemas. The result also contains these further schemas.
+    further schemas, which the result also contains.
     """
     used_schemas = [ERROR]
     for route in routes:

@@ -1,8 +1,8 @@
 """Start page of the HTTP server, which shows the models and an example of a request.
 
-The names of models, the model cards and the reasons for refusals come from files. Special characters of HTML in these
-texts are therefore escaped. In addition, the headers of the page do not allow browsers to run scripts or to load other
-files.
+The names of models, the model cards and the reasons for refusals come from files. In all texts that come from files,
+special characters of HTML are therefore escaped. In addition, the headers of the page do not allow browsers to run
+scripts or to load other files.
 """
 
 import base64
@@ -127,7 +127,10 @@ def _example(loaded: LoadedVersion, path: str) -> str:
 
 
 def _card(model: Model) -> str:
-    """Read the card in the folder of a model, and return it as preformatted HTML."""
+    """Read the model card in the folder of a model, and return the card as preformatted HTML.
+
+    If the card cannot be read, the function returns a paragraph that says so.
+    """
     try:
         text = read_whole(model.folder / "card.md", MAX_CARD_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError):

@@ -30,15 +30,15 @@ INTERNAL_MESSAGE = "internal error; the server's log says more"
 
 
 def statuses(error: Exception) -> tuple[int, str]:
-    """Return the HTTP status and the name of the gRPC status with which an error is reported."""
+    """Return the HTTP status and the name of the gRPC status that report an error to the client."""
     return next((code, name) for kind, code, name in _STATUSES if isinstance(error, kind))
 
 
 def client_message(error: Exception) -> str:
-    """Return the message about an error that is sent to the client.
+    """Return the message that tells the client about an error.
 
-    If the error is not an IsochargeError, it is unexpected, and its message may contain secrets. The error is then
-    written to the log, and the client receives a general message.
+    Every error other than an IsochargeError is unexpected, and its message may contain secrets. An unexpected error is
+    therefore written to the log, and the client receives a general message.
     """
     if isinstance(error, errors.IsochargeError):
         return str(error)
@@ -81,12 +81,12 @@ def json_response(content: Any) -> Response:
 
 
 def refusal(status: int, message: str, error: str | None = None) -> Response:
-    """Return the response to a request that is refused. Its body is the JSON object {"error": message}."""
+    """Return the response to a refused request. The body of the response is the JSON object {"error": message}."""
     return response_of(status, b"application/json", orjson.dumps({"error": message}), error)
 
 
 def error_response(error: Exception) -> Response:
-    """Return the response to a request that has raised an error.
+    """Return the response to a request that could not be answered because of an error.
 
     The body of the response contains the message of the error. If the HTTP method is wrong, the header `Allow` contains
     the allowed method. If the token is missing or wrong, the header `WWW-Authenticate` contains the required kind of

@@ -31,7 +31,7 @@ Json = dict[str, Any]
 
 
 class Service(NamedTuple):
-    """Objects of the server that are used by the functions that answer requests.
+    """Objects of the server that the functions of the routes need.
 
     Attributes:
         store: Store of the models that the server uses.
@@ -89,7 +89,7 @@ class Body(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Route:
-    """Route of the HTTP server, which answers the requests with one method and certain paths.
+    """Route of the HTTP server, which combines a method, several paths and a function that answers requests.
 
     Attributes:
         method: HTTP method. A route with the method GET also answers HEAD requests, without a body.
@@ -189,6 +189,9 @@ EXAMPLE = {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3],
 """Example of the body of a request for an inference."""
 
 
+# The functions below answer the requests of the routes. A parameter `_` is a request whose content is not needed.
+
+
 def _show_page(request: Request) -> Response:
     """Return the start page of the server."""
     response = response_of(200, b"text/html; charset=utf-8", page(request.service.store).encode())
@@ -261,8 +264,8 @@ def _show_config(request: Request) -> Response:
 def _infer(request: Request) -> Response:
     """Compute the contacts of the presses in a request.
 
-    The body of the response is a JSON text, which may be followed by binary tensors. Responses to other requests are
-    not compressed, because the asyncio client of Triton decompresses only the responses to inferences.
+    The body of the response is a JSON text, which may be followed by binary tensors. The server compresses only the
+    responses to inferences, because the asyncio client of Triton does not decompress other responses.
     """
     loaded = request.loaded
     header_length = request.headers.get(b"inference-header-content-length")
@@ -286,7 +289,7 @@ def _infer(request: Request) -> Response:
 def model_paths(ending: str = "") -> tuple[str, str]:
     """Return the templates of the two paths for requests to a model.
 
-    The first path contains only the name of the model. The second path contains the name and the version.
+    The first path contains only the name of the model. The second path contains the name and the version of the model.
 
     Args:
         ending: End of both paths, such as `/infer`.

@@ -59,7 +59,7 @@ class ProbeNotation:
 
     @property
     def form(self) -> str:
-        """Notation with placeholders for the numbers, which help texts and error messages show."""
+        """Notation with placeholders for the numbers, for help texts and error messages."""
         return f"{self.name}:{self.parameters}"
 
     def parse(self, text: str) -> "Probe | None":
@@ -105,7 +105,7 @@ class FootprintTopology:
 
 
 class Probe(ABC):
-    """Base class of all probes. A probe is a body that presses on the film over its footprint.
+    """Base class of all probes. A probe is a body that presses on the film within its footprint.
 
     The distribution of the pressure over the footprint does not depend on the film. The pressure is uniform unless a
     subclass overrides `has_uniform_pressure`, `pressure` and `force_share`. Subclasses, such as `Circle`, `Ellipse`,
@@ -133,7 +133,7 @@ class Probe(ABC):
     @property
     @abstractmethod
     def reach(self) -> float:
-        """Distance of the farthest point of the footprint from its centroid, mm."""
+        """Distance from the centroid of the footprint to the farthest point of the footprint, mm."""
 
     @property
     @abstractmethod
@@ -172,7 +172,7 @@ class Probe(ABC):
 
     @abstractmethod
     def boundary(self, parameter: Array) -> Complexes:
-        """Return points of the boundary of the footprint, which is rotated by `angle`.
+        """Return points on the boundary of the footprint, including the rotation by `angle`.
 
         Args:
             parameter: Values from 0 to 2 pi, any shape. If the parameter increases, the point moves anticlockwise along

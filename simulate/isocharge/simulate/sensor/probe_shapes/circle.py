@@ -33,17 +33,17 @@ class RoundProbe(CurvedProbe):
 
     @property
     def reach(self) -> float:
-        """Distance of the farthest point of the footprint from its centre, which is the radius, mm."""
+        """Radius of the circle, which is the distance from its centre to its farthest point, mm."""
         return self.radius
 
     @property
     def angle(self) -> float:
-        """Rotation of the footprint, which is always zero, because a rotation does not change a circle."""
+        """Rotation of the footprint. It is always zero, because a rotation does not change a circle."""
         return 0.0
 
     @property
     def period(self) -> float:
-        """Period of the footprint, which is always zero, because every rotation maps a circle onto itself."""
+        """Period of the footprint. It is always zero, because every rotation maps a circle onto itself."""
         return 0.0
 
     @property

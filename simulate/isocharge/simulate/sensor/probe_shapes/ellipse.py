@@ -50,12 +50,12 @@ class Ellipse(CurvedProbe):
 
     @property
     def reach(self) -> float:
-        """Distance of the farthest point of the ellipse from its centre, which is half of the longer axis, mm."""
+        """Distance from the centre to the farthest point of the ellipse, mm. It is half of the longer axis."""
         return 0.5 * max(self.width, self.height)
 
     @property
     def period(self) -> float:
-        """Smallest rotation that maps the ellipse onto itself, which is half a turn, rad."""
+        """Smallest rotation that maps the ellipse onto itself, rad. It is half a turn."""
         return float(np.pi)
 
     def boundary(self, parameter: Array) -> Complexes:
@@ -74,7 +74,7 @@ class Ellipse(CurvedProbe):
         return float(area_on_unit_disk) * 0.25 * self.width * self.height
 
     def _on_unit_disk(self, points: Complexes) -> Complexes:
-        """Apply to points the affine map that transforms the ellipse into the unit disk.
+        """Transform points by the affine map that maps the ellipse onto the unit disk.
 
         Args:
             points: Points x + iy relative to the centre of the ellipse, any shape, mm.

@@ -24,7 +24,7 @@ PRESSURE_LEVELS = 48
 
 @dataclass(frozen=True)
 class Finger(RoundProbe):
-    """Probe with a circular footprint, whose pressure decreases from a maximum at the centre to zero at the edge.
+    """Probe with a circular footprint. The pressure decreases from a maximum at the centre to zero at the edge.
 
     Attributes:
         radius: Radius of the footprint, mm, which does not depend on the force. The radius is 4 to 8 mm for a
@@ -68,8 +68,8 @@ class Finger(RoundProbe):
         """
         # The Gauss rule is for the interval [-1, 1]. It is mapped to levels t from 0 to 1, and its weights are halved.
         nodes, weights = np.polynomial.legendre.leggauss(PRESSURE_LEVELS)
-        level = 0.5 * (nodes + 1.0)
-        level_radius = self.radius * np.sqrt(1.0 - level**2)
+        pressure_fraction = 0.5 * (nodes + 1.0)
+        disk_radius = self.radius * np.sqrt(1.0 - pressure_fraction**2)
         points = to_complex(corners)
-        areas = [float(area_in_disk(points, at, radius)) for radius in level_radius]
+        areas = [float(area_in_disk(points, at, radius)) for radius in disk_radius]
         return float(PEAK_PRESSURE / self.area * 0.5 * (weights @ areas))

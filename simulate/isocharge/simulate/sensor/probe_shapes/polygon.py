@@ -84,7 +84,7 @@ class Polygon(Probe):
 
     @classmethod
     def of(cls, corners: Array, angle: float = 0.0, name: str = "polygon") -> "Polygon":
-        """Create a polygon from its corners, which are shifted such that the centroid becomes the origin.
+        """Create a polygon from its corners. The corners are shifted such that the centroid becomes the origin.
 
         Args:
             corners: Corners (x, y) relative to any point, anticlockwise, shape (n, 2), mm.
@@ -150,7 +150,7 @@ class Polygon(Probe):
 
     @property
     def reach(self) -> float:
-        """Distance of the farthest corner from the centroid, mm."""
+        """Distance from the centroid to the farthest corner, mm."""
         return float(np.linalg.norm(np.array(self.corners), axis=1).max())
 
     @property
@@ -170,7 +170,7 @@ class Polygon(Probe):
 
     @property
     def topology(self) -> FootprintTopology:
-        """Topology of a polygonal footprint, whose core polygon is the whole footprint."""
+        """Topology of a polygonal footprint. The core polygon is the whole footprint."""
         return FootprintTopology(len(self.corners), is_curved=False, fills_circle=False)
 
     @property
