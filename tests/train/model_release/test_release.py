@@ -54,6 +54,7 @@ error of the force, %."""
 
 ELLIPSE_TOLERANCES = {
     "four-25um-biaxial": 0.03,  # the map nearly folds at the edge of the area
+    "eight-25um-biaxial-36mm": 0.035,  # near the clamp, the ellipses contain 70 % of 60,000 contacts
     "four-25um-biaxial-student": 0.09,  # small networks have larger errors
     "three-25um-biaxial-student": 0.04,
     "four-25um-biaxial-films": 0.065,  # networks for all films have less accurate correlations
@@ -61,6 +62,13 @@ ELLIPSE_TOLERANCES = {
     "three-25um-biaxial-films": 0.05,
 }
 """Largest difference from 0.68 of the coverage of the 68 % ellipses of models whose errors are not quite Gaussian."""
+
+INTERVAL_TOLERANCES = {
+    "three-25um-biaxial-student": 0.06,  # students have too few hidden units
+    "four-25um-biaxial-student": 0.06,
+    "four-25um-biaxial-films": 0.045,  # 72 % of the coordinates in a third of the presses
+}
+"""Largest difference from 0.68 of the coverage of the 68 % intervals in a third of the presses."""
 
 ERROR_TOLERANCES = {"four-25um-uniaxial-films": 0.25}
 """Largest relative difference from the stated errors, of models whose rms is dominated by few presses beside a fold."""
@@ -190,7 +198,7 @@ def test_intervals_contain_the_stated_fraction_of_the_coordinates(truth, predict
     assert np.all(np.abs(np.mean(deviation < 1.96, axis=0) - 0.95) < 0.012)
     radius = np.hypot(*truth.contact[:, :2].T)
     force = truth.contact[:, 2]
-    tolerance = 0.06 if predictor.metadata.name.endswith("-student") else 0.04  # students have too few hidden units
+    tolerance = INTERVAL_TOLERANCES.get(predictor.metadata.name, 0.04)
     for key in (radius, force):
         for rows in np.array_split(np.argsort(key), 3):
             assert np.all(np.abs(np.mean(deviation[rows] < 1.0, axis=0) - 0.68) < tolerance)
