@@ -45,7 +45,8 @@ class Series:
             position_terms, force_terms = chebyshev_terms(chunk, degree=n_y - 1, force_degree=n_force - 1)
 
             # Sum over the products of polynomials in x and y: (points, n_term) @ (n_term, n_force * 4 * n_electrode).
-            # The factor 4 stands for the value and its three derivatives.
+            # The factor 4 stands for the value and its three derivatives. For each point, the sums are the coefficients
+            # of series in the logarithm of the force.
             force_coefficients = position_terms @ self._term_coefficients
             force_coefficients = force_coefficients.reshape(len(chunk), n_force, 4 * n_electrode)
 

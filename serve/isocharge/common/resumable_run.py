@@ -86,13 +86,13 @@ class ResumableRun:
             write_whole(self._parts / f"{name}.sha256", sha256_of(data).encode())
 
     def load(self, name: str, decode: Callable[[bytes], Content], *, final: bool = False) -> Content | None:
-        """Load a finished part.
+        """Load a part of the run that `save` has stored, and check its checksum.
 
         Args:
             name: Name of the part.
             decode: Function that converts the bytes of the part to its content. If the part is damaged, the function
                 may raise any exception.
-            final: Whether the part is a file of the target.
+            final: Whether the part is a file of the target, and not only an intermediate result.
 
         Returns:
             The content; None if the part is not finished. If the part is damaged, a warning is logged, and the result
@@ -183,9 +183,8 @@ class _StoringExecutor(Executor):
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit a task whose result is stored as a part of the run, and return the future of the stored result.
 
-        If an earlier run has stored the result, the result is loaded. Otherwise, the executor that was given to the
-        constructor computes the task. If the constructor was given no executor, the task is computed before this method
-        returns.
+        There are three cases. If an earlier run has stored the result, the result is loaded. Otherwise, the executor
+        that was given to the constructor computes the task. Without an executor, this method computes the task itself.
 
         Args:
             function: Function that computes the result, an array of numbers.
@@ -204,7 +203,8 @@ class _StoringExecutor(Executor):
             stored_future.set_result(result)
         else:
             task_future = self._executor.submit(function, *args, **kwargs)
-            # The argument of both callbacks is the finished future, which they do not need.
+            # When the task is done, store its result. The argument of a callback is the finished future, which neither
+            # of the two callbacks needs.
             task_future.add_done_callback(lambda _: self._store(part_name, task_future, stored_future))
             # If the caller cancels the returned future, the task is also cancelled.
             stored_future.add_done_callback(lambda _: task_future.cancel())
@@ -309,8 +309,9 @@ def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fa
 def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
     """Begin or resume a run in the `with` block. The block itself writes the target, for example as a single file.
 
-    The draft is removed at the end of the block. If the block raises an exception, the draft is kept for the next run.
-    However, it is removed if it contains no finished part, or if the next run would fail with the same error.
+    The draft is a folder next to the target that stores the finished parts of the run. It is removed at the end of the
+    block. If the block raises an exception, the draft is kept, so that the next run can use the finished parts. In two
+    cases, it is removed nevertheless: it contains no finished part, or the next run would fail with the same error.
 
     Args:
         target: File or folder that the run writes.
@@ -347,7 +348,8 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
 def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterator[None]:
     """Lock the draft of a run for the `with` block, and create the draft if it does not exist.
 
-    The folder of the draft contains a lock file, and the file `run.json` with the settings of the run.
+    The draft is a folder that stores the finished parts of the run. It contains a lock file, and the file `run.json`
+    with the settings of the run.
 
     Args:
         draft: The draft.

@@ -265,12 +265,13 @@ def _expected_value(expected_type: Any, first_member: Any) -> str:
 def _mistakes_in_tag(value: object, members: list[Any], path: str) -> Iterator[str]:
     """Yield a description of the mistake if the tag of a table is missing or unknown.
 
-    The tag is the value of the key that selects one of several structs. If only one struct is possible, the tag may be
+    A struct is a class that declares the keys of a table. If a table may belong to one of several structs, one of its
+    keys selects the struct, and the value of this key is the tag. If only one struct is possible, the tag may be
     missing.
 
     Args:
         value: Value from TOML or JSON.
-        members: Members of the expected union. If no member is a struct with a tag, there is no mistake.
+        members: Types that the value may have. If none of them is a struct with a tag, there is no mistake.
         path: Names of the keys that lead to the value.
     """
     structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
@@ -319,7 +320,9 @@ def _mistakes_in_parts(value: object, expected_type: Any, path: str) -> Iterator
 def _mistakes_in_keys(table: Mapping[str, Any], struct: type[Struct], path: str) -> Iterator[str]:
     """Yield a description of each unknown key, each missing key and each mistake in the values of a table.
 
-    If the tag of the table selects another struct, the function yields nothing.
+    A struct is a class that declares the keys of a table. If there are several structs, the value of one of the keys
+    (the tag) selects the struct. If the tag of the table selects another struct than the given struct, the function
+    yields nothing.
 
     Args:
         table: Table from TOML or JSON.

@@ -168,15 +168,17 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
     """
     device = device_from_table(examination.device, "board")
     channel_names = [channel.name for channel in examination.channels]
-    are_electrodes_named = set(electrodes) <= set(channel_names)
+    are_electrodes_named = set(electrodes) <= set(channel_names)  # whether each electrode has a channel of its name
 
-    # Channel of each electrode, by the name of the electrode, as it is assumed before the check.
+    # The channel that each electrode is assumed to have before the check: the one in the device file, the one at the
+    # same place in the order of the channels, or the one of the same name.
     if device.channels:
         channel_of_electrode = dict(device.channels)
     elif len(electrodes) == len(channel_names) and not are_electrodes_named:
-        channel_of_electrode = dict(zip(electrodes, channel_names, strict=True))  # in the order of the channels
+        channel_of_electrode = dict(zip(electrodes, channel_names, strict=True))
     else:
-        channel_of_electrode = {name: name for name in channel_names}  # each channel has the name of its electrode
+        channel_of_electrode = {name: name for name in channel_names}
+
     with Port(examination.url, baud=examination.baud, request=device.request) as port:
         return check_electrodes(port, device, channel_of_electrode, say)
 

@@ -350,8 +350,8 @@ def _label_axes(axes: Any, label: str) -> None:
 def _draw_path(axes: Any, traces: dict[str, Array], time: Array, time_label: str) -> None:
     """Draw the path of the contacts on the film, true to scale.
 
-    Each press is a line with dots. The colour of the dots shows the time, and their size shows the force. If there are
-    too many records, only every n-th record is drawn.
+    Each press is a line, with dots at the positions of its records. The colour of the dots shows the time, and their
+    size shows the force. If there are too many records, only every n-th record is drawn.
 
     Args:
         axes: Axes of matplotlib.
@@ -361,11 +361,11 @@ def _draw_path(axes: Any, traces: dict[str, Array], time: Array, time_label: str
     """
     position_mm = np.column_stack([traces["x_mm"], traces["y_mm"]])
     has_position = ~np.isnan(position_mm[:, 0])
-    contacts = _every_nth(np.flatnonzero(has_position), MAX_POINTS)  # positions of the records that are drawn as dots
-    if len(contacts):
+    dot_rows = _every_nth(np.flatnonzero(has_position), MAX_POINTS)  # rows of the records that are drawn as dots
+    if len(dot_rows):
         line_x, line_y = _every_nth(position_mm, MAX_POINTS).T
         axes.plot(line_x, line_y, color=INK, lw=0.5, alpha=0.5)  # NaN separates the presses
-        _draw_contacts(axes, traces, position_mm, contacts, time, time_label)
+        _draw_contacts(axes, traces, position_mm, dot_rows, time, time_label)
     else:
         axes.text(0.5, 0.5, "nothing touched the film", transform=axes.transAxes, ha="center", color=INK)
     axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal")
@@ -376,7 +376,7 @@ def _draw_path(axes: Any, traces: dict[str, Array], time: Array, time_label: str
 
 
 def _draw_contacts(
-    axes: Any, traces: dict[str, Array], position_mm: Array, contacts: Integers, time: Array, time_label: str
+    axes: Any, traces: dict[str, Array], position_mm: Array, rows: Integers, time: Array, time_label: str
 ) -> None:
     """Draw contacts as dots, ellipses of two standard deviations around some of them, and crosses on doubtful contacts.
 
@@ -384,28 +384,28 @@ def _draw_contacts(
         axes: Axes of matplotlib.
         traces: Columns of the records.
         position_mm: Position of each record, shape (n, 2), mm.
-        contacts: Positions of the drawn records in the columns, shape (m,).
+        rows: Rows of the drawn records in the columns, shape (m,).
         time: Time of each record, shape (n,), in the unit of the label.
         time_label: Label of the scale of colours.
     """
     # The area of a dot increases with the force. The lower limit of the largest force only avoids a division by zero.
-    force_N = np.clip(traces["force_N"][contacts], 0.0, None)
+    force_N = np.clip(traces["force_N"][rows], 0.0, None)
     largest_force_N = max(float(force_N.max()), 1e-9)
     dot_area = 3.0 + 30.0 * (force_N / largest_force_N)
-    dots = axes.scatter(*position_mm[contacts].T, c=time[contacts], s=dot_area, lw=0.0, alpha=0.8, zorder=4)
+    dots = axes.scatter(*position_mm[rows].T, c=time[rows], s=dot_area, lw=0.0, alpha=0.8, zorder=4)
     axes.figure.colorbar(dots, ax=axes, shrink=0.6, label=time_label, location="bottom", pad=0.02)
 
     # An ellipse extends two standard deviations to each side, and is therefore four standard deviations wide.
-    with_ellipse = _every_nth(contacts, MAX_ELLIPSES)
-    width_mm = 4.0 * traces["x_std_mm"][with_ellipse]
-    height_mm = 4.0 * traces["y_std_mm"][with_ellipse]
+    ellipse_rows = _every_nth(rows, MAX_ELLIPSES)
+    width_mm = 4.0 * traces["x_std_mm"][ellipse_rows]
+    height_mm = 4.0 * traces["y_std_mm"][ellipse_rows]
     axes.add_collection(
         EllipseCollection(
             width_mm,
             height_mm,
-            angles=np.zeros(len(with_ellipse)),
+            angles=np.zeros(len(ellipse_rows)),
             units="xy",
-            offsets=position_mm[with_ellipse],
+            offsets=position_mm[ellipse_rows],
             offset_transform=axes.transData,
             facecolors="none",
             edgecolors=INK,
@@ -416,11 +416,11 @@ def _draw_contacts(
     )
 
     # Crosses mark the contacts with at least one of the flags. A flag that no record has is not in `traces`.
-    is_doubtful = np.zeros(len(contacts), dtype=bool)
+    is_doubtful = np.zeros(len(rows), dtype=bool)
     for word in DOUBTFUL_FLAGS:
         if word in traces:
-            is_doubtful |= traces[word][contacts] > 0.0
-    axes.scatter(*position_mm[contacts[is_doubtful]].T, c=FELT, marker="x", s=24, lw=0.9, zorder=5)
+            is_doubtful |= traces[word][rows] > 0.0
+    axes.scatter(*position_mm[rows[is_doubtful]].T, c=FELT, marker="x", s=24, lw=0.9, zorder=5)
 
 
 def _every_nth(values: Any, max_count: int) -> Any:

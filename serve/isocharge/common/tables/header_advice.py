@@ -70,9 +70,10 @@ def header_advice(columns: Iterable[str], absent_columns: Mapping[str, ColumnMea
 def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
     """If a column of a file is probably a given missing column, return advice. Otherwise return an empty text.
 
-    Three kinds of names are recognised. A name of the first kind differs from the missing name only by capital letters.
-    A name of the second kind consists of words that mean the missing column. A name of the third kind consists of such
-    words and a unit. The unit is either the unit of the missing column, or a unit that can be converted to it.
+    Three kinds of names are recognised in the file. A name of the first kind differs from the missing name only by
+    capital letters. A name of the second kind consists of words that mean the missing column. A name of the third kind
+    consists of such words and a unit. The unit is either the unit of the missing column, or a unit that can be
+    converted to it.
 
     Args:
         column: Name of the column in the file.
@@ -87,9 +88,10 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
     if meaning.noun == "electrode":
         meaning = replace(meaning, words=_words(name))  # an electrode is recognised by the words of its name
 
-    # Check whether the name consists only of words, such as "force".
+    # Check whether the name consists only of words that mean the missing column, such as "force", and of general words,
+    # such as "position", which do not change the meaning.
     words = _words(column)
-    other_words = words - meaning.words - GENERAL_WORDS  # general words, such as "position", do not change the meaning
+    other_words = words - meaning.words - GENERAL_WORDS
     if _is_named(words, meaning) and not other_words:
         return advice_to_rename
 
@@ -98,7 +100,7 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
     if match is None:
         return ""
     label, bracketed_unit, last_word = match.groups()
-    unit = bracketed_unit or last_word
+    unit = bracketed_unit or last_word  # only one of them is not None
     is_named = _is_named(_words(label), meaning)
     is_recognised_by_unit = meaning.is_known_by_unit and bracketed_unit is not None
     if unit == meaning.unit and (is_named or is_recognised_by_unit):

@@ -149,10 +149,10 @@ class ParquetTable(NumberTable):
         return numbers
 
     def _leaf_index(self, field_name: str) -> int:
-        """Return the index under which Parquet stores a column that is not nested.
+        """Return the index under which Parquet stores the numbers of a column.
 
-        A nested column of the file has several indices. The index of a later column is therefore larger than the
-        position of this column in the header.
+        The index may be larger than the position of the column in the header. A nested column, such as a column of
+        records, counts once in the header, but Parquet stores each of its parts under a separate index.
 
         Args:
             field_name: Name of the column in the file.

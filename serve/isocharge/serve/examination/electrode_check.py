@@ -81,10 +81,6 @@ class ElectrodeCheck:
 def _order_sentence(expected_channels: Mapping[str, str], found_channels: Mapping[str, str]) -> str:
     """Return a sentence about the order of the channels, which may be swapped, turned or otherwise different.
 
-    The channels are turned if the channels of all electrodes are shifted by the same number of electrodes around the
-    film. For example, the channels of A, B and C are turned by one place if the presses near A, B and C change the
-    channels that were assumed to belong to B, C and A.
-
     Args:
         expected_channels: Channel of each electrode as it was assumed, by the names of the electrodes.
         found_channels: Channel of each electrode as the presses show it, by the names of the electrodes.
@@ -102,15 +98,32 @@ def _order_sentence(expected_channels: Mapping[str, str], found_channels: Mappin
         assumed_electrodes.append(expected_electrode[found_channel])
 
     # With two electrodes, turned channels are also swapped. "Swapped" is the simpler description.
-    if len(electrodes) > 2:
-        for places in range(1, len(electrodes)):
-            # The assumed electrodes have this order if the channels are shifted by `places` electrodes.
-            turned_electrodes = electrodes[places:] + electrodes[:places]
-            if assumed_electrodes == turned_electrodes:
-                return f"the channels are turned by {places} of {len(electrodes)} places"
+    turned_places = _turned_places(electrodes, assumed_electrodes)
+    if turned_places is not None and len(electrodes) > 2:
+        return f"the channels are turned by {turned_places} of {len(electrodes)} places"
     if len(wrong_electrodes) == 2:
         return f"the channels of {wrong_electrodes[0]} and {wrong_electrodes[1]} are swapped"
     return f"the channels of {', '.join(wrong_electrodes)} are in another order"
+
+
+def _turned_places(electrodes: list[str], assumed_electrodes: list[str]) -> int | None:
+    """Return the number of electrodes by which all channels are shifted around the film.
+
+    For example, the channels of A, B and C are turned by one place if the presses near A, B and C change the channels
+    that were assumed to belong to B, C and A.
+
+    Args:
+        electrodes: Names of the electrodes in the order of the presses.
+        assumed_electrodes: For each press, the electrode to which the channel that changed was assumed to belong.
+
+    Returns:
+        The number of electrodes, at least 1; None if the channels are not shifted by the same number of electrodes.
+    """
+    for places in range(1, len(electrodes)):
+        turned_electrodes = electrodes[places:] + electrodes[:places]
+        if assumed_electrodes == turned_electrodes:
+            return places
+    return None
 
 
 def check_electrodes(

@@ -85,7 +85,8 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     if levels is None or len(levels) * BLOCK_S < min_duration_s:
         return None
 
-    # Find the numbers of the blocks in which the force rises (begin), becomes constant (settled), and falls (end).
+    # Find the numbers of the blocks in which the force rises (begin), becomes constant (settled), and falls (end). The
+    # step is the change between two blocks, and the force rises in the block between them.
     step = _find_step(levels)
     begin_block = step.rest_blocks + 1
     settled_block = begin_block + round(SETTLE_S / BLOCK_S)
@@ -95,10 +96,12 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     if not (step.is_large and has_rest and is_long):
         return None
 
-    # Subtract the rest level from the component, and describe how the press changes while its force is constant.
+    # Subtract the rest level from the component. The difference is the size of the press in each block.
     block_times_s = BLOCK_S * (np.arange(len(step.component)) + 0.5)  # middle of each block
     rest, drift_per_s = _extrapolate_rest(step.component, block_times_s, step.rest_blocks, step.size)
     press_size = step.component - rest
+
+    # Describe how the size changes while the force is constant. A drift of the rest level is described separately.
     begin_s = BLOCK_S * begin_block
     held_times_s = block_times_s[settled_block:end_block] - begin_s
     description, sections = _describe(held_times_s, press_size[settled_block:end_block])
@@ -229,10 +232,13 @@ def _with_drift(
 ) -> tuple[str, dict[str, dict[str, float]]]:
     """Add a drift of the rest level to the description and to the sections of a press.
 
-    The section `[leak]` of a device file corrects an exponential loss of charge with the time constant `tau_s`, and
-    removes the drift at rest as well. If the rest level drifts but the press loses no charge, `tau_s` is set to a value
-    that is so large that no loss is corrected. If the press also loses charge exponentially, `[leak]` already has the
-    time constant of the press. In this case, the description asks the user to measure again without a drift.
+    The section `[leak]` of a device file has two effects. It corrects an exponential loss of charge with the time
+    constant `tau_s`, and it removes a drift at rest.
+
+    - If the press has no section `[leak]`, the section is added in order to remove the drift. Its `tau_s` is so large
+      that no loss of charge is corrected.
+    - If the press has a section `[leak]`, the press loses charge exponentially, and the section is kept. The user is
+      asked to measure again without a drift.
 
     Args:
         description: Description of the press, a sentence.

@@ -166,12 +166,13 @@ def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
 
 
 def held_press_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield sentences about settings and properties whose lack makes the force of a held press seem to change.
+    """Yield sentences about missing settings and properties that make the force of a held press constant.
 
-    The settings correct the leak of the amplifiers. Touches are also computed without these settings.
+    Without them, touches are computed, but the force of a held press seems to change, because the amplifiers leak.
 
-    If the user has held a press during the check, the charge of this press determines the settings. If no press was
-    held, a sentence asks for the time constants of the amplifiers, unless the device file contains the time constants.
+    - If the device file contains time constants of a leak, a clock of the device is needed in each frame.
+    - If the user has held a press during the check, the charge of the press has determined the settings.
+    - If no press was held, the time constants of the amplifiers are needed, unless the device file contains them.
 
     Args:
         findings: Results of the port check. `held.sections` are the sections of a device file that correct the press.

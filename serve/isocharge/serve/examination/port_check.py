@@ -265,7 +265,7 @@ def _touch_sentence(
         capture: The frames.
         device: Settings of the board, with its gain.
         electrode_at_position: Name of the electrode by the position of its channel in the frame.
-        held: The held press; None if there was none.
+        held_press: The held press; None if there was none.
         unit: Unit of the channels: "pC", "counts" or "V".
     """
     if not capture.frames or not electrode_at_position:
@@ -290,9 +290,12 @@ def _touch_sentence(
 def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
     """Return whether a tare succeeds with a device file. A tare is a measurement of the charges at rest.
 
-    The result is also true if the device file switches the tare off, or if there are too few frames to judge. Twice as
-    many frames as a tare needs are enough to judge. The result is false if there are no frames, or if reading the
-    frames raises an error.
+    There are four other cases.
+
+    - If there are no frames, the result is false.
+    - If reading the frames raises an error, the result is false.
+    - If the device file switches the tare off, the result is true.
+    - If there are too few frames to judge, the result is true. Twice as many frames as a tare needs are enough.
 
     Args:
         received: Bytes that the board sent while the film was at rest.
@@ -307,14 +310,15 @@ def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: 
         for chunk in received.chunks:
             for timed in stream.feed(chunk):
                 frame_count += 1
-                if timed.reading.tare is not None or device.tare is None:
+                is_tare_needed = device.tare is not None
+                if timed.reading.tare is not None or not is_tare_needed:
                     return True
     except IsochargeError:
         return False
 
-    # No frame has a tare. This only shows that a tare fails if there were enough frames.
-    if device.tare is None or frame_count == 0:  # there were no frames
+    if device.tare is None or frame_count == 0:  # without a tare rule, the first frame has ended the loop
         return False
+    # No frame has a tare. If there were few frames, this does not show that a tare fails.
     return frame_count < 2 * device.tare.frames
 
 

@@ -273,9 +273,10 @@ def _channels_of_similar_noise(values: Array, candidates: list[int], count: int)
 def _offset_setting(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, Any]:
     """Return the setting `offset` of the section `[gain]`, which contains the values of the channels without charge.
 
-    If a channel rests near half of the range of a converter, half of the range is its offset. For any other rest level,
-    the offset of the channel is the measured rest level. If the difference between offset and rest level would prevent
-    a tare at any electrode, the measured rest levels are used for all electrodes.
+    The rest level of a channel is its measured value at rest. If a channel rests near half of the range of a converter,
+    half of the range is its offset. For any other channel, the offset is the rest level. The rest levels are used for
+    all electrodes if, at any electrode, the rest level differs so much from the offset that a tare would fail. A tare
+    is the measurement of the charges at rest.
 
     Args:
         columns: Values of the channel of each electrode at rest, each of shape (n,), in the unit of the board.
@@ -286,7 +287,6 @@ def _offset_setting(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> di
         numbers by electrode; empty if all electrodes rest at 0.
     """
     rest_levels = {electrode: rest_of(column) for electrode, column in columns.items()}
-    offsets = {electrode: _proposed_offset(column) for electrode, column in columns.items()}
 
     # A rest level whose magnitude is at most the limit of the electrode counts as 0.
     limits = _zero_limits(columns, gain)
@@ -294,8 +294,9 @@ def _offset_setting(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> di
     if all_rest_at_zero:
         return {}
 
-    # With half of the range as the offset, the remaining rest level must be small enough for a tare. This limit is only
-    # known with the gain.
+    # After the offset is subtracted, the remaining rest level must be small enough for a tare. Without the gain, it is
+    # not known how large it may be, because the limit of a tare is in pC.
+    offsets = {electrode: _proposed_offset(column) for electrode, column in columns.items()}
     prevents_tare = any(abs(rest - offsets[electrode]) > limits[electrode] for electrode, rest in rest_levels.items())
     if gain and prevents_tare:
         offsets = {electrode: _round_rest_level(rest) for electrode, rest in rest_levels.items()}

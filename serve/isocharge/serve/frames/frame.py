@@ -256,13 +256,15 @@ class Columns:
         self.seq_column = names.index(SEQ) if SEQ in names else None
         self.flags_column = flags_column
 
+        # `TIMES_US` contains the unit of each clock, us, by the name of the clock, such as "t_ms".
         clock_columns = [names.index(name) for name in TIMES_US if name in names]
         self.clock_column = clock_columns[0] if clock_columns else None
         self.clock_unit_us = 1.0
         if self.clock_column is not None:
-            clock_name = names[self.clock_column]  # such as "t_ms"
+            clock_name = names[self.clock_column]
             self.clock_unit_us = TIMES_US[clock_name] * scales[self.clock_column]
 
+        # All other columns are channels.
         columns_without_channel = {self.seq_column, self.flags_column, *clock_columns}
         self.channels = [
             (column, scale) for column, scale in enumerate(scales) if column not in columns_without_channel
@@ -362,22 +364,24 @@ class DelimitedParser(Parser):
         """Return the frames that end within `data`.
 
         The bytes are divided into pieces at the delimiters. The bytes after the last delimiter are an unfinished piece,
-        which is stored for the next call. If an unfinished piece is longer than `max_length`, the piece and all bytes
-        up to the next delimiter are dropped.
+        the tail. The tail is stored for the next call. If the tail is longer than `max_length`, it is dropped instead.
+        The rest of the same piece is dropped when it arrives.
         """
         *pieces, tail = (self._tail + data).split(self._delimiter)
         frames = []
         for piece in pieces:
-            # The first piece may be the end of a long piece, whose beginning was dropped by an earlier call.
+            # If the beginning of a long piece was dropped by an earlier call, the first piece is its rest.
             if self._beginning_was_dropped or len(piece) > self._max_length:
-                self._beginning_was_dropped = False
+                self._beginning_was_dropped = False  # the following pieces are complete
                 self.counts.count_rejected(len(piece) + 1)  # with the delimiter
             else:
                 frames += self._parse_piece(piece)
+
+        # Store the tail, or drop it if it is too long or belongs to a piece whose beginning was dropped.
         self._tail = tail
         if self._beginning_was_dropped or len(tail) > self._max_length:
             self._beginning_was_dropped = True
-            super().reset()  # drops the tail, but does not set `_beginning_was_dropped` to False
+            super().reset()  # drops the tail; `self.reset` would also set `_beginning_was_dropped` to False
         return frames
 
     def reset(self) -> None:

@@ -141,8 +141,9 @@ class Field(Settings, frozen=True):
     def pack(self, value: float, byte_order: ByteOrder) -> float | bytes:
         """Convert a value to a form that the module `struct` can pack.
 
-        The result is a number, or bytes for a field of three bytes. A counter or clock in an integer field wraps around
-        if it exceeds the range of the field. Every other value is limited to the range of the field.
+        The field contains the count, which is the value divided by the scale of the field. A counter or clock in an
+        integer field wraps around if its count exceeds the range of the field. Every other count is limited to the
+        range of the field. The result is the count as a number, or as bytes for a field of three bytes.
 
         Args:
             value: Value in the unit of the channel or of the clock.
@@ -156,7 +157,7 @@ class Field(Settings, frozen=True):
             count = value / self.scale
         is_float = self.kind in LARGEST_FLOATS
         wraps = self.name in (SEQ, *TIMES_US) and not is_float
-        if wraps:
+        if wraps:  # the result is between the smallest and the largest count of the field
             count = (round(count) - self.smallest_count) % self.modulus + self.smallest_count
         limited_count = self._nearest_count(count)
         if is_float:

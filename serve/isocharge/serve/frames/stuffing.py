@@ -44,8 +44,8 @@ def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
     """Encode a block of bytes without zeros. If a zero follows the block, encode the zero as well.
 
     The block is cut into pieces of at most `MAX_BLOCK` bytes. Before each piece, a distance byte contains the length of
-    the piece plus 1. A decoder adds a zero after each piece, with two exceptions: a piece with the distance `MAX_BLOCK`
-    + 1, and the last piece of a frame.
+    the piece plus 1. The zero itself is not sent. A decoder adds a zero after each piece that has fewer than
+    `MAX_BLOCK` bytes, except after the last piece of a frame.
 
     Args:
         block: Bytes that contain no zero.
@@ -53,8 +53,8 @@ def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
     """
     encoded = bytearray()
     rest = block
-    # No zero is added after a piece of `MAX_BLOCK` bytes. If a zero follows such a piece, an empty piece is encoded
-    # after it, and the decoder adds the zero after the empty piece.
+    # Encode pieces of `MAX_BLOCK` bytes, after which the decoder adds no zero. If a zero follows the block, the last
+    # piece must be shorter, so that the decoder adds the zero. The last piece may be empty.
     while len(rest) > MAX_BLOCK or (len(rest) == MAX_BLOCK and ends_in_zero):
         encoded.append(MAX_BLOCK + 1)
         encoded += rest[:MAX_BLOCK]

@@ -186,11 +186,12 @@ class TextParser(DelimitedParser):
         self._unrecognised = []
 
     def _name_columns(self, header: Line, size: int) -> None:
-        """Use the names in a header as the names of the columns, unless the columns already have names.
+        """Use the names in a header of a CSV as the names of the columns, unless names are already known.
 
-        If the layout is already recognised and its columns cannot have the names in the header, the header is counted
-        as rejected. A header can appear after the recognition if the board was reset, or if another line looks like a
-        header.
+        A header may arrive before or after the layout is recognised. It arrives afterwards if the board was reset, or
+        if another line looks like a header. Such a later header is used only if the layout is a CSV with the same
+        number of columns, and if no names were known when the layout was recognised. Otherwise it is counted as
+        rejected.
 
         Args:
             header: Parsed line with the names of the columns.
@@ -295,10 +296,9 @@ class TextParser(DelimitedParser):
     def _read_cycle_line(self, layout: Layout, line: Line, size: int) -> list[Frame]:
         """Store the values of one line of a cycle. A cycle is a sequence of lines that together contain one frame.
 
-        Each line is identified by its first name other than the name of a clock, because every line of a cycle may
-        contain the clock. A new cycle begins with the line whose name comes first in the layout. A new cycle also
-        begins if the present cycle already contains a value with the name of the line, which means that lines of the
-        present cycle are missing.
+        A line is identified by its first name. The names of clocks are ignored, because every line of a cycle may
+        contain the clock. A line begins a new cycle in two cases: if its name comes first in the layout, or if the
+        present cycle already contains its name. In the second case, some lines were lost.
 
         Args:
             layout: The recognised layout.
@@ -325,6 +325,7 @@ class TextParser(DelimitedParser):
         if not is_complete:
             return []
 
+        # The cycle is complete. Convert its values to a frame, in the order of the layout.
         values = [self._cycle_values[name] for name in layout.names]
         cycle_bytes = self._cycle_bytes
         self._clear_cycle()
@@ -384,11 +385,11 @@ def _counter_and_clock_first(name: str) -> tuple[bool, str]:
 
 
 def _repeated_cycle_length(lines: list[Line]) -> int:
-    """Return the number of lines in the cycle that has just occurred `RECOGNITION_REPEATS` times in succession.
+    """Return the number of lines in a cycle, or 0 if the lines do not repeat regularly.
 
-    If no cycle has occurred so often, the result is 0. Two lines count as equal if they have the same notation, the
-    same names and the same number of values. A cycle of several lines is possible only with the notations `pairs` and
-    `teleplot`, because only in these two notations may a line contain a part of a frame.
+    A cycle is a sequence of lines that together contain one frame. It is recognised if the last lines consist of
+    `RECOGNITION_REPEATS` equal cycles. Lines are equal if their signatures are equal: the notation, the names and the
+    number of values. Only in the notations `pairs` and `teleplot` may a cycle have several lines.
 
     Args:
         lines: The lines received last, at least one, in the order in which they arrived.
@@ -404,6 +405,8 @@ def _repeated_cycle_length(lines: list[Line]) -> int:
     can_have_several_lines = lines[-1].notation in (Notation.pairs, Notation.teleplot)
     if cycle_length > 1 and not can_have_several_lines:
         return 0
+
+    # Compare the last lines with repetitions of the first cycle among them.
     recent_signatures = signatures[-RECOGNITION_REPEATS * cycle_length :]
     is_repeated = recent_signatures == recent_signatures[:cycle_length] * RECOGNITION_REPEATS
     return cycle_length if is_repeated else 0

@@ -84,7 +84,8 @@ class BoardEncoder:
         chain = device.chain(electrodes)
         self._gain = Gain(chain.gain_pC, chain.zero)
 
-        # All frames of the board have the same channels, so that one frame determines the positions of the electrodes.
+        # Find the position of each electrode's channel in a frame. All frames have the same channels, so that any frame
+        # can be used.
         picker = ChannelPicker(electrodes, device.channels, "the sensor", device.where)
         zeros = (0.0,) * len(self._frames.channels)
         frame_of_zeros = Frame(0, 0, zeros, names=self._frames.names)
@@ -95,7 +96,7 @@ class BoardEncoder:
         self.request = device.request
         self.clipped = 0
 
-        # The second check calls `encode`, which needs all attributes.
+        # The checks come last. The second check calls the method `encode`, which needs all attributes.
         self._check_offsets(device.where, electrodes)
         self._check_reading(device, electrodes)
 
@@ -183,14 +184,29 @@ def _frames_of(device: Device, electrodes: tuple[str, ...], notation: str | None
     """
     frames = device.frames
     if isinstance(frames, FrameLayout):  # the device file describes the channels as binary fields
-        no_notations = ()
-        _check_notation(device.where, notation, no_notations)
+        _check_notation(device.where, notation, fitting_notations=())  # no notation may be given
         return _layout_frames(frames, device.where)
     if isinstance(frames, TextFrames) and frames.columns:  # the device file describes the channels as columns of a CSV
-        _check_notation(device.where, notation, (CSV,))
+        _check_notation(device.where, notation, fitting_notations=(CSV,))
         return _column_frames(frames.columns)
 
-    # The device file does not describe the channels. They follow from the electrodes and the notation.
+    return _undescribed_frames(device, electrodes, notation)
+
+
+def _undescribed_frames(device: Device, electrodes: tuple[str, ...], notation: str | None) -> BoardFrames:
+    """Return the description of frames whose channels the device file does not describe.
+
+    The channels follow from the electrodes and from the notation.
+
+    Args:
+        device: Settings of the board.
+        electrodes: Names of the electrodes.
+        notation: Notation of the frames: "binary", or a notation of `encode_text`. If None, a notation is chosen that
+            fits the device file.
+
+    Raises:
+        DeviceError: If the device file contains a channel number that is too large, or does not fit the notation.
+    """
     channel_names, n_channel = _used_channels(device, electrodes)
     default_notation, fitting_notations = _fitting_notations(device, has_channel_names=bool(channel_names))
     _check_notation(device.where, notation, fitting_notations)
@@ -277,10 +293,10 @@ def _check_notation(where: str, notation: str | None, fitting_notations: tuple[s
 
 
 def _used_channels(device: Device, electrodes: tuple[str, ...]) -> tuple[tuple[str, ...], int]:
-    """Return the names of the channels to which electrodes are assigned, and the number of channels in a frame.
+    """Return the names of the channels that the electrodes use, and the number of channels in a frame.
 
-    If the device file assigns no channel to an electrode, the electrode uses the channel that has the name of the
-    electrode. If the device file assigns all channels by number, the tuple of names is empty.
+    By default, an electrode uses the channel with its own name. The section `[channels]` of the device file may state
+    another name, or a number. If it states numbers for all electrodes, the tuple of names is empty.
 
     Args:
         device: Settings of the board.
@@ -292,10 +308,11 @@ def _used_channels(device: Device, electrodes: tuple[str, ...]) -> tuple[tuple[s
     assigned_names = [device.channels.get(electrode, electrode) for electrode in electrodes]
     names = tuple(dict.fromkeys(assigned_names))  # each name once, because two electrodes may use the same channel
     numbers = [channel_number(name) for name in names]  # None for a name that is not a number
-    if None in numbers:
+    if None in numbers:  # the channels are identified by their names
         return names, len(names)
 
-    # All channels have numbers. A frame contains all channels up to the largest number, and one for each electrode.
+    # All channels are identified by numbers. A frame contains all channels up to the largest used number. It contains
+    # at least as many channels as there are electrodes.
     used_numbers = [number for number in numbers if number is not None]
     n_channel = max(len(electrodes), *used_numbers)
     if n_channel > MAX_CHARGES:

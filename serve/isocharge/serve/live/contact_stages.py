@@ -139,17 +139,18 @@ class FilmStage(ContactStage):
         self.follower = FilmFollower(model.predictor, rule, warming_ratio)
 
     def step(self, frame: ContactFrame) -> None:
-        """Correct the contact for the estimated pretension, and then update the estimate with the frame.
+        """Correct the contact for the estimated pretension of the film, and then update the estimate with the frame.
 
         The model for the new estimate is used from the next frame on. If the pretension can no longer be estimated,
         every frame with a contact gets the flag `film`.
         """
+        # Correct the contact with the estimate from the earlier frames, and store this estimate in the frame.
         charge_pC = frame.reading.charge_pC
         if frame.contact is not None and charge_pC is not None:
             frame.contact, frame.model_charge_pC = self.follower.follow_contact(frame.contact, charge_pC)
-        frame.film = self.follower.film  # the estimate with which this contact was corrected
+        frame.film = self.follower.film
 
-        # The following call may change the estimate. It must therefore come after the two statements above.
+        # Update the estimate, and use its model for the next frame.
         self.follower.observe_frame(charge_pC, frame.contact, frame.flags, frame.clock_s)
         self._model.predictor = self.follower.predictor
         if frame.contact is not None and self.follower.is_lost:
@@ -169,16 +170,15 @@ class TrackingStage(ContactStage):
     """Stage that tracks the contact from frame to frame."""
 
     def __init__(self, tracker: Tracker, predictor: Predictor, *, is_film_followed: bool) -> None:
-        """Decide whether the tracker uses a mixture of several possible contacts.
-
-        The contact that the tracker tracks at present is not discarded.
+        """Store the tracker, and give it a mixture of several possible contacts if the film needs one.
 
         On some films, several different contacts cause the same charges. For such a film, the tracker uses a mixture of
-        Gaussian components that represents all possible contacts. The mixture needs the file `charges.npz`, which
-        describes the charges of every contact. The file is in the folder of the model.
+        Gaussian components that represents all possible contacts. The mixture needs the file `charges.npz` in the
+        folder of the model. The file describes the charges of every contact. The tracker keeps the contact that it
+        tracks at present.
 
         Args:
-            tracker: Tracker, whose state is used further.
+            tracker: The tracker. Its mixture is replaced, and its state is kept.
             predictor: The loaded model.
             is_film_followed: Whether the pretension of the film is estimated. If it is, no mixture is used, because the
                 file of charges describes the calibrated film instead of the current film.
@@ -188,7 +188,7 @@ class TrackingStage(ContactStage):
         """
         mixture = None
         if not is_film_followed:
-            mixture = contact_mixture(predictor)  # None if the model has no such file
+            mixture = contact_mixture(predictor)  # None if the model has no file `charges.npz`
         self._mixture_validity = predictor.validity
         if mixture is not None:
             # A contact of the mixture is valid in the whole area for which the file describes the charges.
@@ -265,11 +265,10 @@ class ChargeScaleStage(ContactStage):
     def _shift(self, frame: ContactFrame, contact: Contact) -> tuple[float, float, float] | None:
         """Return the change of the contact that an error of the charge scale by one standard deviation causes.
 
-        The change is computed from a second prediction with slightly larger charges.
-
-        For a contact of the mixture, there is no second prediction, because the model does not predict such a contact.
-        Only the force F of such a contact is assumed to depend on the scale. The assumption that F is proportional to
-        scale^p, with the exponent p = `LARGEST_FORCE_EXPONENT`, gives the change dF = p F d(scale).
+        If the model has predicted the contact, the change is computed from a second prediction with slightly larger
+        charges. If the contact comes from the mixture of the tracker, only its force F is assumed to depend on the
+        scale. The assumption is that F is proportional to scale^p, with the exponent p = `LARGEST_FORCE_EXPONENT`. It
+        gives the change dF = p F d(scale).
 
         Args:
             frame: The frame.
@@ -284,12 +283,15 @@ class ChargeScaleStage(ContactStage):
         charge_pC = frame.model_charge_pC
         if charge_scale_std <= 0.0 or charge_pC is None:
             return None
+
+        # `_sensitivity` stores the result of the latest second prediction. The result is discarded if the model has
+        # changed since then.
         predictor = self._model.predictor
-        if predictor is not self._sensitivity_predictor:  # the sensitivity was computed with another model
+        if predictor is not self._sensitivity_predictor:
             self.reset()
         scaled_pC = charge_pC * (1.0 + CHARGE_SCALE_STEP)
-        # The function that is passed makes the second prediction. It is only called if the contact has moved since the
-        # previous second prediction.
+        # The last argument makes a new second prediction. It is only called if the contact has moved since the latest
+        # one.
         return self._sensitivity.shift(contact, charge_scale_std, lambda: predictor.predict(scaled_pC))
 
 
@@ -331,19 +333,22 @@ class TouchOffsetStage(ContactStage):
     def step(self, frame: ContactFrame) -> None:
         """Add the error of a common offset to the standard deviations of the contact and the tracked contact.
 
-        The error is computed from a second prediction, in which an offset is added to the charges. A contact of the
-        mixture is not changed, because the model does not predict such a contact.
+        The error is computed from a second prediction, in which an offset is added to the charges. A contact from the
+        mixture of the tracker is not changed, because the model does not predict such a contact.
         """
         charge_pC = frame.model_charge_pC
         contact = frame.contact
         if contact is None or charge_pC is None or frame.is_mixture_contact:
             return
+
+        # `_sensitivity` stores the result of the latest second prediction. The result is discarded if the model has
+        # changed since then.
         predictor = self._model.predictor
-        if predictor is not self._sensitivity_predictor:  # the sensitivity was computed with another model
+        if predictor is not self._sensitivity_predictor:
             self.reset()
         shifted_pC = charge_pC + TOUCH_OFFSET_STEP_pC * self._warming_ratio
-        # The function that is passed makes the second prediction. It is only called if the contact has moved since the
-        # previous second prediction.
+        # The last argument makes a new second prediction. It is only called if the contact has moved since the latest
+        # one.
         shift = self._sensitivity.shift(contact, self._rule.std_pC, lambda: predictor.predict(shifted_pC))
         _add_error(frame, contact, shift)
 

@@ -47,8 +47,8 @@ class RecordedStream:
         self._caller_recorder = recorder  # the caller closes this recorder, and all others are closed here
         self._current_chunk: tuple[Chunk, list[str]] | None = None  # a chunk and its records that are not recorded yet
         self._requests: deque[Callable[[], None]] = deque()
-        # Recorder of the requested recording, or None if it was requested to record nothing. The deque is empty if
-        # there is no request. A new request replaces an older one. Other threads can safely append to a deque.
+        # The latest request for a recording: its recorder, or None for a request to record nothing. The deque is empty
+        # if there is no request. A deque is used because other threads can safely append to it.
         self._next_recorder: deque[Recorder | None] = deque(maxlen=1)
         self._next_load: Load | None = None
         self._loading_model: Future[Predictor] | None = None
@@ -256,7 +256,7 @@ def replay(
         RecordingError: If a line other than the last one is damaged.
         ModelError: If a model of the recording cannot be loaded.
     """
-    delay_s: float | None = None  # time from the recording to the replay; None before the first chunk
+    delay_s: float | None = None  # present time minus recorded time of the first chunk; None before that chunk
     for event in recording.events():
         match event:
             case Marker():
@@ -276,10 +276,20 @@ def replay(
                 if real_time:
                     due_s = chunk.timestamp + delay_s
                     time.sleep(max(0.0, due_s - time.time()))
-                # When the recording was made, the program may have ended before the last record of a chunk was yielded.
-                # The recording contains one latency for each record that was yielded. The stream still processes the
-                # whole chunk.
-                yielded_count = len(latencies_us)
-                for index, record in enumerate(stream.feed(chunk)):
-                    if index < yielded_count:
-                        yield record
+                recorded_count = len(latencies_us)  # the recording contains one latency for each recorded record
+                yield from _first_records(stream.feed(chunk), recorded_count)
+
+
+def _first_records(records: Iterator[PredictionRecord], count: int) -> Iterator[PredictionRecord]:
+    """Yield the first records of a chunk, and compute the remaining records without yielding them.
+
+    A chunk may have more records than the recorded stream has yielded, because the program may have ended before. The
+    remaining records are computed so that the stream processes the whole chunk.
+
+    Args:
+        records: All records of the chunk. Each record is computed when it is requested from the iterator.
+        count: Number of records to yield.
+    """
+    for index, record in enumerate(records):
+        if index < count:
+            yield record

@@ -233,6 +233,10 @@ class PressWatch:
     def _process_rest(self, charge_pC: Array, t_s: float) -> WatchResult:
         """Store a frame in which nothing touches the film. Refuse a press that has ended without becoming steady.
 
+        The stored frames are used to measure the charges at rest before the next press. Frames within `edge_s` after a
+        press are not stored, because the finger may still touch the film. Frames within `edge_s` before a press are not
+        used, because the finger may already touch the film.
+
         Args:
             charge_pC: Touch charges of the frame, shape (n_electrode,), pC.
             t_s: Time of the frame, s.
@@ -242,9 +246,10 @@ class PressWatch:
         is_press_unfinished = self._phase is Phase.settling
         self._phase = Phase.waiting
 
-        # Store the frame, and drop frames that are too old to measure the rest before the next press.
-        if t_s > self._end_s + rule.edge_s:  # the finger has left the film
+        if t_s > self._end_s + rule.edge_s:
             self._rest.append((t_s, charge_pC))
+
+        # Drop frames that are too old. If a press began now, its rest would be measured over a duration of `rest_s`.
         oldest_rest_s = t_s - rule.rest_s - rule.edge_s
         while self._rest:
             first_rest_s, _ = self._rest[0]
@@ -322,10 +327,9 @@ class PressWatch:
     def _steady_press(self, reading: Reading) -> SteadyPress | None:
         """Return the press in the window if the press is steady. Otherwise store the reason and return None.
 
-        A window is calm if its scatter is at most `MAX_SCATTER_RATIO` times the smallest scatter in any window of the
-        present press. A window with a sudden movement is therefore not calm. The mean magnitude of the charges in each
-        calm window is stored, because the cause of a slow decrease is determined from the stored magnitudes. If a
-        window is not calm, neither its mean magnitude nor its reason is stored.
+        A window is calm if it contains no sudden movement. Its scatter is then at most `MAX_SCATTER_RATIO` times the
+        smallest scatter in any window of the present press. If a window is not calm, neither its mean magnitude nor its
+        reason is stored.
 
         Args:
             reading: The latest frame. Its tare contains the noise of the charges at rest.
@@ -334,12 +338,8 @@ class PressWatch:
         scatter_pC = float(press.scatter_pC.max())
         is_calm = scatter_pC <= MAX_SCATTER_RATIO * self._min_scatter_pC
         self._min_scatter_pC = min(self._min_scatter_pC, scatter_pC)
-        # The first window of a press contains its beginning, during which the force may still rise.
-        is_after_first_window = press.held_s >= 2.0 * press.window_s
-        if is_calm and is_after_first_window:
-            middle_s = press.held_s - 0.5 * press.window_s  # time from the touch to the middle of the window
-            mean_magnitude_pC = float(np.abs(press.charge_pC).mean())
-            self._mean_magnitudes.append((middle_s, mean_magnitude_pC))
+        if is_calm:
+            self._store_mean_magnitude(press)
 
         noise_pC = np.zeros_like(press.charge_pC)
         if reading.tare is not None:
@@ -350,6 +350,21 @@ class PressWatch:
         if is_calm:
             self._reason = reason
         return None
+
+    def _store_mean_magnitude(self, press: SteadyPress) -> None:
+        """Store the mean magnitude of the charges in a calm window, unless it is the first window of the press.
+
+        The cause of a slow decrease of the charges is determined from the stored magnitudes. In the first window of a
+        press, the force may still rise.
+
+        Args:
+            press: The calm window.
+        """
+        is_after_first_window = press.held_s >= 2.0 * press.window_s
+        if is_after_first_window:
+            middle_s = press.held_s - 0.5 * press.window_s  # time from the touch to the middle of the window
+            mean_magnitude_pC = float(np.abs(press.charge_pC).mean())
+            self._mean_magnitudes.append((middle_s, mean_magnitude_pC))
 
     def _measure_window(self) -> SteadyPress:
         """Fit a straight line to each charge in the window, and return the means, the scatter and the drift.

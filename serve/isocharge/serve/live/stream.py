@@ -162,19 +162,23 @@ class TouchStream:
             chain=chain,
             parser=parser,
             gaps=gaps,
-            misfit=self._misfit,  # is only called for frames, after `_set_model` below
+            misfit=self._misfit,  # uses the model, but is only called for frames, after `_set_model` below
             reader=f"model {predictor.metadata.label}",
         )
+        # Objects that the caller may read
         self.parser = self._readings.parser
         self.gaps = self._readings.gaps
         self.clock = self._readings.clock
         self.counts = StreamCounts()
-        self._tracker = None
-        if device.track is not None:
-            self._tracker = Tracker(device.track)
+
         self._before_restart = StreamTotals()  # counts of the time before the latest `restart`
         self._policy = policy
         self._now_ns = now_ns
+
+        # Settings and objects from which `_set_model` creates the stages
+        self._tracker = None
+        if device.track is not None:
+            self._tracker = Tracker(device.track)
         self._given_name = frame_id
         self._follow_rule = device.follow
         self._touch_offset_rule = device.touch_offset

@@ -109,8 +109,8 @@ class FilmDirections:
         """Compute the change of ln Q, the logarithm of each charge, by one unit of each direction.
 
         A direction is a linear combination of the unknowns of the film. One unit of a direction is one standard
-            deviation. A contact beyond the largest radius or outside the range of forces is replaced by the nearest
-            contact within these limits.
+        deviation. A contact beyond the largest radius or outside the range of forces is replaced by the nearest contact
+        within these limits.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -159,6 +159,9 @@ class FilmDirections:
         # Matrices that project a change D of the charges, each of shape (n, n_electrode, n_electrode)
         explained_projection = contact_slopes @ np.linalg.pinv(contact_slopes)
         unexplained_projection = np.eye(charge_pC.shape[1]) - explained_projection
+
+        # If ln Q of one electrode changes by one unit, D has the single component Q / sigma at this electrode. The
+        # misfit vector then changes by the column of the projection for this electrode, multiplied by Q / sigma.
         return np.asarray(unexplained_projection * charge_slopes[:, None, :])
 
     def _unit_contact(self, contact: Array) -> Array:

@@ -270,7 +270,7 @@ def _columns(widths: Mapping[str, int]) -> dict[str, slice]:
 
     Returns:
         Slice of each output, by the name of the output. The slices follow each other in the order of `widths`, except
-        that the slice of the correlations is the last.
+        that the slice of the correlations is the last, because the correlations are the last values of a `Contact`.
     """
     names = [name for name in widths if name != CORRELATION]
     if CORRELATION in widths:

@@ -91,10 +91,10 @@ class BrowserCheck:
     ) -> str | None:
         """Return the reason why a request is refused, or None if the request is accepted.
 
-        The header `Host` must contain a name or an address of this server, unless every host is accepted. If the
-        request has a header `Origin`, the header must contain the origin of a page of this server. If the request has
-        no header `Origin`, the header `Sec-Fetch-Site` must not state that another site has sent the request. As an
-        exception, a request is accepted if the user has followed a link on another site to a page of this server.
+        First, the header `Host` must contain a name or an address of this server, unless every host is accepted.
+        Second, if the request has a header `Origin`, it must contain the origin of a page of this server. Third, if the
+        request has no header `Origin`, the header `Sec-Fetch-Site` must not state that another site has sent the
+        request. As an exception, the user may follow a link on another site to a page of this server.
 
         Args:
             method: Method in capitals.
@@ -104,7 +104,8 @@ class BrowserCheck:
             fetch_mode: Value of the header `Sec-Fetch-Mode`, or None if the request has no such header.
             fetch_dest: Value of the header `Sec-Fetch-Dest`, or None if the request has no such header.
         """
-        if not (self._any_host or self._is_served(host)):
+        is_accepted_host = self._any_host or self._is_served(host)
+        if not is_accepted_host:
             return (
                 f"Host: expected an IP address or one of {self._served_names()}, got {_quoted(host)}; use the server's "
                 "address, or name the host by --allow-host of `isocharge serve http`"
@@ -141,10 +142,9 @@ class BrowserCheck:
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
         """Return whether the page that has sent a request belongs to this server.
 
-        A page belongs to this server if its origin contains the same host and the same port as the header `Host`. A
-        page also belongs to this server if its host name is one of the allowed names, because a reverse proxy may have
-        replaced the header `Host`. However, a page with the requested host name and a different port belongs to another
-        server.
+        A page belongs to this server in two cases. In the first case, its origin contains the same host and the same
+        port as the header `Host`. In the second case, its host name is allowed and differs from the name in the header
+        `Host`. The names differ if a reverse proxy has replaced the header `Host`.
 
         Args:
             origin: Value of the header `Origin`, for example b"http://localhost:8000".
@@ -156,8 +156,8 @@ class BrowserCheck:
         requested_host = host.decode("latin-1").lower()
         if page_host == requested_host:
             return True
-        # `page_host` and `requested_host` may contain a port. The following names do not. If the names are equal, the
-        # ports differ, and the page belongs to another server on the same machine.
+        # The following names contain no ports. If the names are equal, only the ports differ. The page then belongs to
+        # another server on the same machine.
         page_name = _name_in(f"//{page_host}")
         requested_name = _name_in(f"//{requested_host}")
         return page_name in self._allowed_names and page_name != requested_name

@@ -37,7 +37,9 @@ class McapOutput:
         from isocharge.serve.export.mcap_file import McapFile  # needs the extra `record`
 
         self._path = path
-        self._stack = ExitStack()  # closes the file; in a replay, it then gives the file its final name
+        # In a replay, the file has a temporary name until it is complete. A live file has its final name at once. The
+        # stack contains the steps that end the output: it closes the file and, in a replay, gives it its final name.
+        self._stack = ExitStack()
         written_path = path if is_live else self._stack.enter_context(new_file(path))
         self._file = self._stack.enter_context(McapFile(written_path, electrodes, encoding))
 

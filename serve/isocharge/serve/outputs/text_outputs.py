@@ -59,7 +59,9 @@ class TextFile:
         """
         self._path = path
         self._line_of = line_of
-        self._stack = ExitStack()  # closes the file; in a replay, it then gives the file its final name
+        # In a replay, the file has a temporary name until it is complete. A live file has its final name at once. The
+        # stack contains the steps that end the output: it closes the file and, in a replay, gives it its final name.
+        self._stack = ExitStack()
         written_path = path if is_live else self._stack.enter_context(new_file(path))
         self._file = AtomicWriter(written_path)
         self._stack.callback(self._file.close)

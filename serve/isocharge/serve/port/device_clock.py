@@ -66,7 +66,11 @@ class DeviceClock:
         self.reset()
 
     def reset(self) -> None:
-        """Treat the next reading as the first reading of a new connection."""
+        """Treat the next reading as the first reading of a new connection.
+
+        The fit is a straight line that converts the clock of the device to the time of the host. The bytes that arrive
+        together at the host are called a chunk.
+        """
         self._sent_us: int | None = None  # clock of the latest reading as the device sent it
         self._device_us = 0  # clock of the latest reading after the wraps were removed
         self._last_arrival_s: float | None = None  # arrival of the latest reading that was sent without a clock
@@ -83,8 +87,8 @@ class DeviceClock:
     def read(self, t_us: int | None, modulus: int, arrived_s: float) -> ReadingTime:
         """Return the time at which the next reading was taken, and the time since the previous reading.
 
-        If the device sends a clock, the fit converts the clock to host time. If the device sends no clock, the host
-        time is the arrival time of the chunk.
+        The fit is a straight line that converts the clock of the device to the time of the host. If the device sends no
+        clock, the host time is the arrival time of the chunk. A chunk consists of the bytes that arrived together.
 
         Args:
             t_us: Clock as the device sent it, us; None if the device sends no clock.
@@ -95,7 +99,7 @@ class DeviceClock:
             return self._time_without_clock(arrived_s)
 
         step_us = self._advance(t_us, modulus)  # time since the previous reading
-        if self._is_ahead_of(arrived_s):
+        if self._is_ahead_of(arrived_s):  # no reading can be taken long after its arrival, so a clock was set
             self.restarts += 1
             self._fitted_us = None  # the fit starts again from this reading
             step_us = 0
@@ -139,10 +143,10 @@ class DeviceClock:
     def arrived(self, arrival_s: float) -> None:
         """Fit the clock of the device to the arrival time of a chunk.
 
-        Call this method after the last reading of the chunk.
+        A chunk consists of the bytes that arrived together. Call this method after the last reading of the chunk.
 
-        If the readings come from a file, all chunks have the same arrival time. An arrival time is therefore used only
-        if it differs from the previous arrival time.
+        If the readings come from a file, all chunks have the same arrival time, which contains no information about the
+        clock. An arrival time is therefore used only if it differs from the previous arrival time.
 
         Args:
             arrival_s: Arrival of the chunk, unix seconds.
@@ -151,13 +155,14 @@ class DeviceClock:
         self._chunk_arrival_s = arrival_s
         is_first_arrival = previous_arrival_s is None
         is_repeated = previous_arrival_s == arrival_s
-        if self._fitted_us is None or is_first_arrival or is_repeated:
+        if self._fitted_us is None or is_first_arrival or is_repeated:  # the first arrival may be that of a file
             return
 
         delay_s = arrival_s - self._predict(self._device_us)  # positive if the chunk arrived later than predicted
         was_clock_set = abs(delay_s) > MAX_DEVIATION_s
         if was_clock_set:
             self._latest_host_s = -math.inf  # the host time may decrease here
+        # A provisional fit relies on the arrival of only one chunk, and is replaced by a fit to this arrival.
         if was_clock_set or self._is_fit_provisional:
             self._begin_fit(arrival_s)
         else:

@@ -163,7 +163,7 @@ class Recorder:
         if self.failed:
             return
         try:
-            self._file.write(f"{lines}\n".encode())
+            self._file.write(f"{lines}\n".encode())  # overwrites the rest of an interrupted call
         except OSError as error:
             self.failed = True
             log.error("%s: recording stopped (%s); what was written until now is whole", self.path, error.strerror)

@@ -193,7 +193,7 @@ def _flags(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], 
     all_flags = []
     for press, validity_flags in enumerate(batch_flags):
         flags = []
-        if OUTSIDE in validity_flags and has_contact[press]:
+        if OUTSIDE in validity_flags and has_contact[press]:  # without a contact, NaN counts as outside
             flags.append(OUTSIDE)
         if has_misfit[press]:
             flags.append(MISFIT)

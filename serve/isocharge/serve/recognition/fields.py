@@ -125,9 +125,9 @@ class Part(NamedTuple):
 def parts_of(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights: Weights) -> list[list[Part]]:
     """List the possible parts of a frame that begin at each byte.
 
-    For each byte, the first entry is padding, namely a single byte without a meaning. The other entries are the numbers
-    of the types `TYPES` that can begin at the same byte. A number may extend into the second frame of a row, because
-    the first byte of the frames is not yet known.
+    A part is a single byte without a meaning (padding), or a number of one of the types `TYPES`. The first byte of the
+    frames is not yet known. A number may therefore begin near the end of the first `length` bytes of a row, and end in
+    the following bytes.
 
     Args:
         rows: Bytes of each frame and of the next frame, shape (n, 2 * length). The frames may begin at any position of
@@ -137,7 +137,7 @@ def parts_of(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights: Weigh
         weights: Contributions to the score.
 
     Returns:
-        For each of the `length` bytes, a list of parts.
+        For each of the `length` bytes, a list of parts, of which the first is padding.
     """
     usual, is_constant = usual_bytes(rows)
     is_zero = is_constant & (usual == 0)
@@ -147,11 +147,12 @@ def parts_of(rows: Bytes, order: ByteOrder, frame_rate_Hz: float, weights: Weigh
     parts_at: list[list[Part]] = []
     for position in range(length):
         pad_score = weights.constant if is_constant[position] else weights.noise
-        parts = [Part("pad", "pad", 1, pad_score)]
-        for kind in TYPES:  # such as "u16": the number is the size in bits
+        parts = [Part("pad", "pad", 1, pad_score)]  # one byte of padding
+        for kind in TYPES:  # such as "u16", whose size is 16 bits
             size = int(kind[1:]) // 8  # in bytes
             end = position + size
             if end <= row_length:
+                # The bytes of the number in all frames, shape (n, size), and the properties of each byte, shape (size,)
                 number_bytes = rows[:, position:end][:, ::byte_step]
                 byte_is_constant = is_constant[position:end][::byte_step]
                 byte_is_zero = is_zero[position:end][::byte_step]
@@ -239,6 +240,7 @@ def split_frame(
     def best_division(position: int, row: str) -> tuple[float, tuple[Part, ...]]:
         """Find the division with the lowest score for the bytes from a given position to the end.
 
+        The function tries each part that may begin at the position, and calls itself for the bytes after the part.
         Adjacent channels of one type form a row. A channel that begins a row adds `weights.row` to the score. A channel
         with a constant value cannot begin a row.
 

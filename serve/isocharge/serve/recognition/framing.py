@@ -170,12 +170,11 @@ def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
 def _synchronised_frames(stream: Bytes) -> Iterator[Windows]:
     """Yield divisions of a stream into frames that begin at a repeated byte or a repeated pair of bytes.
 
-    If a byte or a pair of bytes is the same in every frame, it repeats at a distance of one frame length. For each
-    repeated byte or pair, frames are assumed to begin at every repetition. The share of the stream that these frames
-    would cover is computed. For each frame length, the byte or pair with the largest share is chosen. The share of a
-    single byte is reduced by a penalty, because single bytes often repeat by chance. Only the `MAX_FRAME_LENGTHS` frame
-    lengths with the largest shares are used. If two frame lengths have about equal shares, the shorter length comes
-    first.
+    If a byte or a pair of bytes is the same in every frame, it repeats at a distance of one frame length. Frames are
+    therefore assumed to begin at every repetition of a byte or pair. The assumption is rated by the share of the stream
+    that these frames would cover. The share of a single byte is reduced by a penalty, because single bytes often repeat
+    by chance. For each frame length, the byte or pair with the largest share is chosen. The `MAX_FRAME_LENGTHS` frame
+    lengths with the largest shares are yielded.
 
     Args:
         stream: Bytes of the stream, shape (n,).
@@ -183,19 +182,22 @@ def _synchronised_frames(stream: Bytes) -> Iterator[Windows]:
     single_bytes = stream.astype(np.int64)
     byte_pairs = 256 * single_bytes[:-1] + single_bytes[1:]
 
-    # For each length of a frame, the largest share of the stream that is covered, and where its frames begin.
+    # For each length of a frame, the largest share so far, and the positions at which the frames begin
     best_share: dict[int, float] = {}
     best_starts: dict[int, NDArray[np.int64]] = {}
     for codes, penalty in ((byte_pairs, 0.0), (single_bytes, SINGLE_BYTE_PENALTY)):
         for length, starts in _frequent_distances(codes):
             share = len(starts) * length / len(stream) - penalty
-            share_to_exceed = best_share.get(length, COVERED_SHARE - penalty)
+            share_to_exceed = best_share.get(length, COVERED_SHARE - penalty)  # the default is for a new length
             if share > share_to_exceed:
                 best_share[length] = share
                 best_starts[length] = starts
 
     def largest_share_first(length: int) -> tuple[float, int]:
-        """Return the key for sorting lengths by decreasing share, rounded to 10 %, and then by increasing length."""
+        """Return the key for sorting lengths by decreasing share, and equal shares by increasing length.
+
+        The shares are rounded to 10 %, so that of two lengths with about equal shares the shorter length comes first.
+        """
         return -round(best_share[length], 1), length
 
     best_lengths = sorted(best_share, key=largest_share_first)[:MAX_FRAME_LENGTHS]
@@ -204,22 +206,25 @@ def _synchronised_frames(stream: Bytes) -> Iterator[Windows]:
 
 
 def _frequent_distances(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Yield each frequent distance between successive occurrences of a code, with the positions of these occurrences.
+    """Yield each frequent distance from a code to the next equal code, and the positions from which it is measured.
 
-    A distance is frequent if frames of this length at the yielded positions would cover a large share of the stream.
-    Only distances that can be the length of a frame are yielded.
+    A code is a byte, or a pair of bytes as a number. Only distances that can be the length of a frame are yielded. A
+    distance is frequent if frames of this length at the yielded positions would cover a large share of the stream.
 
     Args:
-        codes: Code at each position of the stream, shape (n,). A code is a byte, or a pair of bytes as a number.
+        codes: Code at each position of the stream, shape (n,).
     """
-    # A stable sort puts the positions of equal codes side by side, in ascending order.
+    # A stable sort puts the positions of equal codes side by side, in ascending order. Neighbours in the sorted array
+    # are therefore successive positions of the same code, unless the code changes.
     sorted_positions = np.argsort(codes, kind="stable")
-    all_positions = sorted_positions[:-1]
-    distances_to_next = np.diff(sorted_positions)
+    distances_to_next = np.diff(sorted_positions)  # shape (n - 1,)
     next_code_is_equal = np.diff(codes[sorted_positions]) == 0
+
+    # Select the distances that can be the length of a frame, and the position before each of them.
     has_frame_length = (distances_to_next >= MIN_FRAME_BYTES) & (distances_to_next <= MAX_FRAME_BYTES)
-    positions = all_positions[next_code_is_equal & has_frame_length]
-    distances = distances_to_next[next_code_is_equal & has_frame_length]
+    is_selected = next_code_is_equal & has_frame_length
+    positions = sorted_positions[:-1][is_selected]
+    distances = distances_to_next[is_selected]
 
     # Count how often each pair of code and distance occurs. Each pair is encoded as one number.
     distance_count = MAX_FRAME_BYTES + 1
@@ -227,7 +232,7 @@ def _frequent_distances(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray
     different_pairs, pair_counts = np.unique(code_distance_pairs, return_counts=True)
     for pair, count in zip(different_pairs, pair_counts, strict=True):
         distance = int(pair) % distance_count  # decodes the distance
-        if count * distance >= COVERED_SHARE * len(codes):
+        if count * distance >= COVERED_SHARE * len(codes):  # the frames would cover a large share
             yield distance, positions[code_distance_pairs == pair]
 
 
@@ -300,23 +305,22 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     Args:
         rows: Bytes of the frames, shape (n, length).
     """
-    different_rows = np.unique(rows, axis=0)  # sorted
-
-    # The frames are drawn at random, because neighbours in the sorted array differ in a few bits only.
-    drawn = np.random.default_rng(0).permutation(len(different_rows))[:MAX_CHECKED_FRAMES]
-    checked_rows = different_rows[drawn]
+    checked_rows = _drawn_rows(rows)
     if len(checked_rows) < MIN_CHECKED_FRAMES:
         return
     frames = [row.tobytes() for row in checked_rows]
-    _usual, is_constant = usual_bytes(checked_rows)
+    _usual, is_constant = usual_bytes(checked_rows)  # `is_constant` has the shape (length,)
     length = len(is_constant)
-    leading_constant_count = int(np.argmin([*is_constant[:MAX_FIRST_COVERED_BYTE], False]))  # position of first False
+    # Number of constant bytes at the beginning of the frames, which is the position of the first False
+    leading_constant_count = int(np.argmin([*is_constant[:MAX_FIRST_COVERED_BYTE], False]))
     for size in UNNAMED_CRCS:  # in bytes, from the widest to the narrowest
         is_too_wide = size + 2 > length  # at least two bytes must remain
         if is_too_wide or is_constant[-size:].all():  # a checksum differs from frame to frame
             continue
+
+        # Try each position for the first covered byte, up to the first byte that is not constant.
         last_begin = min(leading_constant_count, length - size - 1)  # the checksum covers at least one byte
-        begins = range(last_begin + 1)  # possible positions of the first covered byte
+        begins = range(last_begin + 1)
         orders = ORDERS if size > 1 else ORDERS[:1]  # a single byte has no byte order
         for order in orders:
             named_checks = _named_checks(frames, size, order, begins)
@@ -324,6 +328,19 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
             first_check = next(chain(named_checks, unnamed_checks), None)
             if first_check is not None:
                 yield first_check
+
+
+def _drawn_rows(rows: Bytes) -> Bytes:
+    """Return at most `MAX_CHECKED_FRAMES` different frames, which are drawn at random.
+
+    The frames are drawn at random, because neighbours in a sorted array differ in a few bits only.
+
+    Args:
+        rows: Bytes of the frames, shape (n, length).
+    """
+    different_rows = np.unique(rows, axis=0)  # sorted
+    drawn = np.random.default_rng(0).permutation(len(different_rows))[:MAX_CHECKED_FRAMES]
+    return np.asarray(different_rows[drawn])
 
 
 def _named_checks(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> Iterator[Check]:
@@ -379,10 +396,10 @@ def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size
 def _unnamed_checks(frames: list[bytes], size: int, order: ByteOrder) -> Iterator[Check]:
     """Yield the cyclic redundancy checks without a name that fit most of the frames.
 
-    All checks are computed with the initial value 0 and the final value 0. If all frames have the same length, other
-    initial and final values change every check by an exclusive or with the same constant. With the right polynomial,
-    the computed check and the sent check therefore differ by the same constant in all frames. The final value of the
-    yielded check is set to this constant.
+    A board may use any initial value and any final value, but all checks are computed with 0 for both values. For
+    frames of one length, other initial and final values only change every check by an exclusive or with one constant.
+    If the polynomial is right, the computed check and the sent check therefore differ by the same constant in all
+    frames. The final value of the yielded check is set to this constant.
 
     Args:
         frames: The frames, which are of one length.
@@ -391,7 +408,7 @@ def _unnamed_checks(frames: list[bytes], size: int, order: ByteOrder) -> Iterato
     """
     digit_count = 2 * size  # hexadecimal digits of a number of this size
     for crc in UNNAMED_CRCS[size]:
-        difference_counts: Counter[int] = Counter()
+        difference_counts: Counter[int] = Counter()  # number of frames by the difference of their two checks
         for frame in frames:
             computed_value = crc(frame[:-size])
             sent_value = int.from_bytes(frame[-size:], order)

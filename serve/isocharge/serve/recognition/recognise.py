@@ -100,23 +100,25 @@ def _scored_sections(windows: Windows, seconds: float, weights: Weights) -> Iter
     if len(rows) < MIN_FRAMES - 1:  # the last frame has no row, because no frame follows it
         return
 
-    # A frame with a sync pattern may begin at any constant byte of a window. Other windows begin with the frame.
+    # Find the possible first bytes of a frame in a window. A frame with a sync pattern may begin at any byte that may
+    # belong to the pattern. With any other framing, the window begins with the frame.
     has_sync = windows.framing == SYNC
     usual, is_constant = usual_bytes(rows[:, :length])
-    may_be_sync = is_constant & (usual != 0)  # zeros are mostly the high bytes of numbers
+    may_be_sync = is_constant & (usual != 0)  # shape (length,); zeros are mostly the high bytes of numbers
     starts = [0]
     if has_sync:
         starts = np.flatnonzero(may_be_sync)[:MAX_FRAME_STARTS].tolist()
 
-    # Pairs of a first byte and a checksum. If no checksum fits, frames without a checksum are tried.
+    # Find the possible pairs of a first byte and a checksum.
     starts_and_checks = [(start, check) for start in starts for check in find_checks(rows[:, start : start + length])]
     has_check = bool(starts_and_checks)
 
-    covered_share = min(1.0, len(windows.starts) * length / len(windows.stream))
+    # For each byte order and each pair, find the division of the frame into parts with the lowest score.
+    covered_share = min(1.0, len(windows.starts) * length / len(windows.stream))  # share of the bytes inside frames
     frame_rate_Hz = len(windows.stream) / length / seconds  # as if all bytes of the stream belonged to frames
     for order in ORDERS:
         parts_at = parts_of(rows, order, frame_rate_Hz, weights)  # possible parts at each byte of a window
-        if not has_check:
+        if not has_check:  # try frames without a checksum
             starts_and_checks = [(start, Check(0, order, {})) for start in starts]
         for start, check in starts_and_checks:
             parts_from_start = parts_at[start:] + parts_at[:start]  # from the first byte of the frame
@@ -168,19 +170,19 @@ def _field_tables(parts: Sequence[Part]) -> list[dict[str, Any]]:
     for part in parts:
         roles.append(part.role)
         role_count = roles.count(part.role)  # number of parts with this role so far, including this part
-        is_counter_or_clock = part.role in ("seq", "clock")
+        is_first_counter_or_clock = part.role in ("seq", "clock") and role_count == 1
         if part.role == "channel":
             fields.append({"name": f"ch{role_count}", "type": part.kind})
-        elif is_counter_or_clock and role_count == 1:
+        elif is_first_counter_or_clock:
             field: dict[str, Any] = {"name": part.name, "type": part.kind}
             if part.scale != 1.0:
                 field["scale"] = part.scale
             fields.append(field)
-        elif fields and fields[-1]["type"] == PADDING:
+        elif fields and fields[-1]["type"] == PADDING:  # the part extends the padding before it
             previous_padding = fields[-1]
             previous_count = previous_padding.get("count", 1)  # padding without a count is one byte
             previous_padding["count"] = previous_count + part.size
-        else:
+        else:  # the part becomes a new field of padding
             padding: dict[str, Any] = {"type": PADDING}
             if part.size > 1:
                 padding["count"] = part.size
@@ -237,10 +239,10 @@ def _parse_all(parser: Parser, chunks: Sequence[bytes]) -> tuple[list[Frame], fl
 
 
 def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) -> dict[str, Any]:
-    """Return the keys that a device file for lines of text needs.
+    """Return the keys that describe the counter, the clock and the columns of lines of text in a device file.
 
-    The key `columns` lists the names of all columns. The keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the
-    board uses for its counter and its clock.
+    If each line contains names, the keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the board uses for its
+    counter and its clock. Otherwise, the key `columns` lists the names of all columns.
 
     Args:
         layout: Layout of the lines.
@@ -248,10 +250,10 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
         frame_rate_Hz: Number of frames per second, Hz.
     """
     last_frame = frames[-1]
-    meanings = _meanings(frames, frame_rate_Hz)  # by the position of the value in a frame
+    meanings = _meanings(frames, frame_rate_Hz)  # "seq" or the name of a clock, by the position of the value in a frame
 
-    # The header of a CSV is copied, because a program that starts later does not receive it. Only the names of the
-    # counter and the clock are replaced.
+    # Case 1: a CSV with a header. The names in the header are copied, because a program that starts later does not
+    # receive it. Only the names of the counter and the clock are replaced.
     if layout.notation is Notation.csv and layout.names:
         columns = list(layout.names)
         for position, meaning in meanings.items():
@@ -259,14 +261,13 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
             columns[column] = meaning
         return {"columns": columns}
 
-    # If each line contains the names, the key `columns` is not needed.
+    # Case 2: each line contains the names of its values. The key `columns` is not needed.
     if last_frame.names:
         return {meaning: last_frame.names[position] for position, meaning in meanings.items()}
 
-    # If no column is a counter or a clock, the columns need no names.
+    # Case 3: the board sends no names. If no column is a counter or a clock, the columns need no names.
     if not meanings:
         return {}
-
     column_names = []
     channel_count = 0
     for position in range(len(last_frame.values)):

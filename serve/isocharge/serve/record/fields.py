@@ -57,15 +57,15 @@ def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
 def _flat_fields(struct: type[Struct]) -> Iterator[Field]:
     """Yield the fields of a struct, in the order of their declaration.
 
-    If a nested struct is marked as `is_flattened`, the fields of the nested struct are yielded instead of the struct
-    itself. Every other nested struct is yielded as a single field of the kind `object`, whose parts are the fields of
-    the struct. In both cases, the attribute that contains the nested struct gives its name to the group of the yielded
-    fields. A record has the fields of a group only if it has the nested struct.
+    A field may contain another struct. If the field is marked as `is_flattened`, the fields of the other struct are
+    yielded in its place. Otherwise, a single field of the kind `object` is yielded, whose parts are the fields of the
+    other struct. In both cases, the yielded fields form a group with the name of the field that contains the struct. A
+    record has the fields of a group only if it has the other struct.
     """
     annotations = get_type_hints(struct, include_extras=True)  # with the metadata of `Annotated`
     for name in struct.__struct_fields__:
         declared_type, meaning = _type_and_meaning(annotations[name], f"{struct.__name__}.{name}")
-        value_type, may_be_null = _without_none(declared_type)
+        value_type, may_be_null = _without_none(declared_type)  # the type without the alternative None
         is_struct = isinstance(value_type, type) and issubclass(value_type, Struct)
         if meaning.is_flattened:
             for nested_field in _flat_fields(value_type):

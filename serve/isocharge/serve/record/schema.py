@@ -64,10 +64,11 @@ def _property(field: Field, electrodes: Sequence[str], *, allows_null: bool) -> 
     Args:
         field: Field of the record.
         electrodes: Names of the electrodes.
-        allows_null: Whether null is allowed for a field that may be unknown, and for the numbers in objects.
+        allows_null: Whether unknown values are null. If they are, the schema allows null for every field that may be
+            unknown, and for every number in an object.
     """
     json_type = JSON_TYPES[field.kind]
-    number_in_object: dict[str, Any] = {"type": "number"}
+    number_in_object: dict[str, Any] = {"type": "number"}  # schema of a number in an object
     if allows_null:
         number_in_object = {"type": ["number", "null"]}
 

@@ -145,14 +145,10 @@ class SignalChain:
         # The offset stage is the last stage that stores the charge at rest. The warming stage adds the charge of the
         # warming to this charge.
         offset_stage: OffsetStage = self._tare_stage
-        warmth_s = None  # time constant with which the film follows the temperature of the air, s
-        if settings.memory is not None:
-            warmth_s = settings.memory.warmth_s
-            offset_stage = MemoryStage(settings.memory, settings.leak, settings.tau_s)
-            stages.append(offset_stage)
-        elif settings.tau_s is not None:
-            offset_stage = LeakStage(settings.leak, settings.tau_s)
-            stages.append(offset_stage)
+        compensation = _leak_or_memory_stage(settings)
+        if compensation is not None:
+            stages.append(compensation)
+            offset_stage = compensation
 
         # The touch stage notifies the earlier stages when a touch begins.
         earlier_stages = stages.copy()  # a copy, because further stages are appended below
@@ -162,6 +158,8 @@ class SignalChain:
             if misfit is None:
                 raise ValueError("the warming stage needs the misfit of a model, got None")
             warming_ratios = settings.warming_ratios
+            # Time constant with which the film follows the temperature of the air, s; only known with a memory
+            warmth_s = None if settings.memory is None else settings.memory.warmth_s
             stages.append(Warming(settings.thermal, misfit, offset_stage, ratios=warming_ratios, warmth_s=warmth_s))
         self.stages = stages
 
@@ -210,3 +208,19 @@ class SignalChain:
         """Measure the tare again from the next quiet frames. The estimate of the hum is kept."""
         for stage in self.stages:
             stage.reset()
+
+
+def _leak_or_memory_stage(settings: Chain) -> LeakStage | MemoryStage | None:
+    """Return the stage that corrects the leak of the amplifiers and, with its settings, the memory of the film.
+
+    Args:
+        settings: Settings of all stages.
+
+    Returns:
+        The stage; None if the settings describe neither a leak nor a memory.
+    """
+    if settings.memory is not None:  # the memory stage also corrects the leak
+        return MemoryStage(settings.memory, settings.leak, settings.tau_s)
+    if settings.tau_s is not None:
+        return LeakStage(settings.leak, settings.tau_s)
+    return None

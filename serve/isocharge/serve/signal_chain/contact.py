@@ -66,9 +66,11 @@ def update_contact(
     """Return the state of the touch detection after the next frame.
 
     A touch begins when the total charge exceeds the base by the touch threshold. The base is the smallest total charge
-    since the last release. A touch ends when the total charge falls below the release threshold. The release threshold
-    is a share of the peak of the press, increased by the uncertainty of the total charge. If this sum is less than half
-    of the touch threshold, the release threshold is half of the touch threshold.
+    since the last release.
+
+    A touch ends when the total charge falls below the release threshold. The release threshold is a share of the peak
+    of the press, increased by the uncertainty of the total charge, but at least half of the touch threshold. The peak
+    is the largest total charge that two consecutive frames of the press have reached.
 
     Args:
         rule: The thresholds.

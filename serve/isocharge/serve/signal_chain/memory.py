@@ -392,11 +392,13 @@ def _remaining_charge(memory: Memory, creep_pC: Array, step_pC: Array) -> Remain
 def _learn_film(memory: Memory, dt_s: float) -> Memory:
     """Update the scale factors of creep and thermoelastic step with the charge that remains after a release.
 
-    The measurement is the deviation of the remaining charge from its prediction, along one direction. The deviation is
-    modelled as the sum of the predicted charges of creep and of the step, each multiplied by the error of its scale
-    factor. A Kalman filter updates the two scale factors with this scalar measurement. All frames after a release
-    together count as one measurement. The variance of each frame is therefore multiplied by the number of frames in
-    `LEARN_S`.
+    After a release, creep and the thermoelastic step leave a charge on the film. The measurement is the difference
+    between this charge and its prediction, reduced to one number. The difference is modelled as the sum of the
+    predicted charges of creep and of the step, each multiplied by the error of its scale factor. A Kalman filter
+    updates the two scale factors with the measurement.
+
+    All frames in the time `LEARN_S` after a release together count as one measurement. The variance of each frame is
+    therefore multiplied by the number of these frames.
 
     Args:
         memory: State of this frame.
@@ -416,6 +418,7 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
         return memory
 
     # Covariance of each scale factor with the measurement, and variance of the measurement due to both scale factors.
+    # A measurement that is too large for these variances comes from something else, such as a warm hand.
     variances = film.variances
     creep_covariance = variances.creep * measurement.creep_pC + variances.covariance * measurement.step_pC
     step_covariance = variances.covariance * measurement.creep_pC + variances.step * measurement.step_pC
@@ -445,6 +448,9 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
 def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
     """Return the state at the first frame of a touch.
 
+    The rows of the state are the creep terms, the thermoelastic term, the warmth, the slope of the warmth, and the
+    touch charge. The charge of the film is the sum of the rows, each multiplied by its response.
+
     The warmth is the charge of each electrode due to a change of temperature. The touch may have changed the latest
     estimate of the warmth before the touch was detected. The warmth is therefore predicted from the trusted estimate,
     whose age is at least `look_back_s`.
@@ -456,8 +462,10 @@ def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
     film = memory.film
     age_s = memory.trusted_s
     rows_pC = memory.rows_pC.copy()  # the state, shape (rows, electrodes)
-    propagation = state_propagation(rule.warmth_s, age_s)  # matrix that advances the state by a time
-    warmth_propagation = propagation[WARMTH_ROWS, WARMTH_ROWS]  # its part for the warmth and the slope of the warmth
+
+    # Advance the trusted warmth and its slope by their age. The matrix advances all rows of the state.
+    propagation = state_propagation(rule.warmth_s, age_s)
+    warmth_propagation = propagation[WARMTH_ROWS, WARMTH_ROWS]
     rows_pC[WARMTH_ROWS] = warmth_propagation.dot(memory.trusted_pC)
 
     # The touch charge explains the part of the film's charge that the other rows do not explain.
@@ -487,16 +495,12 @@ def add_warmth(
     charge due to a change of temperature. The charge of the film stays the same if the touch charge is decreased by c
     and the warmth is increased by h c.
 
-    If the scale factors of creep and thermoelastic step must not be updated after this touch, the time for which the
-    warmth could not be observed is set to infinity. With an infinite time, the measurement after the release has an
-    infinite variance and no influence.
-
     Args:
         memory: The state.
         change_pC: Part c of the touch charge, shape (electrodes,), pC.
         rate_pC_per_s: Change of the slope of the warmth, shape (electrodes,), pC/s.
-        is_learned: Whether the scale factors of the film may be updated after this touch. Set it to False if the warmth
-            is uncertain.
+        is_learned: Whether the charge that remains after this touch may be used to update the scale factors of creep
+            and thermoelastic step. Set it to False if the warmth is uncertain.
     """
     step_response = memory.film.step_response
     charge_pC = memory.leak.charge_pC - change_pC
@@ -504,6 +508,9 @@ def add_warmth(
     rows_pC[WARMTH_ROW] += step_response * change_pC
     rows_pC[SLOPE_ROW] += step_response * rate_pC_per_s
     rows_pC[CHARGE_ROW] = charge_pC
+
+    # The variance of the remaining charge grows with the time for which the warmth could not be observed. With an
+    # infinite time, the remaining charge has no influence.
     unseen_s = memory.unseen_s if is_learned else math.inf
     return memory._replace(leak=memory.leak._replace(charge_pC=charge_pC), rows_pC=rows_pC, unseen_s=unseen_s)
 

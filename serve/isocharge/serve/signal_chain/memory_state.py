@@ -69,6 +69,10 @@ class Film(NamedTuple):
     def with_memory(cls, creep: float, thermoelastic: float, variances: ScaleVariances) -> "Film":
         """Return the properties of a film with a given creep and thermoelastic step.
 
+        The state of a film has one row for each of its terms: the creep terms, the thermoelastic term, the warmth
+        (charge due to a change of temperature), the slope of the warmth, and the touch charge. The charge of the film
+        is the sum of all rows, each multiplied by its response.
+
         Args:
             creep: Share of a charge that is lost in each decade of time.
             thermoelastic: Share by which the charges of a touch are larger at first.
@@ -79,7 +83,7 @@ class Film(NamedTuple):
         response = creep * CREEP_RESPONSE + thermoelastic * STEP_RESPONSE
         response[WARMTH_ROW] = 1.0
         response[CHARGE_ROW] += 1.0
-        step_response = float(response[CHARGE_ROW])
+        step_response = float(response[CHARGE_ROW])  # a step of the touch charge does not change other rows at once
         return cls(creep, thermoelastic, response, step_response, variances)
 
 
@@ -103,7 +107,8 @@ def _relaxation(warmth_s: float) -> tuple[Array, Array]:
     steady_state[:WARMTH_ROW, CHARGE_ROW] = 1.0  # the creep terms and the thermoelastic term follow the touch charge
     steady_state[WARMTH_ROW, WARMTH_ROW] = 1.0
     steady_state[WARMTH_ROW, SLOPE_ROW] = warmth_s
-    # The rows after the creep terms (thermoelastic term, warmth, slope and charge) have the time constant of the air.
+    # The thermoelastic term, the warmth and its slope follow the temperature of the air. The time constant of the last
+    # row, the touch charge, has no effect, because this row is 0 at the time 0 and in the steady state.
     time_constants_s = np.array([*DECADES_S, warmth_s, warmth_s, warmth_s, warmth_s])
     return time_constants_s[:, np.newaxis], steady_state
 

@@ -111,7 +111,7 @@ def track_thermal_drift(
         The state after this frame. Its rate is the correction of the slope of p in this frame.
     """
     waited_s = state.waited_s + dt_s
-    if waited_s < rule.every_s:
+    if waited_s < rule.every_s:  # no estimate in this frame, so the slope is not corrected
         return state._replace(waited_s=waited_s, rate_pC_per_s=0.0)
     predicted_variance_pC2, predicted_covariance, predicted_rate_variance = _predicted_variances(
         rule, state, waited_s, warmth_s
@@ -125,7 +125,7 @@ def track_thermal_drift(
     # The variance of the estimate is the inverse of the curvature, because the misfit is in standard deviations. Errors
     # of the model increase it by `noise` squared. If the parabola is flat, warming cannot be distinguished from force.
     estimate_variance_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
-    if estimate_variance_pC2 > rule.blind_pC**2:
+    if estimate_variance_pC2 > rule.blind_pC**2:  # p is not changed
         return state._replace(waited_s=0.0, blind=True, rate_pC_per_s=0.0)
 
     # The estimate is the minimum of the parabola, limited to the range of the trial values.
@@ -139,7 +139,7 @@ def track_thermal_drift(
     return ThermalDrift(
         charge_pC=state.charge_pC + charge_gain * change_pC,
         variance_pC2=(1.0 - charge_gain) * predicted_variance_pC2,
-        rate_pC_per_s=rate_gain * change_pC,
+        rate_pC_per_s=rate_gain * change_pC,  # correction of the slope in this frame
         covariance=(1.0 - charge_gain) * predicted_covariance,
         rate_variance=predicted_rate_variance - rate_gain * predicted_covariance,
     )

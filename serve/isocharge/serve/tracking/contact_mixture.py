@@ -346,20 +346,15 @@ class ContactMixture:
         states, linearised = self._most_probable_states(prior, measurement, iterations)
 
         # The likelihood p of a component is given by -2 ln p = squared misfit + squared change of the state + ln det S,
-        # where S is the covariance of the innovation v. The squared change of the state is relative to the covariance
-        # of the state before the update. All terms have the shape (n_component,).
-        residual_pC = measurement.charge_pC - linearised.charge_pC
-        squared_misfit = (residual_pC**2 / measurement.variance).sum(axis=1)
-        weighted_innovation = linearised.weighted_innovation  # S^-1 v, shape (n_component, n_electrode, 1)
-        weighted_row = weighted_innovation.swapaxes(1, 2)
-        squared_state_change = (weighted_row @ linearised.charge_covariance @ weighted_innovation)[:, 0, 0]
+        # where S is the covariance of the innovation. All terms have the shape (n_component,).
+        squared_misfit, squared_state_change = _squared_distances(measurement, linearised)
         squared_distance = squared_misfit + squared_state_change
         _sign, log_determinant = np.linalg.slogdet(linearised.innovation_covariance)
         log_weight = prior.log_weight - 0.5 * (squared_distance + log_determinant)
 
         is_outside_film = np.hypot(states[:, X], states[:, Y]) > MAX_RELATIVE_RADIUS * self.charges.radius_mm
         log_weight[is_outside_film] = -np.inf
-        best = int(log_weight.argmax())
+        best = int(log_weight.argmax())  # the most probable component
         is_explained = squared_distance[best] < MAX_SQUARED_DISTANCE and np.isfinite(log_weight[best])
         if not is_explained:
             return None
@@ -392,22 +387,27 @@ class ContactMixture:
         variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])
         longest = variances.size - 1  # `eigh` returns the variances in ascending order
         std_mm = math.sqrt(max(variances[longest], 0.0))  # rounding errors may make the variance negative
-        if std_mm < MIN_SPLIT_STD_mm or not has_space_for_two:
+        is_narrow = std_mm < MIN_SPLIT_STD_mm
+        if is_narrow or not has_space_for_two:
             return components
 
         # Expected change of the whole state if the position changes by one standard deviation along the longest axis.
-        direction = covariance[:, POSITION] @ axes[:, longest] / std_mm  # shape (n_state,)
+        change_per_std = covariance[:, POSITION] @ axes[:, longest] / std_mm  # shape (n_state,)
+
+        # Search for a fold up to `FOLD_DISTANCE` standard deviations from the mean on both sides.
         sides = np.array([1.0, -1.0])
-        states_on_both_sides = mean + FOLD_DISTANCE * np.outer(sides, direction)
+        states_on_both_sides = mean + FOLD_DISTANCE * np.outer(sides, change_per_std)  # shape (2, n_state)
         if not self._is_across_fold(mean, states_on_both_sides).any():
             return components
 
-        # Each added component is narrower along this direction. Its weight is the weight of the most probable component
-        # multiplied by the relative density of that component at the mean of the added component.
+        # Each added component is narrower along the longest axis than the most probable component.
         removed_share = 1.0 - SPLIT_STD_RATIO**2
-        narrow_covariance = covariance - removed_share * np.outer(direction, direction)
+        narrow_covariance = covariance - removed_share * np.outer(change_per_std, change_per_std)
+
+        # The weight of each added component is the weight of the most probable component, multiplied by the relative
+        # density of the most probable component at a distance of `SPLIT_DISTANCE` standard deviations.
         log_weight = components.log_weight[best] - 0.5 * SPLIT_DISTANCE**2
-        added_means = mean + SPLIT_DISTANCE * np.outer(sides, direction)
+        added_means = mean + SPLIT_DISTANCE * np.outer(sides, change_per_std)
         for added_mean in added_means:
             components = components.with_component(added_mean, narrow_covariance, log_weight)
         return components
@@ -484,6 +484,29 @@ class ContactMixture:
         is_same = is_near & ~self._is_across_fold(components.mean[first], mean)
         is_same[0] = True  # even if rounding errors make the first component appear to be across a fold
         return np.asarray(is_same)
+
+
+def _squared_distances(measurement: Measurement, linearised: LinearisedUpdate) -> tuple[Array, Array]:
+    """Compute how far the updated state of each component is from the measured charges and from the prior state.
+
+    Let J be the Jacobian of the charges, P the prior covariance of the state, and S^-1 v the weighted innovation. The
+    update changes the state by P J^T S^-1 v. The square of this change, relative to P, is (S^-1 v)^T J P J^T (S^-1 v).
+
+    Args:
+        measurement: Charges of this step.
+        linearised: Quantities of the update, linearised about the updated states.
+
+    Returns:
+        Squared misfit of the charges relative to the variance of the noise, shape (n_component,), and squared change of
+        the state relative to the prior covariance, shape (n_component,).
+    """
+    residual_pC = measurement.charge_pC - linearised.charge_pC
+    squared_misfit = (residual_pC**2 / measurement.variance).sum(axis=1)
+    weighted_innovation = linearised.weighted_innovation  # S^-1 v, shape (n_component, n_electrode, 1)
+    weighted_row = weighted_innovation.swapaxes(1, 2)  # shape (n_component, 1, n_electrode)
+    # The charge covariance is J P J^T, shape (n_component, n_electrode, n_electrode).
+    squared_state_change = (weighted_row @ linearised.charge_covariance @ weighted_innovation)[:, 0, 0]
+    return squared_misfit, squared_state_change
 
 
 def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:

@@ -110,9 +110,11 @@ class FilmFilter:
     ) -> None:
         """Start with the probability distribution of the unknowns after the calibration.
 
+        An offset is a charge that is added to all electrodes during a touch, for example by a warm finger.
+
         Args:
             pretensions: Weights of the network at any pretension.
-            directions: Directions in which the film is uncertain at a given pretension.
+            directions: Combinations of film parameters that are uncertain at a given pretension.
             drift_MPa_per_root_hour: Standard deviation of the change of the pretension in an hour, MPa. The standard
                 deviation is proportional to the square root of the time.
             largest_offset_pC: Largest standard deviation of the offsets that the filter tolerates, pC; 0 if touches
@@ -120,36 +122,49 @@ class FilmFilter:
             offset_ratio: Charge that an offset adds to each electrode, relative to the common offset, shape
                 (n_electrode,).
         """
-        low, high = pretensions.range_MPa
-        self.grid_MPa = evenly_spaced(low, high, GRID_STEP_MPa)
+        low_MPa, high_MPa = pretensions.range_MPa
+        self.grid_MPa = evenly_spaced(low_MPa, high_MPa, GRID_STEP_MPa)
         self._pretensions = pretensions
-        self._network = pretensions.at(evenly_spaced(low, high, NETWORK_STEP_MPa))
+        # The network is evaluated on a coarser grid. Its results are interpolated to the pretensions of `grid_MPa`.
+        self._network = pretensions.at(evenly_spaced(low_MPa, high_MPa, NETWORK_STEP_MPa))
         self._drift_MPa_per_root_hour = drift_MPa_per_root_hour
         self._largest_offset_pC = largest_offset_pC
         self._offset_ratio = offset_ratio
         self._directions = directions
         self._layout = UnknownsLayout(pretensions.typical_pC.size, directions.count)
 
+        # The size of the offsets is unknown, so the filter compares several offset levels. Each level has a standard
+        # deviation of the mean offset, and a standard deviation (scatter) of the offset of a single touch about the
+        # mean offset. Both are 0 at level 0, which is the only level if touches have no offsets.
         level_count = len(RELATIVE_LEVELS) if largest_offset_pC > 0.0 else 1
         self._level_std_pC = largest_offset_pC * np.array(RELATIVE_LEVELS[:level_count])
         self._scatter_std_pC = largest_offset_pC * np.array(RELATIVE_SCATTER[:level_count])
         self.reset()
 
     def reset(self) -> None:
-        """Discard all touches, and restore the probability distribution that is assumed before the first touch."""
-        # Joint probability of the offset level and the pretension, shape (n_level, n_pretension). Level 0 is the level
-        # without offsets, and the other levels share the remaining probability equally.
+        """Discard all touches, and restore the probability distribution that is assumed before the first touch.
+
+        An offset is a charge that is added to all electrodes during a touch. An offset level is a hypothesis about the
+        size of the offsets. The linear unknowns are the gains of the electrodes, the offset, and the coordinates of the
+        film along the directions. A direction is a combination of film parameters that remained uncertain after the
+        calibration.
+        """
+        # Probability of each offset level, shape (n_level,). Level 0 is the level without offsets. The other levels
+        # share the remaining probability equally. There may be no other level.
         level_count = self._level_std_pC.size
         offset_level_count = level_count - 1
-        offset_level_probability = (1.0 - NO_OFFSET_PROBABILITY) / max(offset_level_count, 1)
+        offset_level_probability = (1.0 - NO_OFFSET_PROBABILITY) / max(offset_level_count, 1)  # no division by zero
         level_probability = np.full(level_count, offset_level_probability)
         level_probability[0] = 1.0 - level_probability[1:].sum()
+
+        # Joint probability of the offset level and the pretension, shape (n_level, n_pretension). The change of the
+        # pretension since the calibration is normally distributed.
         change_MPa = self.grid_MPa - self._pretensions.calibrated_MPa
         pretension_probability = normal_probabilities(change_MPa, self._pretensions.std_MPa)
         self._joint_probability = np.outer(level_probability, pretension_probability)
 
         # Mean and covariance of the linear unknowns at each level and pretension. Only the means of the directions
-        # depend on the pretension.
+        # depend on the pretension. `by_pretension` is the change of each mean per MPa.
         shape = self._joint_probability.shape
         size = self._layout.size
         self._mean = np.zeros((*shape, size))
@@ -187,7 +202,11 @@ class FilmFilter:
 
     @property
     def is_offset_too_large(self) -> bool:
-        """Whether the offsets are probably larger than the largest offsets that the filter tolerates."""
+        """Whether the offsets are probably larger than the largest offsets that the filter tolerates.
+
+        An offset is a charge that is added to all electrodes during a touch. The offset levels are hypotheses about the
+        size of the offsets. The last level is the hypothesis that the offsets are too large.
+        """
         level_count = self._level_std_pC.size
         if level_count == 1:  # touches are assumed to have no offsets
             return False
@@ -268,18 +287,22 @@ class FilmFilter:
     def _change_level(self) -> None:
         """Account for the small probability that the offset level has changed since the previous touch.
 
+        An offset is a charge that is added to all electrodes during a touch. An offset level is a hypothesis about the
+        size of the offsets.
+
         The method is the mixing step of an interacting multiple model (Blom and Bar-Shalom 1988). After a change of the
         offset level, the mean offset does not depend on the previous mean offset. A change of the level does not affect
         the other linear unknowns.
         """
         level_count = self._level_std_pC.size
-        if level_count == 1:
+        if level_count == 1:  # there is no other level
             return
         changed_mean, changed_covariance = self._moments_after_level_change()
 
-        # After a change of the level, all levels are equally likely.
+        # After a change of the level, all levels are equally likely. The second term has the shape (n_pretension,), and
+        # is added at each level.
         unchanged_probability = (1.0 - LEVEL_CHANGE_PROBABILITY) * self._joint_probability
-        changed_probability = LEVEL_CHANGE_PROBABILITY / level_count * self.pretension_probability  # (n_pretension,)
+        changed_probability = LEVEL_CHANGE_PROBABILITY / level_count * self.pretension_probability
         self._joint_probability = unchanged_probability + changed_probability
 
         # Average the moments with and without a change. The weight is broadcast over the axis of the unknowns for the
@@ -323,6 +346,10 @@ class FilmFilter:
             elapsed_s: Time since the previous touch, s.
         """
         self._pending_variance_MPa2 += self._drift_MPa_per_root_hour**2 * elapsed_s / SECONDS_PER_HOUR
+
+        # The moments are the probability of each level and pretension, and the mean and the covariance multiplied by
+        # the probability. Moments are therefore averaged over pretensions by adding them up. The shape is (n_level,
+        # n_pretension, n_moment).
         moments = self._weighted_moments()
 
         # The grid cannot represent a drift that is smaller than the step of the grid. The variance of such a drift
@@ -331,9 +358,10 @@ class FilmFilter:
         if drift_std_MPa >= GRID_STEP_MPa:
             moments = smooth_moments(moments, drift_std_MPa)
             self._pending_variance_MPa2 = 0.0
-        moments /= moments[..., PROBABILITY_COLUMN].sum()
+        moments /= moments[..., PROBABILITY_COLUMN].sum()  # all probabilities add up to 1 again
 
-        # After a jump, all pretensions have the same moments: the mean of the moments over the previous pretensions.
+        # After a jump, all pretensions are equally likely. At each level, all pretensions then have the same moments,
+        # namely the mean of the moments over the previous pretensions.
         moments_after_jump = moments.mean(axis=1, keepdims=True)
         moments = (1.0 - JUMP_PROBABILITY) * moments + JUMP_PROBABILITY * moments_after_jump
         self._set_weighted_moments(moments)
@@ -376,6 +404,9 @@ class FilmFilter:
         With a small probability, the touch is an outlier. The changes that the Kalman update computes are therefore
         multiplied by the probability that the touch is not an outlier.
 
+        The misfit vector is the part of the charges that no contact explains. A direction is a combination of film
+        parameters that remained uncertain after the calibration.
+
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
             log_changes: Changes of the logarithms of the charges by one unit of each direction at the contact, shape
@@ -391,7 +422,8 @@ class FilmFilter:
         noise_covariance = self._noise_covariance(jacobian)
         kalman = kalman_update(misfit, jacobian, noise_covariance, self._mean, self._covariance)
 
-        # Probability that the touch is not an outlier, shape (n_level, n_pretension).
+        # Probability density of the touch, and probability that the touch is not an outlier (good). All arrays have the
+        # shape (n_level, n_pretension).
         good_density = (1.0 - OUTLIER_PROBABILITY) * kalman.density
         total_density = good_density + OUTLIER_PROBABILITY * OUTLIER_DENSITY
         good_probability = good_density / total_density
@@ -425,12 +457,18 @@ class FilmFilter:
     def _linearise(self, charge_pC: Array, log_changes: Array, misfit_slopes: Array | None) -> tuple[Array, Array]:
         """Compute the misfit vectors of a touch, and their Jacobian with respect to the linear unknowns.
 
-        There is one misfit vector for each pretension.
+        The misfit vector is the part of the charges that no contact explains. There is one misfit vector for each
+        pretension. The linear unknowns are the gains of the electrodes, the coordinates of the film along the
+        directions (uncertain combinations of film parameters), and the offset (a charge that is added to all
+        electrodes).
 
-        A unit step of a gain or a direction changes the logarithms of the charges. The derivative with respect to the
-        gain or the direction is the product of the misfit slopes and this change. The derivative with respect to the
-        offset is a finite difference. The step of this difference is the estimated mean offset at the offset level. The
-        linearised misfit vector is therefore exact for charges from which the mean offset is subtracted.
+        A unit step of a gain or of a direction changes the logarithms of the charges. The derivative with respect to
+        the gain or the direction is the product of the misfit slopes and the change of the logarithms. Without misfit
+        slopes, this derivative is a finite difference.
+
+        The derivative with respect to the offset is always a finite difference. The step of this difference is the mean
+        offset that was estimated at the offset level. The linearised misfit vector is therefore exact for charges from
+        which the mean offset is subtracted.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
@@ -444,16 +482,17 @@ class FilmFilter:
             n_pretension, n_electrode, n_unknown). Both are relative to the root mean square misfit of good touches.
         """
         layout = self._layout
-        gain_changes = GAIN_STD * np.eye(layout.electrodes)
-        offset_step_pC = self._offset_steps()
+        gain_changes = GAIN_STD * np.eye(layout.electrodes)  # changes of the logarithms; one row for each gain
+        offset_step_pC = self._offset_steps()  # shape (n_level,)
 
-        # One call evaluates the network for the charges of the touch and for the charges without the offset of each
-        # level.
+        # One call evaluates the network for the charges of the touch (first row) and for the charges without the offset
+        # of each level (all other rows).
         charges_without_offset = charge_pC - np.outer(offset_step_pC, self._offset_ratio)
         misfit_vectors = self._misfit_vectors(np.vstack([charge_pC, charges_without_offset]))
-        misfit = misfit_vectors[0]
+        misfit = misfit_vectors[0]  # shape (n_pretension, n_electrode)
         misfit_without_offset = misfit_vectors[1:]  # shape (n_level, n_pretension, n_electrode)
 
+        # The derivatives with respect to gains and directions are the same at every level.
         jacobian = np.empty((*self._joint_probability.shape, layout.electrodes, layout.size))
         jacobian[..., layout.offset] = (misfit - misfit_without_offset) / offset_step_pC[:, None, None]
         if misfit_slopes is None:
@@ -505,21 +544,26 @@ class FilmFilter:
     def _residuals(self, misfit: Array, jacobian: Array, noise_covariance: Array) -> TouchResiduals:
         """Compute the squared misfits of a touch after a correction with the estimates at the most likely offset level.
 
+        The misfit vectors are corrected for the means of the linear unknowns, which are the gains, the offset and the
+        directions. A second result is corrected only for the offset and the directions.
+
         Args:
             misfit: Misfit vectors, as `_linearise` returns them.
             jacobian: Jacobian of the misfit vectors, as `_linearise` returns it.
             noise_covariance: Covariance of the misfit vectors, as `_noise_covariance` returns it.
         """
         level = self._likeliest_level
-        level_jacobian = jacobian[level]
-        precision = np.linalg.inv(noise_covariance[level])
+        level_jacobian = jacobian[level]  # shape (n_pretension, n_electrode, n_unknown)
+        precision = np.linalg.inv(noise_covariance[level])  # shape (n_pretension, n_electrode, n_electrode)
 
-        mean = self._mean[level]
+        # Subtract the part of each misfit vector that the means of the unknowns explain.
+        mean = self._mean[level]  # shape (n_pretension, n_unknown)
         mean_without_gains = mean.copy()
         mean_without_gains[:, self._layout.gains] = 0.0
         residual = misfit - multiply_stacks(level_jacobian, mean)
         residual_without_gains = misfit - multiply_stacks(level_jacobian, mean_without_gains)
 
+        # Variance that the scatter of the offset of a single touch adds to the misfit at the estimated pretension.
         offset_jacobian = level_jacobian[self.nearest_index, :, self._layout.offset]
         offset_variance = self._scatter_std_pC[level] ** 2 * (offset_jacobian**2).sum()
 
@@ -527,7 +571,7 @@ class FilmFilter:
         # of `einsum`, g is the pretension, and e and f are electrodes.
         quadratic_form = "ge,gef,gf->g"
         return TouchResiduals(
-            filtered=np.einsum(quadratic_form, residual, precision, residual),
+            with_gains=np.einsum(quadratic_form, residual, precision, residual),
             without_gains=np.einsum(quadratic_form, residual_without_gains, precision, residual_without_gains),
             offset_variance=float(offset_variance),
         )

@@ -137,17 +137,17 @@ class SquaredMisfits(NamedTuple):
     `LARGEST_SQUARE`.
 
     Attributes:
-        filtered: Squared misfit at each pretension after a correction for the gains, the offset and the directions,
+        with_gains: Squared misfit at each pretension after a correction for the gains, the offset and the directions,
             shape (n_pretension,).
-        filtered_at_estimate: Element of `filtered` at the pretension that was estimated at the time of the touch.
+        at_touch_estimate: Element of `with_gains` at the pretension that was estimated at the time of the touch.
         without_gains: Squared misfit at each pretension after a correction for the offset and the directions, but not
             for the gains, shape (n_pretension,).
         wrong_gain: Squared misfit for each wrong gain of each electrode, first with the model of the calibrated film
             and then with the model of the estimated pretension, shape (2 * n_wrong_gain * n_electrode,).
     """
 
-    filtered: Array
-    filtered_at_estimate: float
+    with_gains: Array
+    at_touch_estimate: float
     without_gains: Array
     wrong_gain: Array
 
@@ -193,7 +193,8 @@ class FilmFollower:
             directions=np.zeros(self._directions.count),
             directions_per_MPa=np.zeros(self._directions.count),
         )
-        # Each row contains a wrong gain for one electrode, and the gain 1 for all other electrodes.
+        # Each row contains a wrong gain for one electrode, and the gain 1 for all other electrodes. The shape is
+        # (n_wrong_gain * n_electrode, n_electrode).
         self._wrong_gains = 1.0 + np.kron(np.eye(electrodes), WRONG_GAINS[:, None])
         self.reset()
 
@@ -245,6 +246,7 @@ class FilmFollower:
         if contact is None:
             self._end_touch(clock_s)
         elif flags:
+            # The first frames of every touch have the flag `outside`. More flags are harmless in such a frame.
             harmless_flags = HARMLESS_FLAGS_OUTSIDE if OUTSIDE in flags else HARMLESS_FLAGS
             if not harmless_flags.issuperset(flags):
                 self._is_touch_usable = False
@@ -370,30 +372,46 @@ class FilmFollower:
     def _squared_misfits(self, charge_pC: Array, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
         """Compute the squared misfits of a touch, which are needed to decide whether the film is lost.
 
-        The attribute `wrong_gain` of the result tests the hypothesis that the gain of one electrode is wrong. The
-        charges are corrected for the offset and the directions, and are multiplied by each assumed wrong gain.
+        Each squared misfit is limited to `LARGEST_SQUARE`, so that a single touch has little influence.
 
         Args:
-            charge_pC: Touch charges of the frame with the largest force, shape (n_electrode,), pC.
-            log_changes: Changes of ln Q by one unit of each direction, shape (n_direction, n_electrode).
+            charge_pC: Touch charges Q of the frame with the largest force, shape (n_electrode,), pC.
+            log_changes: Changes of ln Q by one unit of each direction, shape (n_direction, n_electrode). A direction is
+                an uncertain combination of film parameters.
             residuals: Squared misfits that the filter computed for the touch.
         """
-        directions = self._filter.direction_means(self._filter.mean_MPa)
-        corrected_pC = (charge_pC - self._filter.offset_pC) * np.exp(-directions @ log_changes)
+        with_gains = np.minimum(residuals.with_gains, LARGEST_SQUARE)  # shape (n_pretension,)
+
+        # Remove the estimated offset, and the estimated changes of the film along the directions.
+        direction_means = self._filter.direction_means(self._filter.mean_MPa)
+        corrected_pC = (charge_pC - self._filter.offset_pC) * np.exp(-direction_means @ log_changes)
+        wrong_gain = self._squared_misfits_of_wrong_gains(corrected_pC, residuals.offset_variance)
+        return SquaredMisfits(
+            with_gains=with_gains,
+            at_touch_estimate=float(with_gains[self._filter.nearest_index]),
+            without_gains=np.minimum(residuals.without_gains, LARGEST_SQUARE),
+            wrong_gain=np.minimum(wrong_gain, LARGEST_SQUARE),
+        )
+
+    def _squared_misfits_of_wrong_gains(self, corrected_pC: Array, offset_variance: float) -> Array:
+        """Compute the squared misfit of a touch for each hypothesis that the gain of one electrode is wrong.
+
+        Args:
+            corrected_pC: Charges after a correction for the offset and the directions, shape (n_electrode,), pC.
+            offset_variance: Variance of the misfit that is caused by the deviation of the offset of this touch from
+                the mean offset, relative to the mean squared misfit of good touches.
+
+        Returns:
+            Squared misfits, first with the model of the calibrated film and then with the model of the estimated
+            pretension, shape (2 * n_wrong_gain * n_electrode,). They are relative to the mean squared misfit of good
+            touches.
+        """
         charges_with_wrong_gain_pC = corrected_pC * self._wrong_gains  # one row for each wrong gain
         calibrated_misfit = self._calibrated_predictor.predict_batch(charges_with_wrong_gain_pC).misfit
         followed_misfit = self.predictor.predict_batch(charges_with_wrong_gain_pC).misfit
         misfit = np.concatenate([calibrated_misfit, followed_misfit]).astype(float)
-        mean_square_of_good_touches = self._pretensions.misfit_rms**2 * (1.0 + residuals.offset_variance)
-        wrong_gain = misfit**2 / mean_square_of_good_touches
-
-        filtered = np.minimum(residuals.filtered, LARGEST_SQUARE)
-        return SquaredMisfits(
-            filtered=filtered,
-            filtered_at_estimate=float(filtered[self._filter.nearest_index]),
-            without_gains=np.minimum(residuals.without_gains, LARGEST_SQUARE),
-            wrong_gain=np.minimum(wrong_gain, LARGEST_SQUARE),
-        )
+        mean_square_of_good_touches = self._pretensions.misfit_rms**2 * (1.0 + offset_variance)
+        return np.asarray(misfit**2 / mean_square_of_good_touches)
 
     def _is_unexplained(self) -> bool:
         """Return whether no pretension explains the latest touches.
@@ -404,8 +422,8 @@ class FilmFollower:
         """
         count = len(self._recent_misfits)
         nearest_index = self._filter.nearest_index
-        sum_at_present_estimate = sum(float(touch.filtered[nearest_index]) for touch in self._recent_misfits)
-        sum_at_earlier_estimates = sum(touch.filtered_at_estimate for touch in self._recent_misfits)
+        sum_at_present_estimate = sum(float(touch.with_gains[nearest_index]) for touch in self._recent_misfits)
+        sum_at_earlier_estimates = sum(touch.at_touch_estimate for touch in self._recent_misfits)
         largest_explained_sum = EXPLAINED_SQUARE * count + EXPLAINED_SCATTER * math.sqrt(count)
         return min(sum_at_present_estimate, sum_at_earlier_estimates) > largest_explained_sum
 

@@ -34,7 +34,7 @@ class TouchResiduals(NamedTuple):
     All values are relative to the mean squared misfit of good touches.
 
     Attributes:
-        filtered: Squared misfit at each pretension after a correction for the gains, the offset and the directions,
+        with_gains: Squared misfit at each pretension after a correction for the gains, the offset and the directions,
             shape (n_pretension,).
         without_gains: Squared misfit at each pretension after a correction for the offset and the directions, but not
             for the gains, shape (n_pretension,).
@@ -42,7 +42,7 @@ class TouchResiduals(NamedTuple):
             mean offset.
     """
 
-    filtered: Array
+    with_gains: Array
     without_gains: Array
     offset_variance: float
 

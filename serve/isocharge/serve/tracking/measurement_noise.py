@@ -62,12 +62,14 @@ class CovarianceShape(NamedTuple):
         Returns:
             The shape, and the size in mm^2. The size is the square root of the determinant of the covariance.
         """
-        # The determinant of the covariance is (x_std * y_std)^2 * (1 - correlation^2).
+        # The determinant of the covariance is (x_std * y_std)^2 * (1 - correlation^2). The lower limit keeps the
+        # determinant positive if x and y are fully correlated.
         uncorrelated_share = 1.0 - correlation * correlation
         root_of_uncorrelated_share = math.sqrt(max(uncorrelated_share, MIN_UNCORRELATED_SHARE))
         size_mm2 = x_std_mm * y_std_mm * root_of_uncorrelated_share
 
-        # Elements of the inverse of the shape, divided by the number of dimensions.
+        # Elements of the inverse of the shape. They are divided by the number of dimensions, because `mean_square`
+        # computes the mean over the dimensions from them.
         dimensions = 2
         inverse_divisor = dimensions * root_of_uncorrelated_share
         inverse_xx = y_std_mm / (x_std_mm * inverse_divisor)

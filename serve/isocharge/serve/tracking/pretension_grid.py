@@ -46,10 +46,14 @@ def odds_of_no_change(change_MPa: Array, probability: Array, prior_std_MPa: floa
         prior_std_MPa: Standard deviation of the prior distribution of the change, MPa.
         additional_variance: Variance of the errors that `probability` does not include, MPa^2.
     """
-    # The kernel has at least the width of a grid step, because the grid cannot represent a narrower density.
+    # The posterior density of a zero change is the sum of the probabilities, each multiplied by the value of a normal
+    # density (kernel) at the distance of the grid point from zero. The kernel describes the additional errors. The
+    # kernel has at least the width of a grid step, because the grid cannot represent a narrower density.
     kernel_variance = additional_variance + GRID_STEP_MPa**2
     kernel = np.exp(-0.5 * change_MPa**2 / kernel_variance) / math.sqrt(2.0 * math.pi * kernel_variance)
     posterior_density = float(probability @ kernel)
+
+    # The prior distribution is widened by the same kernel, so that the two densities can be compared.
     prior_density = 1.0 / math.sqrt(2.0 * math.pi * (prior_std_MPa**2 + kernel_variance))
     return posterior_density / prior_density
 

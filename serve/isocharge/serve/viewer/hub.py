@@ -172,23 +172,31 @@ class RecordedTape(Tape):
         """
         elapsed_s = samples["timestamp"] - self.timestamp(0)  # time since the first sample of the recording
         while elapsed_s[-1] >= MAX_PIECES * self._piece_s:
-            pairs = [self._max_force_N[first : first + 2] for first in range(0, len(self._max_force_N), 2)]
-            self._max_force_N = [max(pair) for pair in pairs]
-            self._piece_s *= 2.0
+            self._join_pieces()
+
+        # Append new pieces up to the piece that contains the last sample.
         piece_of_sample = (elapsed_s / self._piece_s).astype(int)  # index of the piece that contains the sample
         piece_count = int(piece_of_sample[-1]) + 1
         new_piece_count = piece_count - len(self._max_force_N)
         self._max_force_N += [0.0] * new_piece_count
 
-        # The times do not decrease. The samples in one piece are therefore neighbours, which are called a run here.
-        # `reduceat` computes the largest force of every run in one call.
+        # Compute the largest force of the samples in each piece. These samples are neighbours, because the times do not
+        # decrease. They are called a run here. `reduceat` computes the largest force of every run in one call.
         force_N = np.nan_to_num(samples["force_N"], nan=0.0)
         begins_run = np.diff(piece_of_sample, prepend=-1) != 0  # true for the first sample, because no piece is -1
         run_starts = np.flatnonzero(begins_run)
         run_pieces = piece_of_sample[run_starts].tolist()
         run_max_N = np.maximum.reduceat(force_N, run_starts).tolist()
+
+        # A piece may contain earlier samples, so the larger one of the earlier and the new force is stored.
         for piece, max_force_N in zip(run_pieces, run_max_N, strict=True):
             self._max_force_N[piece] = max(self._max_force_N[piece], max_force_N)
+
+    def _join_pieces(self) -> None:
+        """Join neighbouring pieces of the overview in pairs, and double the duration of a piece."""
+        pairs = [self._max_force_N[first : first + 2] for first in range(0, len(self._max_force_N), 2)]
+        self._max_force_N = [max(pair) for pair in pairs]
+        self._piece_s *= 2.0
 
 
 @dataclass
@@ -410,17 +418,18 @@ class Viewer:
         self._hub = hub
         self._playhead = Playhead() if hub.is_recording else None  # the position that is shown
 
-        # Samples and values that the page has received
-        # Number of the first sample that was not sent. In a recording, `_begin_anew_after_jump` replaces this number.
+        # What was sent to the page. The samples of the stream are numbered. `_next_sample` is the number of the first
+        # sample that was not sent. In a recording, `_begin_anew_after_jump` replaces this number.
         self._next_sample = hub.tape.first_number_after(now_s - HISTORY_S)
         self._begins_anew = True  # whether the page clears its plots when it receives the next message
         self._missed_samples = 0  # number of samples that were overwritten before they could be sent
         self._state_version = -1  # version of the state that was sent last
         self._must_send_playhead = True  # whether the position has changed since it was sent
 
-        # Messages with samples, which the page confirms
+        # Numbers of messages with samples. The page confirms such a message after it has drawn the samples.
         self._sent_messages = 0
         self._confirmed_messages = 0
+
         self._latest_message_s = now_s  # Unix time at which the number of samples in a message was last limited
         self._latest_advance_s = now_s  # Unix time at which the position was last advanced
 
@@ -471,25 +480,29 @@ class Viewer:
             max_samples: Largest number of samples in the message. If there are more new samples, they are coalesced.
             now_s: Unix time, s.
         """
+        # Determine the samples from `start` to `stop` that are sent.
         tape = self._hub.tape
         self._begin_anew_after_jump()
         stop = self._first_hidden_sample()
         start = max(self._next_sample, tape.oldest)  # samples before `oldest` were overwritten
-        begins_anew = self._begins_anew  # such a message is sent even without samples, so that the page is cleared
+
+        # If the page must clear its plots, the message is sent even without samples.
+        begins_anew = self._begins_anew
         self._begins_anew = False
         if stop <= start and not begins_anew:
             return None
         self._missed_samples += start - self._next_sample
         self._next_sample = stop
         self._sent_messages += 1
-        limit = MAX_MESSAGE_SAMPLES if begins_anew else max_samples  # such a message covers a long time
+        limit = MAX_MESSAGE_SAMPLES if begins_anew else max_samples  # after clearing, the message covers a long time
         samples = coalesce(tape.samples(start, stop), limit)
         return samples_message(self._sent_messages, now_s, samples, self._missed_samples, begin_anew=begins_anew)
 
     def _begin_anew_after_jump(self) -> None:
-        """After the viewer has selected another position, let the next message replace everything on the page.
+        """If the viewer has selected another position in a recording, let the next message replace all plots.
 
-        The next message begins with the samples of the last `HISTORY_S` seconds before the new position.
+        The next message then begins with the samples of the last `HISTORY_S` seconds before the new position. Otherwise
+        the method does nothing.
         """
         playhead = self._playhead
         tape = self._hub.tape

@@ -421,15 +421,16 @@ def _electrode_polygons(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, l
         description of the sensor has an unknown form.
     """
     try:
-        # The values are the centre of a square electrode, the polygons of an electrode, and the side of all squares.
-        # The side is not `Positive`, because msgspec 0.22 crashes on a union of a fixed tuple and a bounded number.
+        # Each value is the centre of a square electrode (`Point`), the polygons of an electrode (`_Polygon`), or the
+        # side of all squares (`float`). The type of the side is not `Positive`, because msgspec 0.22 crashes on a union
+        # of a fixed tuple and a bounded number.
         parts = convert(sensor["electrodes"], dict[str, Point | float | _Polygon], "sensor", InputError)
         calibration = sensor.get("calibration") or {}
         return {
             name: [_calibrated_corners(polygon, calibration) for polygon in _designed_polygons(parts, name)]
             for name in electrodes
         }
-    except (InputError, TypeError, ValueError, KeyError):
+    except (InputError, TypeError, ValueError, KeyError):  # the description has an unknown form
         return {}
 
 

@@ -428,19 +428,39 @@ class VirtualSensor:
             self._sent_s[frame_number % SEQ_MODULUS] = time.perf_counter()
             self._frame_count = frame_number + 1
 
-            # Close the port at the beginning of an outage, and open it again at the end.
-            if self._faults.is_unplugged(self._script_time_s(frame_number)):
-                self._close_port()
-            elif self._port is None:
-                self._open_port()
-                self.unplugged += 1
+            self._plug_or_unplug(frame_number)
+            if self._port is not None:  # otherwise the frame is discarded because of an outage
+                self._answer(self._port, data)
 
-            # Read the requests even if the frame is lost (empty data), so that they do not fill the buffer of the port.
-            is_requested = self._port is not None and self._take_request(self._port)
-            if not data or self._port is None:
-                continue
-            if not is_requested or not self._port.write_whole(self._echo_of_request + data):
-                self.withheld += 1
+    def _plug_or_unplug(self, frame_number: int) -> None:
+        """Close the port if an outage has begun, or open a new port if an outage has ended.
+
+        Args:
+            frame_number: Number of the frame that is due, which determines whether there is an outage.
+        """
+        if self._faults.is_unplugged(self._script_time_s(frame_number)):
+            self._close_port()
+        elif self._port is None:
+            self._open_port()
+            self.unplugged += 1
+
+    def _answer(self, port: PseudoPort, data: bytes) -> None:
+        """Read the requests of the reader, and write a frame. Count the frame if it is withheld.
+
+        A frame is withheld if the reader has not requested it, or if the buffer of the port is full.
+
+        Args:
+            port: The open port.
+            data: Bytes of the frame; empty if the frame is lost because of a fault.
+        """
+        # Read the requests even if the frame is lost, so that they do not fill the buffer of the port.
+        is_requested = self._take_request(port)
+        is_lost = not data
+        if is_lost:
+            return
+        is_written = is_requested and port.write_whole(self._echo_of_request + data)
+        if not is_written:
+            self.withheld += 1
 
     @property
     def _echo_of_request(self) -> bytes:

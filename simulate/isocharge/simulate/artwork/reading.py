@@ -83,7 +83,7 @@ def _touching_groups(polygons: list[Electrode]) -> list[list[Electrode]]:
     """
     groups: list[list[Electrode]] = []
     for polygon in polygons:
-        # Join all groups that the polygon touches with the polygon.
+        # Find the groups that the polygon touches. The polygon connects them, so they become one group.
         touched_groups = []
         separate_groups = []
         for group in groups:
@@ -101,6 +101,9 @@ def _touching_groups(polygons: list[Electrode]) -> list[list[Electrode]]:
 def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list[Electrode]:
     """Read the polygons of a layer, and return each polygon as a separate electrode.
 
+    A closed line is the outline of a pad. An open line with a width is a trace, and the outline of the trace is the
+    polygon.
+
     Args:
         document: DXF document.
         layer: Name of the layer. Upper and lower case are not distinguished.
@@ -108,8 +111,8 @@ def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list
         path: Path of the file for error messages.
 
     Returns:
-        The closed lines, followed by the traces. The name of each electrode states where its line is in the drawing,
-        for error messages.
+        The pads, followed by the traces. The name of each electrode states where its line is in the drawing, for error
+        messages.
 
     Raises:
         SensorError: If the layer has no lines, or an object of the layer cannot be an electrode.

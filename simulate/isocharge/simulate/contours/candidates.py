@@ -259,13 +259,15 @@ class SeedGrid:
         neighbourhood_minimum = scipy.ndimage.minimum_filter(square_grid, (1, 3, 3), mode="constant", cval=np.inf)
         is_minimum = (square_grid == neighbourhood_minimum).reshape(n_press, -1)[:, self.index]
 
-        # Select the `max_count` local minima with the smallest distances of each press. If a press has fewer minima,
-        # the selected nodes that are not minima have an infinite distance and are removed.
+        # Select `max_count` nodes of each press: the local minima with the smallest distances. All other nodes get an
+        # infinite distance.
         distance_of_minimum = np.where(is_minimum, distance, np.inf)
-        node = np.argpartition(distance_of_minimum, max_count, axis=1)[:, :max_count]
-        selected_distance = np.take_along_axis(distance_of_minimum, node, axis=1)
+        selected_nodes = np.argpartition(distance_of_minimum, max_count, axis=1)[:, :max_count]  # (n, max_count)
+
+        # If a press has fewer than `max_count` local minima, remove the selected nodes that are not local minima.
+        selected_distance = np.take_along_axis(distance_of_minimum, selected_nodes, axis=1)
         press, column = np.nonzero(np.isfinite(selected_distance))
-        return press, node[press, column]
+        return press, selected_nodes[press, column]
 
     def is_out_of_range(self, charge: Array, force: Array | None) -> Booleans:
         """Return for each press whether at least one of its charges lies outside the range of the charges at the nodes.

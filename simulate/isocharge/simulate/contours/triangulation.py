@@ -158,6 +158,9 @@ class Triangulation:
     def _choose(self, charge: Array, force: Array | None, candidates: Candidates) -> Fix:
         """Choose the best candidate of each press, unless another candidate is almost as good.
 
+        The candidates of a press are the contacts near which its contours meet. The best candidate is the one with the
+        smallest spread.
+
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
             force: Force of each press, shape (n,), N; None if the forces are estimated.
@@ -170,19 +173,22 @@ class Triangulation:
         n_candidates = np.bincount(candidates.press, minlength=n_press)
 
         # The candidates are ordered, so the first row of a press contains its best candidate, and the next row contains
-        # the second-best one. One row is appended, to which the index of a press without candidates may point.
+        # the second-best one. For a press without candidates, these rows may lie beyond the end of the array. One
+        # element is therefore appended, whose value is never used.
         spread = np.append(candidates.spread, np.inf)
         first_row = np.searchsorted(candidates.press, np.arange(n_press))
         second_row = np.minimum(first_row + 1, candidates.press.size)
         smallest_spread = np.where(n_candidates > 0, spread[first_row], np.nan)
         second_spread = np.where(n_candidates > 1, spread[second_row], np.inf)
 
-        # The contours of a press without candidates are `apart`, or do not exist if the map has no such charges.
+        # A press without candidates has the status `apart`, which means that its contours do not meet. If no contact
+        # causes such charges, the status is `no_contour` instead.
         status = np.where(n_candidates > 0, int(Meeting.met), int(Meeting.apart))
         has_no_contour = (n_candidates == 0) & self._grid.is_out_of_range(charge, force)
         status[has_no_contour] = Meeting.no_contour
 
-        # A press is ambiguous if its second-best candidate is almost as good as the best one, or has a tiny spread.
+        # A press is ambiguous if its second-best candidate is almost as good as the best one, or has a tiny spread. The
+        # status `twice` means that the contours meet at two places.
         is_ambiguous = second_spread <= np.maximum(AMBIGUOUS_RATIO * smallest_spread, AMBIGUOUS_SPREAD)
         status[is_ambiguous] = Meeting.twice
 
@@ -360,14 +366,20 @@ class Triangulation:
         """
         predicted, charge_derivatives = linearised(self._charges, contact)
 
-        # The slope is the length of the gradient. Its lower bound, a fraction of the typical slope, keeps the distance
-        # finite where the charge has an extremum. The typical slope increases with the force like the charges.
-        typical_slope = np.median(self._grid.slope, axis=0) * self._grid.relative_size_at(contact[:, 2])[:, None]
+        # The typical slope of each electrode is its median slope on the grid, which was computed for the middle force.
+        # The slopes at another force are larger or smaller by the same factor as the charges.
+        slope_factor = self._grid.relative_size_at(contact[:, 2])[:, None]
+        typical_slope = np.median(self._grid.slope, axis=0) * slope_factor  # shape (n, n_electrode), pC/mm
+
+        # The slope is the length of the gradient with respect to x and y. Where the charge has an extremum, the
+        # gradient is zero. The lower bound keeps the distance finite there.
         gradient_length = np.linalg.norm(charge_derivatives[..., :2], axis=2)
         slope = np.maximum(gradient_length, MIN_SLOPE * typical_slope)  # pC/mm
-
         distance = (predicted - charge) / slope
-        unknown_scales = np.array([1.0, 1.0, self.charge_map.domain.radius])  # the unknowns over (x, y, ln F)
+
+        # Convert the derivatives with respect to (x, y, ln F) into derivatives with respect to the unknowns, which are
+        # x, y and ln F times the radius of the domain.
+        unknown_scales = np.array([1.0, 1.0, self.charge_map.domain.radius])
         distance_derivatives = charge_derivatives / (slope[..., None] * unknown_scales)
         if is_force_fixed:
             distance_derivatives = distance_derivatives[..., :2]

@@ -170,13 +170,14 @@ def local_workers(count: int) -> Iterator[Executor | None]:
 def _abandon(pool: ProcessPoolExecutor, parent_end: Connection) -> None:
     """End the workers of a process pool although they are still computing, and wait until the pool has ended.
 
-    The method `ProcessPoolExecutor.shutdown` is not sufficient. In this process, a manager thread manages the pool. If
-    the workers end unexpectedly, the manager thread may fail or wait forever. This function prevents two such cases.
+    The method `ProcessPoolExecutor.shutdown` is not sufficient, because it waits until the running jobs are completed.
+    This function ends the workers. A thread of this process, the manager, then notices that they have ended, and closes
+    the pool. Two precautions are necessary.
 
-    In the first case, the workers end shortly after a future was cancelled. The manager thread fails with an
-    InvalidStateError if it has not discarded the cancelled future yet. In the second case, the workers end while a job
-    that is larger than the buffer of a pipe is sent to them. The sending thread waits forever if this process keeps a
-    reading end of this pipe open (https://github.com/python/cpython/issues/94777).
+    First, all futures are cancelled, and the workers may end only after the manager has discarded the cancelled
+    futures. Otherwise the manager fails with an InvalidStateError. Second, a job that is larger than the buffer of a
+    pipe may still be on its way to the workers. The thread that sends the job would wait forever, unless this process
+    closes its own reading end of the pipe (https://github.com/python/cpython/issues/94777).
 
     Args:
         pool: Process pool whose results are no longer needed.

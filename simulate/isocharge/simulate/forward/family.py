@@ -213,9 +213,9 @@ class Family:
     def unfold(self, solved: Array, mesh: Template) -> Array:
         """By symmetry, extend the stress from the rotations within one period of the probe to all rotations.
 
-        A rotation of the probe by one period does not change the press, but rotates the mesh. The stress of each
-        further period is therefore the stress of the solved period, with rotated elements of the mesh and rotated
-        stress components.
+        A period is the smallest rotation that maps the probe onto itself. A rotation of the probe by one period does
+        not change the press, but rotates the mesh. The stress of each further period is therefore the stress of the
+        solved period, with renumbered elements of the mesh and rotated stress components.
 
         Args:
             solved: Scaled stress in a frame that rotates with the probe, as returned by `solve`, shape
@@ -234,7 +234,7 @@ class Family:
             angle = 2.0 * np.pi * period_index / self.symmetry_order
             rotated_elements = mesh.rotated(period_index, self.symmetry_order)
             reordered_stress = solved_period[..., rotated_elements, :, :]
-            # The components refer to a frame that rotates with the probe. In this frame they rotate backwards.
+            # The stress itself does not change, but its components refer to a frame that was rotated by `angle`.
             stress_of_periods.append(rotate_stress(reordered_stress, -angle))
         all_rotations = np.concatenate(stress_of_periods, axis=2)
         return np.asarray(all_rotations.reshape(-1, n_value))

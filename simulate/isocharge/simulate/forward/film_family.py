@@ -226,7 +226,9 @@ class FilmFamily:
             Values by their names. The coefficients and the modes are rounded to integers. The array "mode_scale", shape
             (n_mode, 1), is the product of the scale of the coefficients and the scale of the modes.
         """
-        # Each mode has one scale for its coefficients at all nodes of the grid, and one scale for its own values.
+        # Round the coefficients and the modes to integers, which are multiplied by scales when the file is read. Each
+        # mode has one scale for its coefficients at all nodes of the grid, and one scale for its own values. A mode
+        # with a large contribution to the stress has many bits per value.
         bits = bits_of(self.coefficients, self.modes, MAX_BITS, EXTRA_BITS)  # shape (n_mode,)
         axes_of_grid = tuple(range(len(AXES)))
         coefficients, coefficient_scale = quantise(self.coefficients, axes_of_grid, bits)

@@ -258,6 +258,9 @@ class ModeMap:
     def _field_charges(self, contact: Array) -> dict[str, tuple[Array, ...]]:
         """Compute the charges of the stress fields, grouped by the kind of imperfection.
 
+        A stress field is the change of the stress that an imperfection of the film causes. A kind of imperfection, such
+        as "tension", has one or two stress fields.
+
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
 
@@ -267,7 +270,7 @@ class ModeMap:
         """
         if self.fields is None:
             return {}
-        is_odd = IS_ODD[list(self.field_numbers)]
+        is_odd = IS_ODD[list(self.field_numbers)]  # with respect to a reflection in the direction of the press
         charges = self.fields.field_charges(contact, is_odd)  # shape (n, n_electrode, n_field)
         charges_of_kind: dict[str, list[Array]] = {}
         for field_index, field_number in enumerate(self.field_numbers):
@@ -353,7 +356,8 @@ class FilmModes:
         unknown = sorted(set(names) - set(MODES))
         if unknown:
             raise SceneError(f"modes: expected some of {', '.join(MODES)}, got {', '.join(unknown)}")
-        # Interpolate only the needed fields. A mode that needs no field has the kind "", which no field has.
+        # A mode needs all stress fields of one kind of imperfection. A mode that needs no field has the kind "", which
+        # no field has.
         needed_kinds = {MODES[name].field for name in names}
         field_numbers = tuple(number for number, kind in enumerate(KINDS) if kind in needed_kinds)
         fields = self._field_map(film, field_numbers) if field_numbers else None
@@ -362,12 +366,16 @@ class FilmModes:
     def _field_map(self, forward_map: ForwardMap, field_numbers: tuple[int, ...]) -> ForwardMap:
         """Interpolate stress fields for one film, and return them as a forward map.
 
+        A stress field is the change of the stress that an imperfection of the film causes. In a grid of films and
+        presses, the stress fields of each press are a weighted sum of the same components. Each component contains all
+        fields, and the weights are called coefficients.
+
         A forward map contains a table of the stress, and interpolates the table between presses. The table of the
         returned map contains stress fields in place of the stress, so the fields are interpolated in the same way.
 
         Args:
             forward_map: Forward map of the film.
-            field_numbers: Index in `KINDS` of each required field.
+            field_numbers: Index of each required field among all fields.
 
         Returns:
             Forward map whose table has one row for each press of the grid. A row contains the values of all fields at
@@ -381,7 +389,7 @@ class FilmModes:
         grid_coefficients = self.coefficients.reshape(*self.grid.shape[:3], n_component)  # distance, load and tension
         press_coefficients = np.moveaxis(grid_coefficients, 2, -1) @ tension_weights  # (distance, load, component)
 
-        # Select the fields, and order their values by node.
+        # Select the fields in each component, order their values by node, and sum over the components.
         mesh = template_for(forward_map.probe, forward_map.resolution)
         n_field = IS_ODD.size
         all_fields = self.components.reshape(n_component, n_field, mesh.n_element, -1, 3)
@@ -406,10 +414,11 @@ class FilmModes:
         """Convert the decomposition into arrays that can be stored in a file.
 
         Returns:
-            Arrays by their names. The coefficients and the components ("parts") are rounded to integers. The array
-            "part_scale", shape (n_component, 1), is the product of the scales of both. The array "node_size" contains
-            the size of the stress at each node, by which the components are divided.
+            Arrays by their names. The coefficients and the components ("parts") are divided by scales and rounded to
+            integers. The array "part_scale", shape (n_component, 1), is the product of the scales of both. The array
+            "node_size" contains the size of the stress at each node, by which the components are divided before.
         """
+        # Round the coefficients. Each component has one scale for its coefficients at all nodes of the grid.
         axes_of_grid = tuple(range(len(AXES)))
         coefficients, coefficient_scale = quantise(self.coefficients, axes_of_grid, SCALE_BITS)
 
@@ -421,6 +430,8 @@ class FilmModes:
         node_exponent = np.round(np.log2(node_norm + np.finfo(np.float32).tiny))
         node_size = np.float32(np.exp2(node_exponent))
         relative_components = (node_stress / node_size).reshape(n_component, -1)
+
+        # Round the components. A component with a large contribution to the stress has many bits per value.
         bits = bits_of(self.coefficients, relative_components, MAX_BITS, EXTRA_BITS)
         components, component_scale = quantise(relative_components, 1, bits[:, None])
         return {
@@ -463,6 +474,9 @@ class FilmModes:
 def _check_shapes(arrays: Mapping[str, Any], field_size: int) -> None:
     """Raise an error if the arrays of film modes have inconsistent shapes.
 
+    The arrays describe stress fields at the nodes of a mesh. The fields are weighted sums of components, which are
+    called parts in the file. Each component contains all fields.
+
     Args:
         arrays: Arrays of a file with the names of `FilmModes.to_arrays`.
         field_size: Number of values of one stress field.
@@ -472,13 +486,14 @@ def _check_shapes(arrays: Mapping[str, Any], field_size: int) -> None:
     """
     grid_shape = tuple(arrays["grid_shape"])
     coefficients = arrays["coefficients"]
-    parts = arrays["parts"]  # the components of the stress fields
+    parts = arrays["parts"]  # the components, shape (n_component, part_size)
     n_component = len(parts)
     coefficients_fit = coefficients.shape == (*grid_shape, n_component)
     scales_fit = arrays["part_scale"].shape == (n_component, 1)
     if not (coefficients_fit and scales_fit):
         raise ValueError(f"coefficients {coefficients.shape} and parts {parts.shape} do not match")
 
+    # Each component contains all fields (one per element of `IS_ODD`), with three stress components at each node.
     part_size = parts.shape[1]
     if part_size != IS_ODD.size * field_size:
         raise ValueError(

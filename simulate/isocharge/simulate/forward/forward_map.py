@@ -280,9 +280,11 @@ class ForwardMap:
         """Compute the charges that the stress causes at given positions, for all forces of the family at once.
 
         The result includes neither the crosstalk nor the charges that the contact pressure causes. The probe keeps its
-        own orientation. The stresses under the different forces are treated as several stress fields of a map with a
-        single force. The interpolation between distances and the location of the points in the mesh are therefore done
-        only once for all forces.
+        own orientation.
+
+        The method uses a second map, the stacked map, which saves time. The stacked map has a single force, and its
+        table contains the stresses under all forces of the family as separate stress fields. The interpolation between
+        distances and the location of the points in the mesh are therefore done only once for all forces.
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
@@ -291,7 +293,8 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_force, n_electrode), pC. Charges that are not needed are zero.
         """
-        # The stacked map has one stress field for each force of the family. All these fields are even.
+        # Integrate all fields of the stacked map for chunks of presses. All fields are even with respect to a
+        # reflection in the direction of the press, because they are stresses of a film without imperfections.
         complex_position = position[:, 0] + 1j * position[:, 1]
         stacked_map = self._stacked_forces
         first_force = stacked_map.family.force[0]

@@ -57,7 +57,8 @@ class SideForceMap:
     def build(cls, film: ForwardMap, *, executor: Executor | None = None) -> "SideForceMap":
         """Solve a few presses in the domain of a forward map, and compute the stress fields of a side force.
 
-        The solves take about ten seconds.
+        The solves take about ten seconds. The map also contains the holding force of each press, which is the side
+        force that prevents the film from slipping under the probe.
 
         Args:
             film: Forward map of the film under a circular probe. It provides the domain, the mesh and the readout.

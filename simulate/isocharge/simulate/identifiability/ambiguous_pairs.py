@@ -166,9 +166,12 @@ def _candidates(
         Indices of the first contacts, shape (m,). Candidates (x, y, F) for their second contacts, shape (m, 3), mm and
         N. A first contact with two candidates occurs twice.
     """
-    # The profile computes the charges at a position from the tabulated ratios of charge and power of the force.
+    # The profile computes the charges at every position for any force from tabulated values (`ratios`). This is faster
+    # than the charge map.
     profile, ratios = _tabulate(charge_map, position)
-    _, neighbours = cKDTree(position).query(position, min(NEIGHBOURS, len(position)))  # shape (n, n_neighbour)
+
+    # Find the indices of the nearest positions of each position, shape (n, n_neighbour).
+    _, neighbours = cKDTree(position).query(position, min(NEIGHBOURS, len(position)))
     first_indices = []
     second_contacts = []
     for first_index, first_charge in enumerate(charge):
@@ -176,9 +179,10 @@ def _candidates(
         observed = np.broadcast_to(first_charge, charge.shape)
         log_force = profile.best_log_force(ratios, observed, noise)
         predicted = profile.charge(log_force, ratios)
-        chi2 = ((observed - predicted) ** 2 / noise.variance(predicted)).sum(axis=1)  # shape (n,)
 
-        # Select the best distant positions at which chi2 is a local minimum.
+        # Compute the squared distance of the charges in standard deviations of the noise, shape (n,). Then select the
+        # best distant positions at which the squared distance is a local minimum.
+        chi2 = ((observed - predicted) ** 2 / noise.variance(predicted)).sum(axis=1)
         is_local_minimum = chi2 <= chi2[neighbours].min(axis=1)
         x_difference, y_difference = (position - position[first_index]).T
         is_distant = np.hypot(x_difference, y_difference) > min_distance[first_index]
@@ -190,19 +194,20 @@ def _candidates(
 
 
 def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Array]:
-    """Tabulate the charges at every position as a function of the force.
+    """Tabulate the charges at every position for a few forces, and create a profile that interpolates between them.
 
-    If Q is a charge and F is the force, the ratio Q / F^EXPONENT depends only weakly on F. Therefore this ratio is
-    interpolated by a polynomial in ln F.
+    If Q is a charge and F is the force, the ratio Q / F^EXPONENT depends only weakly on F. The ratio is therefore
+    tabulated at a few forces (the nodes), and is interpolated by a polynomial in ln F.
 
     Args:
         charge_map: Map that computes the charges of contacts.
         position: Positions (x, y), shape (n, 2), mm.
 
     Returns:
-        Profile that computes charges from the ratios at any force. The ratios Q / F^EXPONENT at the nodes of the
-        interpolation, shape (n, n_node, n_electrode), pC/N^EXPONENT.
+        Profile that computes the charges for any force; the terms of the profile are the tabulated ratios. Tabulated
+        ratios Q / F^EXPONENT at the nodes, shape (n, n_node, n_electrode), pC/N^EXPONENT.
     """
+    # Choose the nodes. If the map has a single force, this force is the only node.
     force_range = charge_map.domain.force_range
     min_log_force, max_log_force = np.log(force_range)
     if max_log_force > min_log_force:
@@ -211,7 +216,7 @@ def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Arr
         log_nodes = np.array([min_log_force])
     force_nodes = np.clip(np.exp(log_nodes), *force_range)  # rounding must not move a force out of the range
 
-    # Compute the ratios at the nodes of the interpolation: one array of shape (n, n_electrode) for each force.
+    # Compute the ratios at the nodes: one array of shape (n, n_electrode) for each force.
     nodal_ratios = []
     for force in force_nodes:
         contact = np.column_stack([position, np.full(len(position), force)])
@@ -219,7 +224,7 @@ def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Arr
     barycentric = barycentric_weights(log_nodes)
 
     def weights(log_force: Array) -> Array:
-        """Compute the weights for which the weighted sum of the ratios at the nodes is equal to the charge.
+        """Compute weights of the nodes. The weighted sum of the ratios at the nodes is the charge.
 
         Args:
             log_force: Natural logarithms of the forces in N, shape (n,).
@@ -227,6 +232,7 @@ def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Arr
         Returns:
             Weights of the nodes for each force, shape (n, n_node), N^EXPONENT.
         """
+        # The interpolation weights lead to the ratio Q / F^EXPONENT, and the factor F^EXPONENT leads to the charge Q.
         interpolation_weights = lagrange_values(log_nodes, barycentric, log_force)
         force_power = np.exp(EXPONENT * log_force)
         return np.asarray(interpolation_weights * force_power[:, None])

@@ -264,15 +264,15 @@ class _FoldSearch:
             points.append(middle[is_short])
 
             # Find the half of each other segment in which the orientation is reversed. A segment is dropped if the
-            # orientation is reversed in neither half.
+            # orientation is reversed in neither half. If it is reversed in both halves, the first half is used.
             middle_jacobian = self.scaled_jacobian(middle)
             in_first_half = has_reversed_orientation(first_jacobian, middle_jacobian)
             in_second_half = has_reversed_orientation(middle_jacobian, second_jacobian)
             remaining = ~is_short & (in_first_half | in_second_half)
             use_second_half = (in_second_half & ~in_first_half)[remaining]
 
-            # Replace the first end or the second end of each remaining segment by its middle, together with the scaled
-            # derivatives at this end.
+            # Shorten each remaining segment to the half that is used. The middle becomes the first end of the second
+            # half, or the second end of the first half. The scaled derivatives at the ends are replaced accordingly.
             use_second_position = use_second_half[:, None]  # broadcasts with shape (n, 2)
             first = np.where(use_second_position, middle[remaining], first[remaining])
             second = np.where(use_second_position, second[remaining], middle[remaining])
@@ -303,7 +303,8 @@ class _FoldSearch:
         smallest_of_neighbours = scipy.ndimage.minimum_filter(smallest, 3, mode=("nearest", "wrap"))
         is_minimum = smallest == smallest_of_neighbours
 
-        # The first step of a search is the distance between neighbouring positions.
+        # The first step of a search is the larger distance between neighbouring positions: on the same ring or between
+        # rings. The distance between rings is equal to the radius of the innermost ring.
         spacing_on_ring = rings.distance * 2.0 * np.pi / n_angle
         spacing_between_rings = rings.distance[0]
         first_step = np.maximum(spacing_between_rings, spacing_on_ring)

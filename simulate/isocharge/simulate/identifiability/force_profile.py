@@ -41,7 +41,11 @@ class ForceProfile:
 
     @classmethod
     def of(cls, weights: Callable[[Array], Array], force_range: tuple[float, float]) -> "ForceProfile":
-        """Create a profile, and tabulate its exponent as a function of the force.
+        """Create a profile from its weights.
+
+        A profile computes the charges at a position as weights(ln F) @ terms, where F is the force. The terms depend
+        only on the position. The charges are approximately proportional to a power of the force. The exponent of this
+        power is tabulated as a function of ln F.
 
         Args:
             weights: Function that computes weights, shape (n, n_term), from values of ln F, shape (n,).
@@ -52,6 +56,9 @@ class ForceProfile:
             log_forces = np.linspace(min_log_force, max_log_force, EXPONENT_NODES)
         else:  # the numerical derivative needs two points, which lie on both sides of the single force
             log_forces = np.array([min_log_force - 1e-3, min_log_force + 1e-3])
+
+        # The sum of the weights depends on the force nearly as the charges do. The derivative of the logarithm of this
+        # sum with respect to ln F is therefore the exponent.
         log_sum = np.log(weights(log_forces).sum(axis=1))
         exponent = np.gradient(log_sum, log_forces)
         return cls(weights, (min_log_force, max_log_force), log_forces, exponent)
@@ -85,11 +92,12 @@ class ForceProfile:
     def best_log_force(self, terms: Array, charge: Array, noise: NoiseModel) -> Array:
         """For each position, find the force that best explains the measured charges (weighted least squares).
 
-        Each step computes a factor. Multiplied by this factor, the predicted charges fit the measured charges best. The
-        exponent of the profile converts this factor into a change of ln F.
+        The search starts in the middle of the range of ln F. Each step computes the factor by which the predicted
+        charges must be multiplied in order to fit the measured charges best. The force is then changed such that the
+        predicted charges change by about this factor.
 
         Args:
-            terms: Terms of the charges at each position, shape (n, n_term, n_electrode).
+            terms: Values from which the profile computes the charges at each position, shape (n, n_term, n_electrode).
             charge: Measured charges for each position, shape (n, n_electrode), pC.
             noise: Noise of the readings.
 
@@ -109,7 +117,8 @@ class ForceProfile:
             positive_factor = np.maximum(factor, 1e-300)
             log_factor = np.clip(np.log(positive_factor), -MAX_LOG_CHANGE, MAX_LOG_CHANGE)
 
-            # Near the present force F, the charges are proportional to F^exponent.
+            # Near the present force F, the charges are proportional to F^exponent. A change of ln F therefore changes
+            # their logarithms by exponent times this change.
             exponent = np.interp(log_force, self.log_forces, self.exponent)
             log_force = np.clip(log_force + log_factor / exponent, *self.log_range)
         return np.asarray(log_force)

@@ -183,7 +183,9 @@ def mirror_region(
 ) -> MirrorRegion | None:
     """Compute the mirror region of a sensor by means of a coarse charge map of the whole film.
 
-    Outside the working area, a probe that is not round is replaced by a round probe with the same reach.
+    The mirror region contains the presses outside the working area that have the same charges as a press inside it. The
+    charge map of the whole film is solved for a round probe. A probe of another shape is replaced by the smallest
+    circle around its centroid that contains the probe.
 
     Args:
         sensor: Sensor with the film and the electrodes.
@@ -202,7 +204,7 @@ def mirror_region(
     """
     if not 0.0 < radius < outermost_distance(sensor.film, probe):
         return None
-    is_round = probe.period == 0.0
-    round_probe = probe if is_round else Circle(probe.reach)
+    is_round = probe.period == 0.0  # every rotation maps a round probe onto itself
+    round_probe = probe if is_round else Circle(probe.reach)  # the reach is the distance of the farthest point
     whole_film = whole_film_map(sensor, round_probe, charges.domain.force_range, executor=executor)
     return MirrorRegion.of(charges, radius, whole_film, noise)

@@ -111,13 +111,13 @@ def _descend(
     Returns:
         Contacts (x, y, F), shape (n, 3), mm and N. Residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
-    # Centre and half width of the domain along x, y and ln F
+    # Compute the centre and the half width of the domain along x, y and ln F. Unit coordinates are relative to them.
     radius = INNER_RADIUS * charge_map.domain.radius
     force_range = charge_map.domain.force_range
     min_log_force, max_log_force = np.log(force_range)
     centre = charge_map.domain.centre
     half_width = np.array([radius, radius, 0.5 * (max_log_force - min_log_force)])
-    # The half width of ln F is zero if there is a single force.
+    # The half width of ln F is zero if there is a single force. A division by the half width uses 1 instead.
     nonzero_half_width = np.where(half_width > 0.0, half_width, 1.0)
 
     def to_contact(unit_coordinates: Array) -> Array:
@@ -137,11 +137,13 @@ def _descend(
             Residuals, shape (k, n_electrode). Their derivatives with respect to the unit coordinates, shape (k, 3,
             n_electrode).
         """
+        # The slopes are the derivatives of the charges with respect to x, y and ln F, shape (k, n_electrode, 3).
         predicted, slopes = linearised(charge_map, to_contact(unit_coordinates))
         sigma = sigma_of(rows, predicted)
         derivatives = -slopes * half_width / sigma[..., None]  # the small derivative of sigma is neglected
         return (charge[rows] - predicted) / sigma, derivatives.swapaxes(1, 2)
 
+    # Convert the starting points into unit coordinates, minimise, and convert the solution back.
     log_start = np.column_stack([start[:, :2], np.log(start[:, 2])])  # (x, y, ln F)
     unit_start = (log_start - centre) / nonzero_half_width
     unit_solution, residual = minimise(residuals, unit_start, max_steps, min_change)
@@ -193,7 +195,7 @@ def search(
     # For each row of charges, one descent starts from the nearest candidate, one from the second nearest, and so on.
     # All descents run together, because the charge map is faster for many contacts at once.
     candidates_of_descents = np.concatenate(nearest_candidates).T  # shape (starts, n)
-    contact, residual = explain(
+    contact_of_descent, residual_of_descent = explain(
         charge_map,
         np.tile(charge, (starts, 1)),
         np.tile(sigma, (starts, 1)),
@@ -201,12 +203,12 @@ def search(
         min_change=min_change,
     )
 
-    # Choose the descent with the smallest residual for each row of charges.
-    contacts = contact.reshape(starts, len(charge), 3)
-    residuals = residual.reshape(starts, *charge.shape)
-    best_start = (residuals**2).sum(axis=2).argmin(axis=0)
+    # Choose the descent with the smallest residual for each row of charges. The axes are (start, row, component).
+    contact_by_start = contact_of_descent.reshape(starts, len(charge), 3)
+    residual_by_start = residual_of_descent.reshape(starts, *charge.shape)
+    best_start = (residual_by_start**2).sum(axis=2).argmin(axis=0)  # shape (n,)
     row = np.arange(len(charge))
-    return contacts[best_start, row], residuals[best_start, row]
+    return contact_by_start[best_start, row], residual_by_start[best_start, row]
 
 
 def _unit_candidates(count: int) -> Array:

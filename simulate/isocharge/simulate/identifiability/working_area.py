@@ -170,6 +170,8 @@ def _confirm_error_radius(
 ) -> float:
     """Evaluate the position error on finer rings within a radius, and reduce the radius if the error exceeds its limit.
 
+    After a reduction, the evaluation is repeated within the smaller radius, on still finer rings.
+
     Args:
         charge_map: Map that computes the charges of contacts.
         radius: Radius within which the error does not exceed its limit on coarser rings, mm.
@@ -178,21 +180,25 @@ def _confirm_error_radius(
         error: Largest allowed position error, mm.
 
     Returns:
-        Radius within which the error does not exceed its limit on the finer rings either, mm. The radius of the domain
-        is returned unchanged, because it was not reduced by the error on the coarser rings.
+        Radius within which the error does not exceed its limit on the finer rings either, mm. There are at most
+        `MAX_CONFIRMATIONS` evaluations.
     """
+    # If the given radius is that of the domain, the rings within it are those that were evaluated before.
     if radius >= charge_map.domain.radius:
         return radius
     for _ in range(MAX_CONFIRMATIONS):
-        rounded_radius = _round_down(radius)
-        if rounded_radius <= 0.0:
+        # The finer rings extend to the rounded radius, because the radius of the working area is rounded, too.
+        outermost_ring = _round_down(radius)
+        if outermost_ring <= 0.0:
             break
-        rings = Rings.spread(rounded_radius)
-        confirmed_radius = min(_error_radius(charge_map, rings, force, noise, error) for force in forces)
-        is_confirmed = confirmed_radius >= rounded_radius * (1.0 - 1e-9)  # allows for rounding errors
+        finer_rings = Rings.spread(outermost_ring)
+
+        # If the error exceeds its limit on none of the finer rings, the distance is that of the outermost ring.
+        exceeding_distance = min(_error_radius(charge_map, finer_rings, force, noise, error) for force in forces)
+        is_confirmed = exceeding_distance >= outermost_ring * (1.0 - 1e-9)  # allows for rounding errors
         if is_confirmed:
             break
-        radius = confirmed_radius
+        radius = exceeding_distance
     return radius
 
 

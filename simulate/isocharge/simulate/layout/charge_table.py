@@ -156,7 +156,8 @@ class ChargeTable:
     def rows(self, presses: Array, centres: Array, side: float, others: tuple[Electrode, ...] = ()) -> Array:
         """Compute the charges of square and other electrodes under presses, and the derivatives of these charges.
 
-        The charge per area is averaged over the area of an electrode, even if the sensor has the edge readout.
+        A row contains the charge of one electrode under one press, followed by the derivatives of this charge. The
+        charge per area is averaged over the area of an electrode, even if the sensor has the edge readout.
 
         Args:
             presses: Positions (x, y) of the presses, shape (n, 2), mm.
@@ -208,18 +209,21 @@ class _PressedFilm:
             presses: Positions (x, y) of the presses, shape (n, 2), mm.
         """
         position = presses @ np.array([1.0, 1j])  # x + iy
-        direction = np.exp(1j * np.angle(position))
+        direction = np.exp(1j * np.angle(position))  # unit vector from the centre of the film to the press
         relative_distance = np.abs(position) / table.film_radius
 
-        # The stress is interpolated between the distances of the table. Its components are multiplied by the
-        # piezoelectric coefficients and added. One matrix product performs both steps.
+        # Compute the weights that interpolate between the distances of the table, shape (n, n_distance).
         nodes = distance_coordinate(table.distance / table.film_radius)
         coordinate = distance_coordinate(relative_distance)
         distance_weights = lagrange_values(nodes, barycentric_weights(nodes), coordinate)
+
+        # Compute the coefficients that convert the three stress components into charge per area, shape (n, 3).
         coefficients = _piezo_in_press_frame(table.piezo, direction)
+
+        # One matrix product interpolates the stress and converts it into charge per area, for all nodes of the grid.
         weights = distance_weights[:, :, None] * coefficients[:, None, :]  # shape (n, n_distance, 3)
         flat_weights = weights.reshape(len(position), -1).astype(np.float32)
-        density = (flat_weights @ table.stress).reshape(-1, len(COLUMNS))
+        density = (flat_weights @ table.stress).reshape(-1, len(COLUMNS))  # shape (n * n_node, 6)
 
         # Compute the conformal map of each press, which transforms the edge of the probe into the circle |z| = rho.
         relative_radius = np.full(len(position), table.probe.radius / table.film_radius)
@@ -278,9 +282,9 @@ class _PressedFilm:
         return electrode.area * np.concatenate(means)[:, None]
 
     def mean_rows(self, press_index: Integers, points: Array, weights: Array) -> Array:
-        """Average the charge per area and its derivatives over points on the film. The averages are weighted.
+        """Compute weighted means of the charge per area and of its derivatives over points on the film.
 
-        The values at the points are interpolated from the polar grid of each press.
+        Each mean belongs to one press. The values at the points are interpolated from the polar grid of this press.
 
         Args:
             press_index: Index of the press to which each mean belongs, shape (k,).
@@ -288,15 +292,16 @@ class _PressedFilm:
             weights: Weights of the points, which add up to one, shape (n_point,).
 
         Returns:
-            Means with the columns `COLUMNS`, divided by the area, shape (k, 6).
+            Means of the charge per area (pC/mm^2) and of its derivatives, in the order of `COLUMNS`, shape (k, 6).
         """
+        # Rotate the points into the frame of the press, whose x axis is the direction from the centre to the press.
         n_mean = len(press_index)
         direction = self.direction[press_index]
         complex_points = points @ np.array([1.0, 1j])  # x + iy
         points_in_press_frame = complex_points / direction[:, None]
-        nodes, node_weights = self._nodes_around(press_index, points_in_press_frame, weights)
 
         # Each mean is a weighted sum over the nodes of the grid that surround its points.
+        nodes, node_weights = self._nodes_around(press_index, points_in_press_frame, weights)
         flat_weights = node_weights.reshape(n_mean, 1, -1).astype(np.float32)
         node_density = self.density[nodes.reshape(n_mean, -1)]  # shape (k, n_point * n_row * n_column, 6)
         mean: Array = np.matmul(flat_weights, node_density)[:, 0].astype(float)
@@ -367,17 +372,20 @@ class _PressedFilm:
 
 
 def _piezo_in_press_frame(piezo: tuple[float, float], direction: Complexes) -> Array:
-    """Rotate the piezoelectric coefficients from the axes of the film into the frame of each press.
+    """Compute the coefficients that convert the stress in the frame of each press into charge per area.
 
-    Axis 1 of the frame of a press is the direction from the centre of the film to the press.
+    Axis 1 of the frame of a press is the direction from the centre of the film to the press. The charge per area is the
+    sum of the stresses s11, s22 and s12 in this frame, each multiplied by its coefficient.
 
     Args:
         piezo: Coefficients d31 and d32, pC/N.
         direction: Unit vector from the centre of the film to each press as a complex number, shape (n,).
 
     Returns:
-        Charge per area and stress (s11, s22, s12) in the frame of the press, shape (n, 3), pC/N.
+        Coefficients of s11, s22 and s12 for each press, shape (n, 3), pC/N.
     """
+    # If the press lies at the angle a, the coefficients are d31 cos^2 a + d32 sin^2 a, d31 sin^2 a + d32 cos^2 a and
+    # (d32 - d31) sin 2a. The first two are the mean of d31 and d32, plus or minus half their difference times cos 2a.
     d31, d32 = piezo
     mean = 0.5 * (d31 + d32)
     half_difference = 0.5 * (d31 - d32)
@@ -391,12 +399,13 @@ def _piezo_in_press_frame(piezo: tuple[float, float], direction: Complexes) -> A
 def _row_weights(row: Array) -> tuple[Integers, Array]:
     """Find the rows of the polar grid between which values are interpolated, and the weights of these rows.
 
-    The interpolation does not cross the edge of the probe, where the stress has a kink. Fractional rows up to half a
-    row beyond the last inner row are interpolated from inner rows only. All other fractional rows are interpolated from
-    outer rows only.
+    A fractional row is a position between rows: the fractional row 2.5 lies halfway between the rows 2 and 3. The inner
+    rows lie inside the edge of the probe, and the outer rows lie outside. The interpolation does not cross this edge,
+    because the stress has a kink there. Up to half a row beyond the last inner row, only inner rows are used. Farther
+    outside, only outer rows are used.
 
     Args:
-        row: Fractional rows, any shape. The inner rows have smaller numbers than the outer rows.
+        row: Fractional rows, any shape. The outer rows are numbered after the inner rows.
 
     Returns:
         Indices of four rows for each fractional row, and the weights of these rows, each of shape (..., 4).

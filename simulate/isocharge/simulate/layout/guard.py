@@ -183,8 +183,8 @@ def design_guard(case: DesignCase, *, executor: Executor | None = None) -> Guard
     order = np.argsort([limit.rms for limit in limits], kind="stable")
     best_candidates = [candidates[index] for index in order[:MAX_CHECKED]]
 
-    # The shares are only estimates. Compute the mirror regions of the best sensors by a full search, until the share of
-    # a mirror region is also nearly the smallest estimate. Then choose the sensor with the smallest mirror region.
+    # The shares are only estimates. Compute the mirror regions of the best sensors by a full search. Stop at the first
+    # sensor whose computed share is accepted, too. Then choose the sensor with the smallest mirror region.
     results: list[tuple[MirrorRegion, Sensor]] = []
     for candidate in track(best_candidates, "computing mirror regions"):
         region = _mirror_region(case, inner_map, outer_map, candidate)
@@ -255,10 +255,11 @@ def _mirror_region(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMa
 def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMap, sensors: list[Sensor]) -> Array:
     """For several guard electrodes, estimate which share of the presses outside the working area cannot be noticed.
 
-    A press cannot be noticed if a contact in the working area explains its charges. Presses that are noticed without a
-    guard electrode are also noticed with every guard electrode. For each of the other presses, the charge of the guard
-    electrode is added to the charges of the press. A descent starts from the contact that explains the charges without
-    the guard electrode.
+    A press outside cannot be noticed if a contact inside the working area has the same charges within the noise. This
+    contact is said to explain the charges. Presses that are noticed without a guard electrode are also noticed with
+    every guard electrode. For each of the other presses, the function adds the charge of the guard electrode, and
+    searches again for a contact that explains all charges. This search starts from the contact that explains the
+    charges without the guard electrode.
 
     Args:
         case: Design case with the radius of the working area and the noise.
@@ -274,13 +275,13 @@ def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: Forwar
     charge = outer_map.charges(presses)
     inner_charges = ChargeSpline.of(inner_map)
     contact, residual = search(inner_charges, charge, case.noise.sigma(charge))
-    is_explained = np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS
+    is_explained = np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS  # distance in standard deviations of the noise
     is_mirrored = is_explained & is_interior(inner_charges.domain, contact)
     if not is_mirrored.any():
         return np.zeros(len(sensors))
 
-    # For each guard electrode, add its charge, and search again for contacts that explain the charges of the presses
-    # that were not noticed.
+    # For each guard electrode, add its charge to the charges of the presses that were not noticed, and search again for
+    # contacts that explain the charges.
     mirrored_presses = presses[is_mirrored]
     shares = []
     for sensor in track(sensors, "comparing positions"):

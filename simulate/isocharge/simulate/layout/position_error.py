@@ -119,8 +119,9 @@ def position_variance(inverse: Array) -> Array:
 
 
 def squared_errors_with_candidates(sensitivity: Array, candidates: Array) -> Array:
-    """For many candidate electrodes, compute the squared position errors of a layout with this candidate.
+    """Compute the squared position errors of a layout to which one candidate electrode is added, for many candidates.
 
+    The sensitivities are the derivatives of the charges in units in which the noise and the priors have the variance 1.
     Let B be the information matrix of the layout, and let the vector a contain the sensitivities of a candidate.
     According to Sherman and Morrison (1950), the sum of the variances of x and y with the candidate is
 
@@ -141,5 +142,6 @@ def squared_errors_with_candidates(sensitivity: Array, candidates: Array) -> Arr
     quadratic_form = (inverse_times_candidate * candidates).sum(axis=1)  # a' B^-1 a
     reduction = squared_position_part / (1.0 + quadratic_form)
 
-    # The reduction is in units of the squared prior standard deviation of the position.
+    # The squared error is that of the layout minus the reduction. The reduction is in units of the squared prior
+    # standard deviation of the position.
     return np.asarray(position_variance(inverse)[:, None] - POSITION_PRIOR_STD**2 * reduction)

@@ -265,8 +265,9 @@ class Search:
     def _log_error_jacobian(self, positions: Array, selection: Integers | slice) -> Array:
         """Compute the derivatives of `_log_errors` with respect to the coordinates of the squares.
 
-        The derivatives are forward differences. If one square moves, the charges of all other electrodes remain
-        unchanged, so only the charge of the moved square is computed again.
+        The derivatives are forward differences. The errors are computed from the rows of the electrodes. The row of an
+        electrode contains its charge and the derivatives of the charge, for each press. If one square moves, only the
+        row of this square changes.
 
         Args:
             positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
@@ -279,8 +280,8 @@ class Search:
         kept_rows = self.kept_rows[selection]
         n_new = len(positions)
 
-        # Compute the rows of the new squares, and the rows of each square after a step along x and after a step along
-        # y.
+        # Compute the rows of the new squares, shape (n_press, n_new, 6). Also compute the rows of each square after a
+        # step along x and after a step along y, shape (n_press, 2 n_new, 6).
         steps = DIFFERENCE_STEP * np.eye(2)
         moved_positions = (positions[:, None] + steps).reshape(-1, 2)
         all_positions = np.concatenate([positions, moved_positions])
@@ -288,6 +289,7 @@ class Search:
         new_rows = all_rows[:, :n_new]
         moved_rows = all_rows[:, n_new:]
 
+        # For each coordinate, replace the row of the moved square, and compute the difference of the errors.
         log_error = self._log_errors_of_rows(np.concatenate([new_rows, kept_rows], axis=1), selection)
         derivatives = []
         for coordinate in range(2 * n_new):
@@ -465,16 +467,19 @@ class _Exchange:
         )
 
     def mean_powers(self, other_squares: Integers) -> Array:
-        """For each position of the grid, compute the mean power of the errors after adding a square there.
+        """Add a square to a layout at each position of the grid in turn, and compute how large the errors then are.
 
-        The error of each press is raised to the power `power`. The result is the weighted mean over the presses.
+        The measure is the weighted mean over the presses of the position error, raised to the exponent `power`.
 
         Args:
-            other_squares: Indices of the grid positions of the other new squares of the layout, shape (n_new - 1,).
+            other_squares: Indices of the grid positions of the new squares to which the square is added, shape
+                (n_new - 1,).
 
         Returns:
-            Means, shape (n,). A mean is infinite if the further square violates a distance rule.
+            Mean for each position of the added square, shape (n,). It is infinite if the added square violates a
+            distance rule.
         """
+        # Collect the sensitivities of the electrodes without the added square, shape (n_press, n_kept + n_new - 1, 5).
         others_sensitivity = self.candidates[:, :, other_squares].swapaxes(1, 2)
         layout_sensitivity = np.concatenate([self.kept_sensitivity, others_sensitivity], axis=1)
         squared_error = squared_errors_with_candidates(layout_sensitivity, self.candidates)  # shape (n_press, n)
@@ -497,16 +502,17 @@ class _Exchange:
             shape (n_new,).
         """
         improved_layout = layout.copy()
-        best_error = np.inf
+        previous_error = np.inf
         for _ in range(MAX_SWEEPS):
             for square in range(len(improved_layout)):
                 other_squares = np.delete(improved_layout, square)
                 mean_powers = self.mean_powers(other_squares)
                 improved_layout[square] = np.argmin(mean_powers)
 
-            # The smallest mean belongs to the layout after the last square has been moved.
+            # The last square was moved to the position with the smallest mean, so this mean is that of the layout. Stop
+            # if the sweep has hardly reduced the error.
             error = float(mean_powers.min() ** (1.0 / self.power))
-            if error > best_error * (1.0 - MIN_SWEEP_GAIN):
+            if error > previous_error * (1.0 - MIN_SWEEP_GAIN):
                 break
-            best_error = error
+            previous_error = error
         return error, improved_layout

@@ -193,11 +193,12 @@ class Measurement:
         """Draw the initial temperatures, and set all charges to their stationary values at these temperatures."""
         amplifier = self.amplifier
 
-        # Draw correlated temperatures of the air and the film. The temperature of the film has the standard deviation
-        # `temperature_rms`. The film responds to the air as a low-pass filter, which multiplies the standard deviation
-        # of the temperature by the factor `correlation`. This factor is also the correlation of the two temperatures.
+        # Draw correlated temperatures of the air and the film. The film follows the air as a low-pass filter, so the
+        # standard deviation of the film is smaller than that of the air. The ratio of both standard deviations is also
+        # the correlation of both temperatures. The film must have the standard deviation `temperature_rms`, so the air
+        # has the standard deviation `temperature_rms / correlation`.
         common_draw, independent_draw = amplifier.temperature_rms * self.rng.standard_normal(2)
-        variance_ratio = self._variance_ratio
+        variance_ratio = self._variance_ratio  # variance of the film divided by the variance of the air
         correlation = math.sqrt(variance_ratio)
         self._air_temperature = common_draw / correlation
         self._film_temperature = correlation * common_draw + math.sqrt(1.0 - variance_ratio) * independent_draw
@@ -303,8 +304,9 @@ class Measurement:
         air_decay = math.exp(-1.0 / (self.rate * amplifier.temperature_time))
         film_decay = math.exp(-1.0 / (self.rate * amplifier.film_time))
 
-        # The drift of the air is drift[n] = air_decay * drift[n - 1] + innovations[n]. The innovations are scaled such
-        # that the temperature of the film has the standard deviation `temperature_rms`.
+        # The drift of the air is drift[n] = air_decay * drift[n - 1] + innovations[n], with random innovations. Their
+        # standard deviation is chosen such that the film has the standard deviation `temperature_rms`. The property
+        # `_variance_ratio` is the variance of the film divided by the variance of the air.
         innovation_std = math.sqrt((1.0 - air_decay * air_decay) / self._variance_ratio) * amplifier.temperature_rms
         innovations = innovation_std * self.rng.standard_normal(time.size)
         air_start = [air_decay * self._air_temperature]

@@ -254,8 +254,9 @@ class Membrane:
         scaled_strain = strain(slopes, self.groups.squared_amplitude)
         energy_density = 0.5 * np.sum(scaled_strain * self._elastic_stress(scaled_strain), axis=-1)
 
-        # The difference tr E' - div U is half of the weighted sum of the squared slopes. If the pretension depends on
-        # the direction, its deviator adds a similar term.
+        # The difference tr E' - div U is half of the weighted sum of the squared slopes. The weights are A^2 for the
+        # slopes of U1 and U2, and 1 for the slopes of W, where A is the amplitude. If the pretension depends on the
+        # direction, its deviator adds a similar term.
         energy_density += 0.5 * self.groups.tension * np.sum(slopes**2 @ self._slope_weights, axis=-1)
         if self._deviator is not None:
             deviator_products = slopes * (self._deviator @ slopes)
@@ -322,7 +323,9 @@ class Membrane:
         for i, j in COMPONENT_PAIRS:
             block = self._material_block(deformation, i, j) * geometry.weights[..., None, None]
             if i == j:
-                block += self._slope_weights[i] * weighted_stress
+                block += self._slope_weights[i] * weighted_stress  # the weights are A^2 for U1 and U2, and 1 for W
+
+            # Compute gradient' block gradient, summed over the quadrature points and the two derivatives at each point.
             stacked_product = (block @ gradient).reshape(n_element, -1, n_local)
             matrix[:, i, :, j] = transposed_gradient @ stacked_product
             if i != j:
@@ -402,7 +405,11 @@ class Bending:
     """
 
     def __init__(self, geometry: Geometry, stiffness: float) -> None:
-        """Compute the matrices L and M of a mesh, which are explained in the docstring of the class.
+        """Compute the matrices L and M of a mesh, from which the bending energy is computed.
+
+        An element of L is the integral of the product of the gradients of two basis functions. An element of the mass
+        matrix M is the integral of the product of two basis functions. With the quadrature rule of the nodes, M is
+        diagonal.
 
         Args:
             geometry: Integration rules of the elements.
@@ -411,13 +418,14 @@ class Bending:
         self.geometry = geometry
         self.stiffness = stiffness
 
-        # Matrix L of each element, shape (n_element, n_local, n_local). Each quadrature point has two derivatives, and
-        # both derivatives have the weight of the point.
+        # Matrix L of each mesh element, shape (n_element, n_local, n_local). The array `stacked` contains both
+        # derivatives of the basis functions at each quadrature point, so the weight of each point is repeated.
         weights = np.repeat(geometry.weights, 2, axis=1)[..., None]
         self._laplace = geometry.stacked.transpose(0, 2, 1) @ (weights * geometry.stacked)
 
-        # Diagonal of M for all nodes, including hanging nodes. If there are hanging nodes, `laplacian` factorises the
-        # matrix M of the other nodes when it is first needed.
+        # Diagonal of M for all nodes, including hanging nodes, shape (n_node,). Hanging nodes have no unknowns of their
+        # own. If there are any, M is not diagonal for the other nodes, and is factorised at the first call of
+        # `laplacian`.
         self._mass = replace(geometry, constraint=None).gather(geometry.mass)
         self._mass_factor: SuperLU | None = None
 
@@ -481,8 +489,9 @@ class Bending:
             [ K + beta (2 s L - s^2 M)    sqrt(beta) (L - s M)^T ] [W ]   [r]
             [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0],
 
-        where beta is the bending stiffness, L is the matrix of the weak Laplacian, M is the diagonal mass matrix, and s
-        is the shift `SHIFT`.
+        where r is the right-hand side for W, beta is the bending stiffness, L is the matrix of the weak Laplacian, and
+        M is the diagonal mass matrix. The solution W does not depend on the constant s, which is `SHIFT`. With this
+        constant, the matrix can be factorised without pivoting.
 
         Args:
             tangent: Matrices for (U1, U2, W), shape (n_element, n_local, 3, n_local, 3).

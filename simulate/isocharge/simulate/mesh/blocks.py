@@ -160,15 +160,16 @@ class Blocks:
         corners = np.eye(self.n_corner + 1)[:-1]
         middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
 
-        # The stops are the middles and the corners of the meshed part in anticlockwise order.
-        stops = [middles[-1]]
+        # List the middles and the corners of the meshed part alternately in anticlockwise order.
+        middles_and_corners = [middles[-1]]
         for corner, middle in zip(corners[: self.n_meshed], middles[: self.n_meshed], strict=True):
-            stops += [corner, middle]
+            middles_and_corners += [corner, middle]
 
-        # Divide the line between two successive stops into equal parts.
+        # Divide each half edge, which connects a middle and a corner, into `n_half_edge` equal parts.
         fraction = np.arange(self.n_half_edge)[:, None] / self.n_half_edge
-        points = [start + fraction * (end - start) for start, end in pairwise(stops)]
-        points.append(stops[-1][None])
+        points = [start + fraction * (end - start) for start, end in pairwise(middles_and_corners)]
+        last_middle = middles_and_corners[-1]
+        points.append(last_middle[None])
         return np.concatenate(points)
 
     @cached_property
@@ -179,6 +180,9 @@ class Blocks:
         inner side, and the first and the last corner of its outer side. Each corner is a weighted sum of the corners
         and the centroid of the core polygon. The weights of a corner on a curved side are zero, because `Placement`
         adds the curved sides.
+
+        The elements are those of the core polygon, followed by one or two layers of elements that surround the core
+        polygon up to the innermost circle.
         """
         core_elements = [
             self._core_element(corner, radial_index, angular_index)

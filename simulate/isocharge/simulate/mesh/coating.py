@@ -75,8 +75,9 @@ class Coating:
     def film_strain(self, points: Complexes, mean_strain: Array) -> Array:
         """Compute the strain at points from the mean strain of the laminate.
 
-        Each point lies in one phase of the laminate. The strain at a point is the strain of the phase that contains the
-        point.
+        The laminate is a mixture of bare film and coated film, with which the mesh replaces the sharp edges of the
+        coat. Film with i layers of the coat is called phase i. The real film at a point consists of a single phase, so
+        the strain at the point is the strain of this phase.
 
         Args:
             points: Film points x + iy, shape (n,), in film radii.

@@ -126,20 +126,28 @@ def _enclosing_radius(outline: Complexes, centre: Array) -> Array:
 
 
 def sector_angles(
-    blocks: Blocks, stops: Complexes, reach: Array, centroid: Array, centre: Array, radius: Array, c_rho: Array
+    blocks: Blocks,
+    inner_points: Complexes,
+    inner_extent: Array,
+    centroid: Array,
+    centre: Array,
+    radius: Array,
+    c_rho: Array,
 ) -> Array:
     """Compute the angles at which the sides of the sectors meet the innermost circle.
 
-    The sides of the sectors begin at the points at which rays from the centroid of the footprint meet the circle. Some
-    points on the inner side of the last layer of blocks are called stops. The directions of the rays are a compromise
-    between evenly spaced directions and the directions of the stops. If the gap between the stops and the circle is
-    narrow, the rays must pass close to the stops, because elements would fold otherwise.
+    The sectors divide the rings between the innermost circle and the rim. Their sides begin where rays from the
+    centroid of the footprint meet the circle. The last layer of elements inside the circle connects the circle to an
+    inner boundary. The directions of the rays are a compromise between evenly spaced directions and the directions of
+    given points on the inner boundary. If the gap between these points and the circle is narrow, the rays must pass
+    close to the points, because elements would fold otherwise.
 
     Args:
         blocks: The elements.
-        stops: Points x + iy on the inner side of the last layer of blocks, shape (..., 2 * n_meshed + 1), in film
-            radii. The stops belong to the corners of the core polygon and to the points half-way between the corners.
-        reach: Largest distance of a point of the inner side from the centre of the circle, shape (...), in film radii.
+        inner_points: Points x + iy on the inner boundary of the last layer, shape (..., 2 * n_meshed + 1), in film
+            radii. They belong to the corners of the core polygon and to the points half-way between the corners.
+        inner_extent: Largest distance of a point of the inner boundary from the centre of the circle, shape (...), in
+            film radii.
         centroid: Position of the centroid of the footprint on the x axis, shape (...), in film radii.
         centre: Position of the centre of the circle on the x axis, shape (...), in film radii.
         radius: Radius of the circle, shape (...), in film radii.
@@ -149,7 +157,7 @@ def sector_angles(
         Angles in the template plane in increasing order, shape (..., n_sector + 1), rad.
     """
     origin = centroid[..., None] + 0j  # common origin of all rays
-    ray_angle = _ray_angles(blocks, stops - origin, radius / reach)
+    ray_angle = _ray_angles(blocks, inner_points - origin, radius / inner_extent)
     ray: Complexes = np.exp(1j * ray_angle)  # unit vectors x + iy, shape (..., n_sector + 1)
     origin_from_centre: Complexes = np.asarray(origin - centre[..., None], dtype=complex)
     intersection = _intersections_with_circle(origin_from_centre, ray, radius[..., None])
@@ -182,35 +190,38 @@ def _intersections_with_circle(origin: Complexes, ray: Complexes, radius: Array)
     return np.asarray(origin + ray * length)
 
 
-def _ray_angles(blocks: Blocks, stops: Complexes, radius_ratio: Array) -> Array:
+def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) -> Array:
     """Compute the directions of the rays that extend from the centroid of the footprint to the sides of the sectors.
+
+    The last layer of elements inside the innermost circle connects the circle to an inner boundary. Some of the rays
+    belong to given points on the inner boundary. The other rays lie between them.
 
     Args:
         blocks: The elements.
-        stops: Points x + iy on the inner side of the last layer of blocks, relative to the centroid, shape
-            (..., n_stop). The stops belong to the corners of the core polygon and to the points half-way between them.
-        radius_ratio: Radius of the innermost circle divided by the largest distance of the inner side from the centre
-            of the circle, shape (...).
+        inner_points: Points x + iy on the inner boundary, relative to the centroid, shape (..., n_point). They belong
+            to the corners of the core polygon and to the points half-way between the corners.
+        radius_ratio: Radius of the innermost circle divided by the largest distance of the inner boundary from the
+            centre of the circle, shape (...).
 
     Returns:
         Angles, shape (..., n_sector + 1), rad.
     """
-    # Angles with equal differences that have the same mean as the angles of the stops
-    stop_angle = np.unwrap(np.angle(stops), axis=-1)
-    angle_from_first = np.linspace(0.0, 2.0 * np.pi / blocks.copies, stop_angle.shape[-1])
-    mean_difference = np.mean(stop_angle[..., :-1] - angle_from_first[:-1], axis=-1)
+    # Angles with equal differences that have the same mean as the angles of the inner points, shape (..., n_point)
+    inner_angle = np.unwrap(np.angle(inner_points), axis=-1)
+    angle_from_first = np.linspace(0.0, 2.0 * np.pi / blocks.copies, inner_angle.shape[-1])
+    mean_difference = np.mean(inner_angle[..., :-1] - angle_from_first[:-1], axis=-1)
     even_angle = angle_from_first + mean_difference[..., None]
 
-    # Rotate the ray of each stop towards the even angle. The rotation is small if the circle is close to the stops. The
-    # function `tanh` limits the rotation to `MAX_TURN`.
+    # Rotate the direction of each inner point towards the even angle. The rotation is small if the circle is close to
+    # the inner points. The function `tanh` limits the rotation to `MAX_TURN`.
     evenness = 0.5 * np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)[..., None]  # from 0 to 0.5
-    rotation = MAX_TURN * np.tanh(evenness * (even_angle - stop_angle) / MAX_TURN)
-    mixed_angle = stop_angle + rotation
+    rotation = MAX_TURN * np.tanh(evenness * (even_angle - inner_angle) / MAX_TURN)
+    mixed_angle = inner_angle + rotation
 
-    # Divide each interval between two stops into `blocks.n_half_edge` equal parts.
+    # Add the rays between the rays of the inner points. Divide each interval into `blocks.n_half_edge` equal parts.
     fraction = np.arange(blocks.n_half_edge) / blocks.n_half_edge
     interval = np.diff(mixed_angle, axis=-1)[..., None]
-    angles_in_intervals = mixed_angle[..., :-1, None] + fraction * interval  # shape (..., n_stop - 1, n_half_edge)
+    angles_in_intervals = mixed_angle[..., :-1, None] + fraction * interval  # shape (..., n_point - 1, n_half_edge)
     angles = angles_in_intervals.reshape(*mixed_angle.shape[:-1], -1)
     return np.concatenate([angles, mixed_angle[..., -1:]], axis=-1)
 
@@ -272,10 +283,12 @@ def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
     if resolution.rim == 0:
         return np.broadcast_to(even_edges, (*rho.shape, even_edges.size))
 
-    # At the rim, r is about 1, so the total width of the thin rings is about their step of ln r. This step divided by
-    # ln(1 / rho) is the total depth of the thin rings.
-    requested_depth = -layer / np.log(rho)
-    thin_depth = np.minimum(requested_depth, _max_thin_depth(resolution))[..., None]
+    # The thin rings extend from r = 1 - layer to r = 1, over which ln(r) increases by about `layer`. According to the
+    # definition of the depth, the depth increases by layer / ln(1 / rho).
+    requested_thin_depth = -layer / np.log(rho)
+    thin_depth = np.minimum(requested_thin_depth, _max_thin_depth(resolution))[..., None]
+
+    # The even rings share the remaining depth. The part of the thin rings outside edge i is 3^-i of their total depth.
     edges_of_even_rings = even_edges * (1.0 - thin_depth)
     edges_of_thin_rings = 1.0 - thin_depth * 3.0 ** -np.arange(1.0, resolution.rim + 1)
     edges_of_thin_rings[..., -1] = 1.0  # the last ring extends to the rim

@@ -223,12 +223,12 @@ class PlacedMesh:
         circular_points = from_oval(points, self.oval)
         meshed_points, is_reflected = self.template.into_meshed_half(circular_points)
 
-        # `locate_points` expects one row of points for each placement. Here, there is a single placement.
-        (base_element,), (base_xi,), (base_eta,) = locate_points(
+        # `locate_points` expects one row of points for each placement. Here, there is a single placement. The function
+        # does not consider that elements may have been split, and returns the unsplit elements.
+        (unsplit_element,), (unsplit_xi,), (unsplit_eta,) = locate_points(
             self.placement.batch(), self.template, meshed_points[None]
         )
-        # The template may consist of parts of the original elements.
-        element, xi, eta = self.template.to_split_elements(base_element, base_xi, base_eta)
+        element, xi, eta = self.template.to_split_elements(unsplit_element, unsplit_xi, unsplit_eta)
         return element, xi, eta, is_reflected
 
     def gradient(self, element: Integers, xi: Array, eta: Array) -> Array:

@@ -102,25 +102,26 @@ class Placement:
         corners = np.concatenate([core_corners, centroid[..., None]], axis=-1)
 
         # The innermost circle is the boundary of a circular footprint, or encloses the footprint with a gap. The last
-        # layer of blocks ends at this circle. `reach` is the largest distance of the inner side of the last layer from
-        # the centre of the circle. `stops` are the points of this side that belong to the corners of the core polygon
-        # and to the points half-way between the corners. Sides of sectors begin at the stops.
-        stops: Complexes = np.asarray(corners @ blocks.core_outline[:: blocks.n_half_edge].T)
+        # layer of elements inside the circle connects the circle to an inner boundary. The inner boundary is the edge
+        # of the core polygon, or the edge of a curved footprint that is not circular. `inner_points` are the points of
+        # the inner boundary that belong to the corners of the core polygon and to the points half-way between them.
+        # `inner_extent` is the largest distance of the inner boundary from the centre of the circle.
+        inner_points: Complexes = np.asarray(corners @ blocks.core_outline[:: blocks.n_half_edge].T)
         if probe.topology.fills_circle:
             centre = centroid
             radius = np.full(centroid.shape, probe.reach / film_radius)
-            reach = np.abs(corners - centre[..., None]).max(axis=-1)
+            inner_extent = np.abs(corners - centre[..., None]).max(axis=-1)
         else:
             outline = centroid[..., None] + probe.outline / film_radius * rotation_factor[..., None]
             centre, radius = enclosing_circle(outline, centroid)
-            reach = np.abs(outline - centre[..., None]).max(axis=-1)
+            inner_extent = np.abs(outline - centre[..., None]).max(axis=-1)
             if probe.topology.is_curved:
                 boundary = probe.boundary(blocks.boundary_parameter[:: blocks.n_half_edge])
-                stops = np.asarray(centroid[..., None] + boundary / film_radius * rotation_factor[..., None])
+                inner_points = np.asarray(centroid[..., None] + boundary / film_radius * rotation_factor[..., None])
 
         # Compute the conformal map of the innermost circle, and the angles and depths of the elements around it.
         c, rho = automorphism_onto(centre, radius)
-        circle_angles = sector_angles(blocks, stops, reach, centroid, centre, radius, c * rho)
+        circle_angles = sector_angles(blocks, inner_points, inner_extent, centroid, centre, radius, c * rho)
         template_layer = layer * (1.0 + c) / (1.0 - c)  # width of the thin rings in the template plane
         return cls(
             c=c,
@@ -290,9 +291,11 @@ def _unit_coordinates(blocks: Blocks) -> tuple[Array, Array]:
 def widest_smooth_layer(mesh: Blocks, probe: Probe, distance: float, film_radius: float) -> float:
     """Compute the largest width of the thin rings with which the mesh changes smoothly with the position of the press.
 
-    For presses near the rim, the function `ring_edges` limits the total depth of the thin rings. As functions of the
-    distance of the press from the centre, the positions of the nodes have a kink where the limit takes effect. If the
-    limit takes effect, polynomials in the distance therefore interpolate the fields inaccurately.
+    The nodes of the mesh move when the distance of the press from the centre increases. Fields at the nodes can be
+    interpolated by polynomials in this distance only if the nodes move smoothly. For presses near the rim, the function
+    `ring_edges` limits the thin rings to a largest width. The movement of the nodes has a kink at the distance beyond
+    which the requested width exceeds this largest width. Thin rings that are not wider than the returned width never
+    reach the limit.
 
     Args:
         mesh: Template of the mesh.
@@ -303,7 +306,8 @@ def widest_smooth_layer(mesh: Blocks, probe: Probe, distance: float, film_radius
     Returns:
         Total width of the thin rings, in film radii.
     """
-    # The layer is 0, because the parameters of the conformal map do not depend on the width of the thin rings.
+    # Place the mesh under the outermost press, in several orientations of the probe. Only the parameters c and rho of
+    # the conformal map are needed. They do not depend on the width of the thin rings, so the width is set to 0.
     no_layer = 0.0
     rotation = 2.0 * np.pi * np.arange(CHECKED_ORIENTATIONS) / CHECKED_ORIENTATIONS
     distances = np.full(CHECKED_ORIENTATIONS, distance)

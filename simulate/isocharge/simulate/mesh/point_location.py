@@ -199,6 +199,9 @@ def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> t
     inside an element with straight sides. Each point is assigned to the element for which the smallest of its four
     distances is largest.
 
+    The elements with straight sides fill the core polygon. One or two layers of elements with curved sides surround the
+    core polygon. If there are two layers, the edge of the footprint separates them.
+
     Args:
         placement: n placements, one for each point.
         blocks: The elements.
@@ -207,8 +210,8 @@ def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> t
     Returns:
         Index of the element, and radial and angular coordinate in the element from 0 to 1, each of shape (n,).
     """
-    # Signed distance of each point from the four sides of each element, shape (n, n_inner). The sides are directed such
-    # that the element lies on the left.
+    # Signed distance of each point from the four sides of each element, shape (n, n_inner). The first two arguments of
+    # `_distance_to_left` are the start and the end of the side, with the element on the left.
     corners = _inner_corners(placement, blocks)
     point_column = points[:, None]
     distance_from_first_side = _distance_to_left(corners.inner_first, corners.outer_first, point_column)
@@ -216,15 +219,11 @@ def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> t
     distance_from_inner_side = _distance_to_left(corners.inner_last, corners.inner_first, point_column)
     distance_from_outer_side = _distance_to_left(corners.outer_first, corners.outer_last, point_column)
 
-    # The distances from curved sides are set to infinity, so that they are never the smallest. If there are two layers,
-    # elements inside the footprint are excluded for points outside, and vice versa, by a distance of minus infinity.
+    # Ignore curved sides: a distance of infinity is never the smallest of the four distances. All outer sides outside
+    # the core polygon may be curved. If there are two layers, the inner sides of the last layer are curved, too.
     distance_from_outer_side[:, blocks.n_quad :] = np.inf
     if blocks.n_layer == 2:
-        centroid = placement.corners[:, -1]
-        is_in_footprint = placement.probe.contains((points - centroid) / placement.rotation_and_scale)
         distance_from_inner_side[:, blocks.last_layer] = np.inf
-        distance_from_outer_side[~is_in_footprint, blocks.footprint] = -np.inf
-        distance_from_outer_side[is_in_footprint, blocks.last_layer] = -np.inf
 
     distances = [
         distance_from_first_side,
@@ -233,6 +232,14 @@ def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> t
         distance_from_outer_side,
     ]
     smallest_distance = np.min(distances, axis=0)  # shape (n, n_inner)
+
+    # If there are two layers, exclude the elements on the other side of the edge of the footprint. An element whose
+    # distance is minus infinity is never chosen.
+    if blocks.n_layer == 2:
+        centroid = placement.corners[:, -1]
+        is_in_footprint = placement.probe.contains((points - centroid) / placement.rotation_and_scale)
+        smallest_distance[~is_in_footprint, blocks.footprint] = -np.inf
+        smallest_distance[is_in_footprint, blocks.last_layer] = -np.inf
     element = np.argmax(smallest_distance, axis=1)
     radial, angular = _local_coordinates(placement, blocks, points, element, corners.of_elements(element))
     if blocks.n_layer == 2:
@@ -251,10 +258,11 @@ def _correct_sectors(
 ) -> None:
     """Reassign points that lie outside their element to another sector of the same layer.
 
-    The straight lines through the sides of two sectors may cross outside the elements. A point may therefore lie
-    between the lines of a sector that does not contain the point. For elongated probes near the rim, some points are at
-    first assigned to a wrong sector. The function tries the neighbouring sectors on both sides, then the next
-    neighbours, and so on.
+    The core polygon is surrounded by two layers of elements. The elements of a layer are called sectors. Each point was
+    assigned to a sector by the straight lines through the sides of the sectors. These lines may cross outside the
+    elements, so a point may lie between the lines of a sector that does not contain the point. For elongated probes
+    near the rim, some points are therefore assigned to a wrong sector. The function tries the neighbouring sectors on
+    both sides, then the next neighbours, and so on.
 
     Args:
         placement: n placements, one for each point.
@@ -267,29 +275,31 @@ def _correct_sectors(
     """
     first_element = element.copy()  # the first assignment, because `element` changes in the loop
     for shift in range(1, blocks.n_sector // 2 + 1):
-        # Select the points that lie outside their element. Only points in the layers are selected, because the elements
-        # of the core polygon are not sectors.
+        # Select the points whose local coordinates exceed the range from 0 to 1, which means that the points lie
+        # outside their element. The elements of the core polygon have the indices below `n_quad`, and are not sectors.
         is_outside = _overshoot(radial, angular) > SECTOR_TOLERANCE
-        rows = np.flatnonzero(is_outside & (first_element >= blocks.n_quad))
-        if rows.size == 0:
-            return
-        row_corners = QuadCorners(*(corner[rows] for corner in corners))
-        in_last_layer = first_element[rows] >= blocks.last_layer.start
+        selected = np.flatnonzero(is_outside & (first_element >= blocks.n_quad))  # indices of the points
+        if selected.size == 0:
+            return  # no point needs to be reassigned any more
+
+        # Find the index of the sector of each selected point within its layer.
+        in_last_layer = first_element[selected] >= blocks.last_layer.start
         layer_start = np.where(in_last_layer, blocks.last_layer.start, blocks.n_quad)
-        sector = first_element[rows] - layer_start  # index of the sector within its layer
+        sector = first_element[selected] - layer_start
 
         # Try the sectors on both sides. Assign a point to a sector in which its local coordinates overshoot less.
+        selected_corners = QuadCorners(*(corner[selected] for corner in corners))
         for signed_shift in (shift, -shift):
             candidate = layer_start + (sector + signed_shift) % blocks.n_sector
-            candidate_corners = row_corners.of_elements(candidate)
+            candidate_corners = selected_corners.of_elements(candidate)
             new_radial, new_angular = _local_coordinates(
-                placement[rows], blocks, points[rows], candidate, candidate_corners
+                placement[selected], blocks, points[selected], candidate, candidate_corners
             )
-            is_better = _overshoot(new_radial, new_angular) < _overshoot(radial[rows], angular[rows])
-            better_rows = rows[is_better]
-            element[better_rows] = candidate[is_better]
-            radial[better_rows] = new_radial[is_better]
-            angular[better_rows] = new_angular[is_better]
+            is_better = _overshoot(new_radial, new_angular) < _overshoot(radial[selected], angular[selected])
+            reassigned = selected[is_better]
+            element[reassigned] = candidate[is_better]
+            radial[reassigned] = new_radial[is_better]
+            angular[reassigned] = new_angular[is_better]
 
 
 def _inner_corners(placement: Placement, blocks: Blocks) -> QuadCorners:

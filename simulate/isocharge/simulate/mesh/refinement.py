@@ -97,13 +97,15 @@ class RefinedTemplate(Template):
         self.n_element = parent.size
         self.splits = np.column_stack([parent, low, size])
 
-        # Nodes of different elements at the same position under the sample press are the same node.
+        # Nodes of different elements are the same node if they have the same position on the film. The positions are
+        # computed for an arbitrary press, the sample press, because the result is the same for all presses.
         points = self.from_base(sample_points(base)).ravel()
         self.n_node, node_number = _number_points(points)
         self.nodes: Integers = node_number.reshape(self.n_element, -1)
-        _, self.first_occurrence = np.unique(node_number, return_index=True)
+        _, self.first_occurrence = np.unique(node_number, return_index=True)  # index in `points` for each node number
 
-        # The rim consists of the outer sides of the original elements of the last ring.
+        # The rim consists of the outer sides (xi = 1) of the original elements of the last ring, which have the highest
+        # indices.
         is_in_last_ring = parent >= base.n_element - base.n_sector
         parent_xi, _ = self._into_parent(self.xi, self.eta)
         is_on_outer_side = parent_xi > 1.0 - 1e-12
@@ -136,9 +138,9 @@ class RefinedTemplate(Template):
     def to_split_elements(self, element: Integers, xi: Array, eta: Array) -> tuple[Integers, Array, Array]:
         """Convert positions in the original elements into positions in the split elements.
 
-        All split elements of one size are cells of a regular grid in the original element. Each cell has a unique code.
-        For each size, the method computes the code of the cell that contains a point, and searches for an element of
-        this size with the same code.
+        The split elements have different sizes. For each size, the original elements can be divided into a regular grid
+        of cells of this size. Every split element of this size is one of the cells. Each cell is identified by a code.
+        The method computes the code of the cell that contains a point, and searches for a split element with this code.
 
         Args:
             element: Index of the original element of each point, shape (n,).
@@ -151,7 +153,7 @@ class RefinedTemplate(Template):
         split_element = np.zeros_like(element)
         position = np.stack([xi, eta])  # shape (2, n)
         for size in np.unique(self.size, axis=0):
-            candidates, candidate_codes = self._elements_of_size(size)
+            candidates, candidate_codes = self._elements_of_size(size)  # ordered by their codes
 
             # Compute the codes of the cells that contain the points. Points on the upper edge of the original element,
             # where a local coordinate is 1, belong to the last cell.
@@ -160,11 +162,12 @@ class RefinedTemplate(Template):
             last_cell = np.rint(2.0 / cell_size).astype(np.intp) - 1
             point_codes = self._cell_codes(element, np.clip(point_cells, 0, last_cell))
 
-            # Find equal codes. The index of a code that is larger than all candidates is limited to the last candidate.
-            insertion_index = np.searchsorted(candidate_codes, point_codes)
-            nearest_candidate = np.minimum(insertion_index, candidates.size - 1)
-            is_match = candidate_codes[nearest_candidate] == point_codes
-            split_element[is_match] = candidates[nearest_candidate[is_match]]
+            # For each point, find the first candidate whose code is not smaller than the code of the point. If there is
+            # no such candidate, the last candidate is used. The candidate contains the point if the codes are equal.
+            first_not_smaller = np.searchsorted(candidate_codes, point_codes)
+            candidate_index = np.minimum(first_not_smaller, candidates.size - 1)
+            is_match = candidate_codes[candidate_index] == point_codes
+            split_element[is_match] = candidates[candidate_index[is_match]]
 
         # Convert the positions into local coordinates of the split elements, from -1 to 1.
         low = self.low[split_element].T
@@ -222,11 +225,12 @@ class RefinedTemplate(Template):
     def _hanging_node_matrix(self, points: Complexes) -> csr_array:
         """Compute the matrix that converts the values at the regular nodes into the values at all nodes.
 
-        All nodes except the hanging nodes are called regular nodes.
+        A hanging node is a node of a small element that lies on the side of a larger element without being a node of
+        the larger element. The polynomial of the larger element determines the value at the hanging node. All other
+        nodes are called regular nodes.
 
         Args:
-            points: Film points x + iy of the nodes of all elements under the sample press, shape
-                (n_element * n_local,).
+            points: Film points x + iy of the nodes of all elements, shape (n_element * n_local,).
 
         Returns:
             Matrix, shape (n_node, n_node). The columns of hanging nodes are zero.
@@ -254,13 +258,13 @@ class RefinedTemplate(Template):
     def _hanging_node_sources(self, points: Complexes) -> dict[int, _HangingNodeSource]:
         """Find the hanging nodes, and the nodes that determine the values at the hanging nodes.
 
-        A side of a large element may be adjacent to 2, 4, 8 or more smaller elements. For each possible number of
-        smaller elements, the method computes the positions on the side at which the smaller elements would have nodes.
-        A node at such a position is a hanging node, unless the node belongs to the large element.
+        A hanging node is a node of a small element that lies on the side of a larger element without being a node of
+        the larger element. A side of a large element may be adjacent to 2, 4, 8 or more smaller elements. For each
+        possible number of smaller elements, the method computes the positions on the side at which the smaller elements
+        would have nodes. A node at such a position is a hanging node, unless the node belongs to the large element.
 
         Args:
-            points: Film points x + iy of the nodes of all elements under the sample press, shape
-                (n_element * n_local,).
+            points: Film points x + iy of the nodes of all elements, shape (n_element * n_local,).
 
         Returns:
             Dictionary with the number of each hanging node as key, and the nodes that determine its value.
@@ -272,13 +276,14 @@ class RefinedTemplate(Template):
         local_index = np.arange((order + 1) ** 2).reshape(order + 1, -1)  # one row for each eta, one column for each xi
         sides = np.stack([local_index[0], local_index[-1], local_index[:, 0], local_index[:, -1]])
 
-        # Nodes on the sides of all elements that may be adjacent to smaller elements
+        # Nodes on the sides of all elements that may be adjacent to smaller elements. Elements
+        # both of whose sides have the smallest length are omitted.
         large_elements = np.flatnonzero(self.size.max(axis=1) > self.size.min())
         nodes_on_sides = self.nodes[large_elements][:, sides]  # shape (n_large, 4, order + 1)
         points_on_sides = points.reshape(self.nodes.shape)[large_elements][:, sides]
 
-        node_tree = _tree(points[self.first_occurrence])
-        max_halvings = round(np.log2(self.size.max() / self.size.min()))
+        node_tree = _tree(points[self.first_occurrence])  # finds the node at a film point
+        max_halvings = round(np.log2(self.size.max() / self.size.min()))  # of a side of the largest element
         sources: dict[int, _HangingNodeSource] = {}
         for halvings in range(1, max_halvings + 1):
             # Compute the film points at which smaller elements would have nodes, if the side is divided into equal
@@ -336,16 +341,22 @@ def refine(mesh: PlacedMesh, lines: Complexes, max_side: float) -> PlacedMesh:
     Returns:
         The mesh with split elements.
     """
+    # Describe each element by the original element that contains it (`parent`), and by its lower left corner (`low`)
+    # and its side lengths (`size`) in the local coordinates of the original element, which range from -1 to 1. At
+    # first, each element is an original element.
     base = mesh.template
     parent = np.arange(base.n_element)
     low = np.full((base.n_element, 2), -1.0)
     size = np.full((base.n_element, 2), 2.0)
     line_tree = _tree(lines)
     for _ in range(MAX_SPLITS):
+        # Compute the lengths of the sides of each element on the film.
         corners, middle = _corners_and_middle(mesh, parent, low, size)
         side_length = np.abs(np.roll(corners, -1, axis=1) - corners)  # along xi, eta, xi and eta, shape (n_element, 4)
         length = np.maximum(side_length[:, :2], side_length[:, 2:])  # along xi and along eta, shape (n_element, 2)
         longest_side = length.max(axis=1)
+
+        # Select the elements to be split, and the directions in which they are halved, shape (n_element, 2).
         distance, _ = line_tree.query(np.stack([middle.real, middle.imag], axis=1))
         is_too_large = (longest_side > max_side) & (distance < GRADING * longest_side)
         is_split = is_too_large[:, None] & (length > MIN_SIDE_RATIO * longest_side[:, None])

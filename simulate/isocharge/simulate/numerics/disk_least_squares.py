@@ -195,26 +195,17 @@ def _restrict_to_edges(
     Returns:
         Modified matrices, shape (..., 3, 3), and modified gradients, shape (..., 3).
     """
-    # Unit vectors at each point: normal and tangent of the circle, and normal of the end of the interval
-    radius = np.hypot(point[..., 0], point[..., 1])
-    nonzero_radius = np.maximum(radius, EDGE_TOLERANCE)  # avoids a division by zero at the centre
-    circle_normal = np.zeros_like(point)
-    circle_normal[..., :2] = point[..., :2] / nonzero_radius[..., None]
-    circle_tangent = np.zeros_like(point)
-    circle_tangent[..., 0] = -circle_normal[..., 1]
-    circle_tangent[..., 1] = circle_normal[..., 0]
-    end_normal = np.zeros_like(point)
-    end_normal[..., 2] = np.sign(point[..., 2])
+    circle_normal, circle_tangent, end_normal = _edge_vectors(point)
 
-    # An edge is active if the negative gradient has an outward component. This component is the Lagrange multiplier of
-    # the edge. The multiplier of an inactive edge is zero.
+    # An edge is active if the negative gradient at a point on this edge has an outward component. This component is the
+    # Lagrange multiplier of the edge. The multiplier of an inactive edge is zero.
     circle_outward = -(gradient * circle_normal).sum(axis=-1)
     end_outward = -(gradient * end_normal).sum(axis=-1)
     circle_multiplier = np.where(is_on_circle, np.maximum(circle_outward, 0.0), 0.0)
     end_multiplier = np.where(is_at_end, np.maximum(end_outward, 0.0), 0.0)
 
-    # The curvature of the circle adds a second derivative along the tangent. The stiffness across an active edge
-    # prevents a movement away from this edge.
+    # Modify the matrices. The curvature of the circle adds a second derivative along the tangent. A large stiffness in
+    # the direction of the normal keeps the step on an active edge.
     curvature = _outer_product(circle_tangent, circle_multiplier)
     stiffness = EDGE_STIFFNESS * trace
     circle_stiffness = _outer_product(circle_normal, np.where(circle_multiplier > 0.0, stiffness, 0.0))
@@ -225,6 +216,31 @@ def _restrict_to_edges(
     circle_component = circle_multiplier[..., None] * circle_normal
     end_component = end_multiplier[..., None] * end_normal
     return new_matrix, gradient + circle_component + end_component
+
+
+def _edge_vectors(point: Array) -> tuple[Array, Array, Array]:
+    """Return unit vectors that describe the directions of the edges of the domain D at given points.
+
+    The first two coordinates of D are bounded by the unit circle. The third coordinate is bounded by both ends of the
+    interval [-1, 1].
+
+    Args:
+        point: Points of D, shape (..., 3).
+
+    Returns:
+        Outward normal of the circle, tangent of the circle, and outward normal of the nearest end of the interval, each
+        of shape (..., 3).
+    """
+    radius = np.hypot(point[..., 0], point[..., 1])
+    nonzero_radius = np.maximum(radius, EDGE_TOLERANCE)  # avoids a division by zero at the centre
+    circle_normal = np.zeros_like(point)
+    circle_normal[..., :2] = point[..., :2] / nonzero_radius[..., None]
+    circle_tangent = np.zeros_like(point)
+    circle_tangent[..., 0] = -circle_normal[..., 1]
+    circle_tangent[..., 1] = circle_normal[..., 0]
+    end_normal = np.zeros_like(point)
+    end_normal[..., 2] = np.sign(point[..., 2])
+    return circle_normal, circle_tangent, end_normal
 
 
 def _outer_product(vector: Array, factor: Array) -> Array:

@@ -141,10 +141,15 @@ class FilmParameter:
     def to_physical_value(self, described: float, parameter: float, factor: float) -> float:
         """Convert the value of the parameter into a physical value, according to `form`.
 
+        The parameter describes how a film differs from the film in the sensor file (the described film). If the form is
+        "logarithm", the parameter is the logarithm of the ratio of both physical values. If the form is "difference",
+        the parameter is their difference. If the form is "value", the parameter is the physical value itself.
+
         Args:
             described: Physical value of the described film.
             parameter: Value of the parameter.
-            factor: Exponential of `parameter`, which the caller computes for all parameters at once.
+            factor: Exponential of `parameter`, which the caller computes for all parameters at once. It is used only if
+                the form is "logarithm".
 
         Returns:
             The physical value, in the unit of `described`.
@@ -374,17 +379,19 @@ class FilmPrior:
     def film(self, parameters: Array) -> tuple[Sensor, Circle]:
         """Return the sensor and the probe that a parameter vector describes.
 
+        They are copies of the sensor and the probe of this prior distribution, in which some attributes are changed.
+
         Args:
             parameters: Parameters, shape (n_parameter,).
 
         Returns:
-            The described sensor and the described probe, with the changes that the parameters state.
+            The changed sensor and the changed probe.
 
         Raises:
             SensorError: If no such sensor can exist, for example because an electrode lies over the rim.
         """
-        # Collect the changed attributes of each component. If an attribute is a tuple or a mapping, collect its changed
-        # items by index or key.
+        # Collect the changed attributes of each component (film, piezo, calibration and probe). An attribute that is a
+        # tuple or a mapping, such as the gains, has several parameters. Collect its changed items by index or key.
         changes: dict[str, dict[str, Any]] = {component: {} for component in self._components}
         factors = np.exp(parameters)
         for declaration, described, parameter, factor in zip(

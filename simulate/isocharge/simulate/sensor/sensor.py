@@ -362,17 +362,19 @@ class Sensor:
         if self.coating == 0.0:
             return self.film
 
-        # The first area is covered by metal on the front or on the back, which `more` contains together. The second
-        # area is covered by metal on both sides: it is the collecting area of electrodes with metal on the back.
+        # The first area has metal on the front or on the back. To compute it, treat the metal on the back as further
+        # metal on the front (`more`).
         electrodes_of_all_metal = [
             replace(electrode, more=(*electrode.more, *electrode.back), back=(), square=False)
             for electrode in self.electrodes
         ]
+        areas = [self._placed_parts(electrodes_of_all_metal)]
+
+        # The second area has metal on both sides. It is the collecting area of the electrodes with metal on the back.
         electrodes_with_back = [electrode for electrode in self.electrodes if electrode.back]
-        layers = [self._placed_parts(electrodes_of_all_metal)]
         if electrodes_with_back:
-            layers.append(self._placed_parts(electrodes_with_back))
-        return replace(self.film, coat=Coat(self.coating, tuple(layers)))
+            areas.append(self._placed_parts(electrodes_with_back))
+        return replace(self.film, coat=Coat(self.coating, tuple(areas)))
 
     def _placed_parts(self, electrodes: list[Electrode]) -> tuple[Corners, ...]:
         """Return the corners (x, y) of all parts of electrodes at their calibrated positions, mm.

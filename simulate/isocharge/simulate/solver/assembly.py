@@ -38,6 +38,9 @@ class Assembly:
     def __init__(self, mesh: Template, components: int, odd: bool = False) -> None:
         """Number the unknowns, and compute the sparsity pattern of the skeleton matrix.
 
+        The skeleton consists of the unknowns on the sides of the elements. The unknowns in the interior of an element
+        are eliminated before the system is solved, so the matrix of the system contains only the skeleton unknowns.
+
         Args:
             mesh: Template of the mesh.
             components: Number of unknowns per node.
@@ -62,7 +65,7 @@ class Assembly:
         self.inner_global = unknown[:, self._inner]
         self.outer_global = unknown[:, self._outer]
 
-        # The skeleton consists of the free unknowns on sides. All other unknowns have the skeleton number -1.
+        # Number the skeleton unknowns, which are the free unknowns on sides. All other unknowns have the number -1.
         is_in_skeleton = np.zeros(self.free.size, dtype=bool)
         is_in_skeleton[self.outer_global.ravel()] = True
         self.skeleton = np.flatnonzero(is_in_skeleton & self.free.ravel())
@@ -87,14 +90,16 @@ class Assembly:
         return skeleton_constraint[:, is_regular].tocsc()
 
     def _set_pattern(self, skeleton_numbers: Integers) -> None:
-        """Compute the sparsity pattern of the skeleton matrix, and the position of each element entry in its data.
+        """Determine which entries of the skeleton matrix may be nonzero, and where the element matrices are added.
 
-        The data of a sparse matrix are the entries of its pattern, ordered column by column (compressed sparse column
-        format). Entries in the rows or columns of fixed unknowns get the position after the last entry of the pattern.
+        The skeleton matrix is the matrix of the unknowns on the sides of the elements. It is the sum of the matrices of
+        all elements. Only its nonzero entries are stored, in an array that is ordered column by column (compressed
+        sparse column format). The method stores the position of each entry of each element matrix in this array.
+        Entries that belong to a fixed unknown get the position after the last nonzero entry.
 
         Args:
-            skeleton_numbers: Number of each outer unknown in the skeleton, shape (n_element, n_outer). Fixed unknowns
-                have the number -1.
+            skeleton_numbers: Row of the skeleton matrix for each unknown on the sides of each element, shape
+                (n_element, n_outer). Fixed unknowns have the number -1.
         """
         # Row and column of each entry of the element matrices in the skeleton matrix
         n_element, n_outer = skeleton_numbers.shape
@@ -113,16 +118,18 @@ class Assembly:
         positions[is_free] = pattern_position
         self._entry_positions = positions.ravel()
 
-        # Compute the row of each entry of the pattern, and the position of the first entry of each column.
+        # Compute the row of each nonzero entry, and the position of the first nonzero entry of each column. Both arrays
+        # are part of the compressed sparse column format.
         self._indices = (codes % size).astype(np.int32)
         entries_per_column = np.bincount(codes // size, minlength=size)
         self._indptr = np.concatenate([[0], np.cumsum(entries_per_column)]).astype(np.int32)
 
     def _reorder(self) -> None:
-        """Renumber the skeleton unknowns by the minimum-degree method, so that the factorisation has little fill-in.
+        """Renumber the skeleton unknowns by the minimum-degree method, so that the factors have few nonzero entries.
 
-        If there are hanging nodes, only the columns of the matrix `constraint` are renumbered, because the factorised
-        matrix does not contain the unknowns of hanging nodes.
+        The skeleton unknowns are the unknowns on the sides of the elements. If the mesh has hanging nodes, the
+        factorised matrix is C' A C, where A is the skeleton matrix and C is the matrix `constraint`. In this case it is
+        sufficient to reorder the columns of C.
         """
         # SuperLU returns its column order only after a factorisation. The factorised matrix has the pattern of the
         # skeleton matrix and a dominant diagonal, because such a matrix needs no pivoting.
@@ -133,13 +140,16 @@ class Assembly:
             self.constraint = self.constraint[:, order]
             return
 
-        # Permute a matrix whose entries are their own positions, and read the new position of each entry from it. The
-        # last position, which is for fixed unknowns, does not change.
+        # The renumbering moves each stored entry of the matrix to a new position. To find the new positions, set each
+        # entry to its old position, permute the matrix, and invert the resulting list of old positions.
         pattern.data = np.arange(pattern.nnz)
         permuted_pattern = pattern[:, order][order]
         permuted_pattern.sort_indices()
+        old_position = permuted_pattern.data
+
+        # Entries of fixed unknowns keep their position after the last stored entry.
         position_of_fixed = permuted_pattern.nnz
-        new_position = np.append(np.argsort(permuted_pattern.data), position_of_fixed)
+        new_position = np.append(np.argsort(old_position), position_of_fixed)
         self._entry_positions = new_position[self._entry_positions]
         self._indices = permuted_pattern.indices
         self._indptr = permuted_pattern.indptr

@@ -322,11 +322,11 @@ def place_coated(
 
 
 def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None) -> float:
-    """Choose the total width of the thin rings at the rim.
+    """Choose the total width of the thin rings of elements at the rim.
 
-    The default width is `LAYER_WIDTH` bending lengths. The width of the thin rings of the starting mesh is used instead
-    if both widths are similar and both meshes may have the same elements. With equal widths, the field of the starting
-    equilibrium can be the first iterate of the solve.
+    The default width is `LAYER_WIDTH` bending lengths. If the solve starts from an equilibrium on another mesh, the
+    width of the thin rings of that mesh may be used instead. The reason is that the solve can then start from the field
+    of the equilibrium. Both widths must be similar, and both meshes may have the same elements.
 
     Args:
         film: The film.
@@ -338,15 +338,15 @@ def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSetting
     Returns:
         Width of the thin rings, in film radii.
     """
-    layer = layer_for(film, force)
+    default_width = layer_for(film, force)
     if start is None:
-        return layer
-    has_similar_width = MIN_LAYER_REUSE < start.layer / layer < MAX_LAYER_REUSE
+        return default_width
+    has_similar_width = MIN_LAYER_REUSE < start.layer / default_width < MAX_LAYER_REUSE
     may_have_same_resolution = settings.resolution in ("auto", start.resolution)
     has_same_topology = probe.topology == start.template.topology
     if has_similar_width and may_have_same_resolution and has_same_topology:
         return start.layer
-    return layer
+    return default_width
 
 
 def choose_mesh(case: LoadCase) -> PlacedMesh:
@@ -403,9 +403,10 @@ def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
 def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     """Generate the resolutions that are tried for a press, from coarse to fine.
 
-    A small probe needs more rings. A press close to the rim needs more rings and more elements around the innermost
-    circle, because the conformal map stretches the template. For presses in the inner half of the film, the first
-    resolution is sufficient.
+    The mesh is created in a unit disk, which a conformal map maps onto the film. A circle in the disk encloses the
+    footprint, and rings of elements lie between this circle and the rim. A small probe needs more rings. A press close
+    to the rim needs more rings and more elements around the circle, because the conformal map stretches the mesh. For
+    presses in the inner half of the film, the first resolution is sufficient.
 
     Args:
         case: The press and the required accuracy.
@@ -422,10 +423,11 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     enclosing_extent = probe.farthest_distance(case.at) + CLEARANCE * probe.reach
     is_crowded = not probe.topology.fills_circle and enclosing_extent > film.radius
 
-    # A better accuracy requires a higher order. A small radius `rho` of the innermost circle and the stretch of the
-    # conformal map require more rings. The factors are empirical.
+    # A better accuracy than the default `ACCURACY` requires a higher polynomial order. The factors are empirical.
     extra_order = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.accuracy)))
     first_order = 5 if case.theory.bending and film.coat is None else 4
+
+    # A small radius `rho` of the circle and the stretch of the conformal map require more rings (empirical factors).
     rings_for_stretch = min(2.0 * math.log(_stretch(placement)), 4.0)
     rings = math.ceil(-1.3 * math.log(float(placement.rho)) + rings_for_stretch)
     first_resolution = Resolution(
@@ -443,17 +445,18 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
 def _thin_ring_count(placement: Placement, layer: float) -> int:
     """Compute the number of thin rings at the rim.
 
-    Each thin ring is a third as wide as the previous thin ring. In the template plane, the boundary layer of bending is
-    widest next to the probe. The boundary layer is narrowest on the opposite side of the film, where the conformal map
-    compresses it. The widths of the thin rings cover the range between the largest and the smallest width of the
-    boundary layer.
+    At the clamped rim, the film bends within a narrow strip, the boundary layer. The mesh is created in a unit disk,
+    the template plane, and a conformal map maps the disk onto the film. Therefore the strip does not have the same
+    width everywhere in the template plane: it is widest next to the probe, and narrowest on the opposite side of the
+    film. Each thin ring is a third as wide as the previous thin ring. The widths of the thin rings cover the range from
+    the largest to the smallest width of the strip.
 
     Args:
         placement: Placement of the mesh under the press.
         layer: Total width of the thin rings on the film, in film radii.
     """
-    # Widths of the boundary layer in the template plane, divided by the depth of all rings in ln r. The limit of 1 / 8
-    # restricts the thin rings to the neighbourhood of the rim.
+    # Largest and smallest width of the boundary layer in the template plane, as a fraction of the range of ln(r) that
+    # all rings cover. The upper limit of 1 / 8 keeps the thin rings near the rim.
     stretch = _stretch(placement)
     total_depth = -float(np.log(placement.rho))
     largest_width = min(layer * stretch / total_depth, 1.0 / 8.0)

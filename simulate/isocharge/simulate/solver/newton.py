@@ -185,10 +185,11 @@ def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
 def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
     """Compute the transverse residual without the transverse forces that the induced stress causes.
 
-    Without in-plane displacement, the transverse forces of the induced stress are cubic functions of the deflection.
-    All other transverse forces are linear functions of the deflection. If the deflection is multiplied by a factor a,
-    the residual therefore differs from that of the flat film by r(a) = k a + c a^3. The linear part is k = (8 r(a)
-    - r(2 a)) / (6 a), which follows from the differences for the factors a and 2 a.
+    The deflection induces a stress, and this stress causes transverse forces. Without in-plane displacement, these
+    forces are proportional to the third power of the deflection. All other transverse forces are linear functions of
+    the deflection. The two kinds of forces are separated as follows. If the field is multiplied by a small factor a,
+    the residual changes by r(a) = k a + c a^3 relative to the flat film. The changes for the factors a and 2 a
+    determine the linear coefficient k = (8 r(a) - r(2 a)) / (6 a).
 
     Args:
         elastic: Discrete model of the film.
@@ -197,10 +198,10 @@ def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
     Returns:
         Residual, shape (n_node, 3). Only the last column is meaningful.
     """
-    factor = 0.01  # every small factor results in the same linear part
+    factor = 0.01  # every small factor a results in the same coefficient k
     flat_residual = elastic.residual(np.zeros_like(field))
-    single_change = elastic.residual(factor * field) - flat_residual
-    double_change = elastic.residual(2.0 * factor * field) - flat_residual
+    single_change = elastic.residual(factor * field) - flat_residual  # r(a)
+    double_change = elastic.residual(2.0 * factor * field) - flat_residual  # r(2 a)
     return flat_residual + (8.0 * single_change - double_change) / (6.0 * factor)
 
 

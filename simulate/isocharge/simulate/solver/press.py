@@ -132,9 +132,11 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
     """Solve a press on meshes of increasing order until the charges on two meshes agree.
 
     The charges agree if their relative difference is at most half of the required accuracy. The order is increased at
-    most `MAX_EXTRA_ORDERS` times. If no equilibrium is found on the first or the second mesh, the status of the result
-    is "failed". If no equilibrium is found on a later mesh, the result is the equilibrium on the previous mesh. If the
-    charges on the last two meshes differ by more than `DIFFERENT_EQUILIBRIUM`, the status is "failed", too.
+    most `MAX_EXTRA_ORDERS` times.
+
+    The status of the result is "failed" in two cases: if no equilibrium is found on the first or the second mesh, or if
+    the charges on the last two meshes differ by more than `DIFFERENT_EQUILIBRIUM`. If no equilibrium is found on a
+    later mesh, the result is the equilibrium on the previous mesh.
 
     Args:
         case: The press and the required accuracy.
@@ -161,6 +163,7 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
         if error <= 0.5 * case.accuracy:
             break
 
+    # If the charges differ very much, the two meshes have different equilibria.
     if solved.proven_error is not None and solved.proven_error > DIFFERENT_EQUILIBRIUM:
         order = solved.mesh.resolution.order
         return replace(

@@ -129,7 +129,9 @@ def fit_command(
     notations = probe or [DEFAULT_PROBE]
     options = ReleaseOptions(output, version, fresh=fresh, json=json)
 
-    # With --films: a network for all films.
+    # There are five cases, which depend on the given options and files.
+
+    # Case 1, --films: train a network for all films.
     if films:
         film_prior = _film_prior(dataset, sensor, notations, radius, config)
         _release_films_model(film_prior, FilmsConfig(radius=parse_radius_mm(radius)), options)
@@ -141,28 +143,30 @@ def fit_command(
         options.check_version_folder(load_sensor(sensor).electrode_names)
     fit_config = load_config(config) if config else FitConfig()
 
-    # Measured presses of a sensor without a description: a network that is trained on the presses alone.
+    # Case 2, a file of measured presses without --sensor: train a network on the presses alone.
     if press_file is not None and sensor is None:
         presses = _read_presses_of_unknown_sensor(press_file, radius, position_std_mm, force_std)
         pressing_probes = tuple(probe or ["unknown"])
         _release_presses_model(presses, pressing_probes, fit_config, options)
         return
 
-    # The path may also be a pipe, or a file that does not exist, which `_read_rig` refuses.
+    # A path that is no folder is a regular file, a pipe, or missing. `_read_rig` refuses a missing file.
     measured_file = dataset if dataset is not None and not dataset.is_dir() else None
     if measured_file is not None:
-        # Measured presses of a described sensor: the presses calibrate the film if a network for all films exists.
         rig = _read_rig(measured_file, sensor, notations, radius, position_std_mm, force_std)
-        problem = calibration_problem(rig, models)
+        problem = calibration_problem(rig, models)  # None without a network for all films of this sensor
+
+        # Case 3, measured presses with --sensor and a network for all films: calibrate the film.
         if problem is not None:
             refuse_training_options(config, version, radius)
             calibrate_into(rig.presses, problem, output, json=json)
             return
-        # Otherwise a network is trained on simulated charges that the presses correct.
+
+        # Case 4, the same without such a network: train a network on simulated charges that the presses correct.
         with shown_progress():
             data = rig_data(rig, seed=fit_config.training.seed)
     else:
-        # A network is trained on a dataset, or on presses that are simulated here.
+        # Case 5, a dataset folder or --sensor alone: train a network on the dataset, or on presses simulated here.
         with shown_progress():
             data = _read_or_simulate_data(dataset, sensor, notations, radius)
     _release_data_model(data, fit_config, options)

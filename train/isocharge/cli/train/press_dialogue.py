@@ -191,17 +191,20 @@ class Dialogue:
     def _guide_press(self, *, asks: bool) -> None:
         """Propose a press, and wait until it has been recorded or until another press must be proposed.
 
+        When the charges of a press are steady, the person is asked where the press was made. The answer records or
+        discards the press. The person can also type a command at any time.
+
         Args:
             asks: Whether to ask where a steady press was made. If not, the press counts as made at the proposed place
                 with the proposed force.
         """
         proposed = self._session.proposed
-        steady_press: SteadyPress | None = None  # the press about which a question is open
+        steady_press: SteadyPress | None = None  # the press about which a question is open; None without a question
         self._screen.say(f"{len(self._session) + 1}. Press {describe_press(proposed.contact)} and hold.")
         self._events.arm()  # only presses from now on count
 
-        # If an earlier press is undone, the proposal changes, which ends the loop. If a question about a steady press
-        # is open, the loop continues until the question is answered.
+        # A command that removes an earlier press changes the proposal of the session. The loop then ends, so that the
+        # new proposal is shown, but not before an open question has been answered.
         while steady_press is not None or self._session.proposed is proposed:
             event = self._events.next()
             if isinstance(event, str):  # a typed line: an answer or a command
@@ -243,8 +246,8 @@ class Dialogue:
     def _act_on(self, answer: Answer, press: SteadyPress | None, proposed: Array) -> bool:
         """Carry out the command of an answer: quit, skip the proposal, record the steady press, or remove a press.
 
-        A press can only be recorded if it is steady. While a press is steady, the command to remove the last press
-        discards the steady press.
+        A press can only be recorded while a question about it is open. The command to remove the last press discards
+        this press or, if no question is open, removes the last recorded press.
 
         Args:
             answer: The command, which was read from the typed line.
@@ -269,14 +272,15 @@ class Dialogue:
             contact = proposed if isinstance(answer.contact, str) else answer.contact  # the text means "as proposed"
             return self._take(press, contact)
 
-        # The remaining command is "undo". It removes the steady press that is not taken yet, or an earlier press.
+        # The remaining command is "undo". Discard the steady press, which is not recorded yet, or remove a recorded
+        # press.
         if answer.number == "last" and press is not None:
             self._screen.say("   this press is not taken")
             return True
         removed_number = self._session.undo(answer.number)
         self._screen.say(f"   press {removed_number} is removed")
         self._say_summary()
-        return False  # a question about a steady press remains open; otherwise the proposed press may have changed
+        return False  # an open question remains open; without one, the caller compares the proposal with the new one
 
     def _take(self, press: SteadyPress, contact: Array) -> bool:
         """Record a press in the session, and return whether the session accepts it.

@@ -219,12 +219,14 @@ class ComparedMethod:
 def describe_parameter(name: str, value: object) -> str:
     """Return a text that describes a parameter of a pipeline.
 
-    A mapping of factors is described by its entries, without the name of the parameter. A number is described by the
-    last part of the name and the value.
+    A pipeline of scikit-learn has several steps, and its parameters have names of the form "step__parameter". The text
+    for a number is the last part of the name and the number. The text for a mapping contains only the entries of the
+    mapping.
 
     Args:
-        name: Name of the parameter, after the names of the steps: "step__parameter".
-        value: Value of the parameter. A mapping contains the factor of each axis, by the name of the axis.
+        name: Name of the parameter.
+        value: Value of the parameter. A mapping contains factors by which axes of the data are scaled, by the name of
+            the axis.
 
     Example:
         >>> describe_parameter("regressor__scales__kw_args", {"force": 0.1, "rest": 0.03})
@@ -315,35 +317,34 @@ def compared_methods(task: FittingTask, charge_map: ChargeMap | None = None) -> 
 def polynomial_ridge(task: FittingTask) -> ComparedMethod:
     """Return ridge regression on monomials of the logarithms of the charges.
 
-    All monomials up to a certain degree are used. The candidates for the degree are the two largest of
-    `POLYNOMIAL_DEGREES` with at most `MAX_MONOMIALS` monomials. There are also two candidates for the penalty on the
-    coefficients.
+    All monomials up to a certain degree are used. Up to two degrees and two penalties on the coefficients are
+    compared. The degrees are the two largest of `POLYNOMIAL_DEGREES` with at most `MAX_MONOMIALS` monomials.
 
     Args:
         task: Presses for the fit.
     """
-    # A polynomial of n variables up to the degree d has "n + d choose d" monomials.
+    # Choose the degrees. A polynomial of n variables up to the degree d has "n + d choose d" monomials.
     n_electrode = task.train.charge.shape[1]
     allowed_degrees = [
         degree
         for degree in range(1, max(POLYNOMIAL_DEGREES) + 1)
         if comb(n_electrode + degree, degree) <= MAX_MONOMIALS
     ]
-    allowed_candidates = [degree for degree in POLYNOMIAL_DEGREES if degree in allowed_degrees]
-    degrees = allowed_candidates[-2:]
-    if not degrees:  # with many electrodes, even the smallest of `POLYNOMIAL_DEGREES` has too many monomials
-        degrees = [max(allowed_degrees)]
+    compared_degrees = [degree for degree in POLYNOMIAL_DEGREES if degree in allowed_degrees][-2:]
+    if not compared_degrees:  # with many electrodes, even the smallest of `POLYNOMIAL_DEGREES` has too many monomials
+        compared_degrees = [max(allowed_degrees)]
 
     # The logarithms are scaled to [-1, 1] and clipped to the range of the training presses, because a polynomial of
     # high degree grows fast beyond it.
     scaler = MinMaxScaler((-1.0, 1.0), clip=True)
     regressor = on_logarithms(task.domain, box=scaler, monomials=PolynomialFeatures(), ridge=Ridge(solver="cholesky"))
 
-    # The penalty is proportional to the number of presses in all noisy copies, as the sum of the squared errors is.
+    # The fit uses several copies of the presses with different noise. The penalty is proportional to the number of
+    # presses in all copies, as the sum of the squared errors is.
     copies = 5
     penalties = [penalty_per_press * copies * len(task.train) for penalty_per_press in (1e-11, 1e-8)]
     candidates: dict[str, Sequence[Any]] = {
-        "regressor__monomials__degree": degrees,
+        "regressor__monomials__degree": compared_degrees,
         "regressor__ridge__alpha": penalties,
     }
     return ComparedMethod(

@@ -253,18 +253,23 @@ class Posterior:
 
     @cached_property
     def _roots(self) -> _RootCells:
-        """Undivided cells of a press, with properties of the charges in these cells."""
+        """Undivided cells of a press, with the charges at their centres and the largest slopes of the charges in them.
+
+        Each charge is a sum of terms, which depend on the position and are weighted by functions of the force.
+        """
         cells = Cells.roots(self.radius)
+
         # The slopes are computed at 3 x 3 points of each cell: at its centre, its corners and the centres of its sides.
+        # Points outside the disk are moved to its edge.
         n_point = 9
         points = cells.centre[:, None] + _grid(3, 0.5 * cells.side)  # shape (n_cell, n_point, 2)
         gradients = self.charges.scaled_gradients(onto_disk(points.reshape(-1, 2), self.radius))
 
-        # The gradients have the shape (n_cell * n_point, n_term, n_electrode, 2). The largest slope is determined first
-        # among the terms of each point, and then among the points of each cell.
+        # A slope is the length of a gradient, shape (n_cell * n_point, n_term, n_electrode). The largest slope is
+        # determined first among the terms of each point, and then among the points of each cell.
         slope = np.linalg.norm(gradients, axis=-1)
-        point_slope = slope.max(axis=1)
-        largest_slope = point_slope.reshape(len(cells), n_point, -1).max(axis=1)
+        largest_slope_of_point = slope.max(axis=1)
+        largest_slope = largest_slope_of_point.reshape(len(cells), n_point, -1).max(axis=1)  # (n_cell, n_electrode)
         return _RootCells(cells, self._terms(cells), largest_slope)
 
     def _terms(self, cells: Cells) -> Array:
@@ -308,8 +313,9 @@ class Posterior:
     def _integration_cells(self, charge: Array) -> Iterator[Cells]:
         """Yield cells that cover the posterior of each press and are small compared with its width.
 
-        In each round, all cells have the same side, and a cell is dropped if no contact in it can explain the charges
-        of its press. If the remaining cells of a press are small enough, they are yielded. Otherwise, each remaining
+        In each round, all cells have the same side. The deviation chi-squared of the charges of a press is computed at
+        the centres of its cells. A cell is possible if chi-squared may be small at some contact in it. If the possible
+        cells of a press are small enough, the cells of this press are finished and yielded. Otherwise, each possible
         cell is divided into four cells for the next round.
 
         Args:
@@ -322,18 +328,22 @@ class Posterior:
         cells = Cells(press, root, roots.cells.centre[root], roots.cells.side)
         terms = roots.terms[root]
         for division in range(MAX_DIVISIONS + 1):
+            # Chi-squared at the centre of each cell, for the force that fits best there, and how much larger it is than
+            # the smallest value among the cells of the same press
             cell_charge = charge[cells.press]
             log_force = self._profile.best_log_force(terms, cell_charge, self.noise)
             chi2, slope = self._chi2_and_slope(terms, log_force, cell_charge, roots.largest_slope[cells.root])
             smallest_chi2 = np.full(n_press, np.inf)
-            np.minimum.at(smallest_chi2, cells.press, chi2)  # the smallest value among the cells of each press
+            np.minimum.at(smallest_chi2, cells.press, chi2)  # minimum by press, shape (n_press,)
             excess_chi2 = chi2 - smallest_chi2[cells.press]
 
-            # A lower bound of chi-squared in the whole cell: no position is farther from the centre than the corners.
+            # Lower bound of chi-squared in the whole cell: between the centre and any position in the cell, the root of
+            # chi-squared decreases by at most the half diagonal times the largest slope of the root.
             half_diagonal = np.sqrt(0.5) * cells.side
             lower_bound = np.maximum(np.sqrt(chi2) - half_diagonal * slope, 0.0) ** 2
             possible = np.flatnonzero(lower_bound - smallest_chi2[cells.press] <= NEGLIGIBLE_CHI2)
 
+            # Yield the cells of the presses whose possible cells are small enough.
             press_is_fine = self._has_fine_cells(cells[possible], terms[possible], log_force[possible], n_press)
             if division == MAX_DIVISIONS:
                 press_is_fine[:] = True  # the cells are not divided again, so they are accepted as they are
@@ -391,15 +401,15 @@ class Posterior:
     ) -> tuple[Array, Array]:
         """Compute chi-squared at the centres of cells, and the largest slope of its square root in each cell.
 
-        Chi-squared is the sum over the electrodes of ((Q - q) / sigma)^2, with the charges Q, the expected charges q at
-        the centre of the cell, and their standard deviations sigma. The expected charges are sums of the terms,
-        weighted by functions of the force.
+        Chi-squared is the sum over the electrodes of ((Q - q) / sigma)^2. Here Q are the measured charges, q are the
+        expected charges at the centre of the cell, and sigma are the standard deviations of their noise. Each expected
+        charge is a sum of terms, which depend on the position and are weighted by functions of the force.
 
         Args:
             terms: Terms of the charges at the centres, shape (n, n_term, n_electrode).
             log_force: Logarithms of the best forces, shape (n,).
             charge: Charges with noise, shape (n, n_electrode), pC.
-            largest_slope: Largest slopes of the scaled charges in the cells, shape (n, n_electrode), 1/mm.
+            largest_slope: Largest slope of any term in each cell, shape (n, n_electrode), 1/mm.
 
         Returns:
             Chi-squared, shape (n,), and the largest slope of its square root, shape (n,), 1/mm.
@@ -410,18 +420,18 @@ class Posterior:
         deviation = (charge - expected) / sigma
         chi2 = (deviation**2).sum(axis=1)
 
-        # The largest slope applies to each term, so the weights of the terms are added. The square root of chi-squared
-        # is the norm of the deviations of all electrodes. Its slope is therefore at most the norm of their slopes.
+        # No term is steeper than the largest slope. The slope of an expected charge is therefore at most the largest
+        # slope times the sum of the weights. The square root of chi-squared is the norm of the deviations of all
+        # electrodes, so its slope is at most the norm of their slopes.
         deviation_slope = largest_slope * force_weights.sum(axis=1)[:, None] / sigma
         return chi2, np.linalg.norm(deviation_slope, axis=1)
 
     def _inverse_std(self, cells: Cells, terms: Array, log_force: Array) -> Array:
         """Compute the inverse of the standard deviation of the position along its most certain direction.
 
-        The force is assumed to be unknown. The derivatives of the charges are divided by the standard deviations of the
-        noise. The part of the derivatives that a change of the force can also cause is removed. The inverse of the
-        standard deviation along the most certain direction is the largest singular value of the remaining derivatives
-        with respect to the position.
+        The force is assumed to be unknown. The computation begins with the derivatives of the charges with respect to
+        the position, in units of the noise. The part of them that a change of the force can also cause is removed. The
+        largest singular value of the remaining matrix is the result.
 
         Args:
             cells: Cells at whose centres the contact is assumed.
@@ -431,8 +441,9 @@ class Posterior:
         Returns:
             Inverse standard deviations, shape (n,), 1/mm.
         """
-        # Expected charges and their derivatives with respect to x and y. Both are sums over the terms k, whose weights
-        # depend on the force, for each cell n, electrode e and coordinate i.
+        # Expected charges, shape (n, n_electrode), and their derivatives with respect to x and y, shape
+        # (n, n_electrode, 2). Both are sums over the terms k, whose weights depend on the force, for each cell n,
+        # electrode e and coordinate i.
         force_weights = self.charges.force_weights(log_force)
         gradients = self.charges.scaled_gradients(onto_disk(cells.centre, self.radius))
         expected = np.einsum("nk,nke->ne", force_weights, terms)
@@ -442,7 +453,8 @@ class Posterior:
         force_jacobian = self._profile.slope(log_force, expected)[..., None]
         jacobian = np.concatenate([position_jacobian, force_jacobian], axis=2)
         whitened_jacobian = jacobian / self.noise.sigma(expected)[..., None]
-        inverse_stds = singular_values(whitened_jacobian)  # in descending order, shape (n, 2)
+        # `singular_values` removes the part by the force. Shape (n, 2), in descending order
+        inverse_stds = singular_values(whitened_jacobian)
         return np.asarray(inverse_stds[:, 0])
 
     def _integrate_force(self, position: Array, charge: Array) -> tuple[Array, Array]:

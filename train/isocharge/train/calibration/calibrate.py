@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from isocharge.common.arrays import Booleans
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import MeasuredPresses, row_words
 from isocharge.simulate import SideForceMap
@@ -103,7 +104,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
         side_force_map = None
         if problem.friction > 0.0:
             posterior, side_force_map = _fit_with_friction(problem, data, posterior, at_C)
-        elif problem.side_force > 0.0:  # only later contacts have side forces, so the fit does not change
+        elif problem.side_force > 0.0:  # a declared side force acts only on later contacts, so the fit does not change
             side_force_map = solve_side_forces(problem.charges, posterior.parameters)
 
     # The refusal uses the residuals and stated errors of the fit. The stated errors are increased afterwards.
@@ -251,11 +252,11 @@ def _check_enough_measured(presses: MeasuredPresses, problem: CalibrationProblem
 
 
 def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> None:
-    """Raise PressError if no film explains the presses, or if only an improbable film explains them.
+    """Raise PressError if the estimate from the presses cannot be trusted, for one of three reasons.
 
-    If all presses contain a common mistake, such as a wrong unit, a possible but unusual film may explain them.
-    Therefore, PressError is also raised if the film is unusual and the correction of a common mistake makes the presses
-    agree far better with a film.
+    First, the residuals of the presses are too large, so that no film explains the presses. Second, the estimated film
+    was very improbable before the presses. Third, the film is unusual, and the correction of a common mistake in all
+    presses, such as a wrong unit, makes the presses agree far better with a film.
 
     Args:
         presses: The presses to which the film was fitted.
@@ -263,7 +264,7 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
         posterior: The estimate of the film from these presses.
     """
     chi2, degrees_of_freedom = posterior.total
-    is_unexplained = (
+    are_residuals_too_large = (
         degrees_of_freedom > 0.0
         and chi2 / degrees_of_freedom > UNEXPLAINED_CHI2
         and chi_square.probability_above(chi2, degrees_of_freedom) < UNEXPLAINED_PROBABILITY
@@ -273,16 +274,17 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
     deviation = (posterior.parameters - problem.before.parameters) / problem.prior.std
     squared_distance = float(deviation @ np.linalg.solve(problem.before.covariance, deviation))
     film_probability = chi_square.probability_above(squared_distance, deviation.size)
-    is_improbable = film_probability < STRAINED_PROBABILITY
+    is_film_improbable = film_probability < STRAINED_PROBABILITY
 
-    # Mistakes are searched for only if the film is unusual: it is imperfect or improbable, or presses were left out.
+    # Mistakes are searched for only if the estimate is unusual: the film has imperfections, presses were left out as
+    # bad, or the film is rather improbable.
     is_unusual = posterior.imperfect or posterior.bad.any() or film_probability < ODD_PROBABILITY
-    is_mistaken = is_unusual and bool(find_mistakes(presses, problem.charges))
-    if not (is_unexplained or is_improbable or is_mistaken):
+    has_common_mistake = is_unusual and bool(find_mistakes(presses, problem.charges))
+    if not (are_residuals_too_large or is_film_improbable or has_common_mistake):
         return
 
     refuse_closed_back(presses, problem.charges)  # raises a more specific error if the back is closed
-    if is_unexplained or is_improbable:
+    if are_residuals_too_large or is_film_improbable:
         # The message states the larger of two deviations: that of the presses from the film, in units of the noise,
         # and that of the film from its description, in prior standard deviations.
         mean_square_of_presses = chi2 / max(degrees_of_freedom, 1.0)
@@ -296,37 +298,49 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
 def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> FilmPosterior:
     """Increase the covariance of an estimate, because a wrong press cannot be recognised among only a few presses.
 
-    If a press was recorded wrongly, the presses are assumed to contain no information. The returned covariance is a
-    weighted mean of the covariances before and after the presses. The weight of the covariance before the presses is
-    the probability that a press was recorded wrongly.
+    If one of the used presses was recorded wrongly, the presses are assumed to contain no information. The returned
+    covariance is therefore a weighted mean of the covariances before and after the presses. The weight of the
+    covariance before the presses is the probability of such a mistake.
 
     Args:
-        posterior: The estimate after the presses.
-        before: The estimate before the presses.
+        posterior: The estimate after the presses. Its unknowns are the parameters of the film, followed by its
+            coefficients.
+        before: The estimate before the presses, which may contain only the first of these unknowns.
+    """
+    mistake_probability = _mistake_probability(posterior.bad)
+    correct_probability = 1.0 - mistake_probability
+
+    # Weighted mean of the covariances of all unknowns. Unknowns that the estimate before the presses does not contain
+    # had no variance before the presses.
+    joint_covariance = correct_probability * posterior.joint
+    unknowns_before = slice(0, len(before.unknowns))
+    joint_covariance[unknowns_before, unknowns_before] += mistake_probability * before.unknown_covariance
+    parameters = slice(0, len(before.parameters))
+    parameter_covariance = joint_covariance[parameters, parameters]
+
+    # The warming is the change of the pretension with temperature. Its covariances with the unknowns get the same
+    # weights. Without information from the presses, the warming is assumed not to be correlated with the unknowns.
+    warming = posterior.warming
+    if warming is not None:
+        warming = warming._replace(covariance=correct_probability * warming.covariance)
+    return replace(posterior, joint=joint_covariance, covariance=parameter_covariance, warming=warming)
+
+
+def _mistake_probability(is_left_out: Booleans) -> float:
+    """Return the probability that one of the used presses was recorded wrongly, although it agrees with the others.
+
+    Args:
+        is_left_out: Whether each press was left out as wrong, shape (n,).
     """
     # Presses that were left out as wrong make further mistakes likely, unless many good presses agree with each other.
     # As a rule of thumb, the probability of a mistake is the number of presses that were left out, divided by the
     # square of the number of good presses.
-    good_count = int((~posterior.bad).sum())
-    left_out_count = int(posterior.bad.sum())
-    mistake_probability = min(left_out_count / (good_count * good_count), MAX_MISTAKE_PROBABILITY)
-    if good_count <= FEW:
-        mistake_probability += MISTAKE_PROBABILITY * good_count
-    correct_probability = 1.0 - mistake_probability
-
-    # Weighted mean of the covariances. The estimate before the presses contains only the first unknowns of the
-    # posterior, and the variances of the other unknowns before the presses are zero.
-    joint = correct_probability * posterior.joint
-    prior_unknowns = slice(0, len(before.unknowns))
-    joint[prior_unknowns, prior_unknowns] += mistake_probability * before.unknown_covariance
-    parameters = slice(0, len(before.parameters))
-
-    # If a press was recorded wrongly, the warming (the change of the pretension with temperature) is assumed not to be
-    # correlated with the unknowns.
-    warming = posterior.warming
-    if warming is not None:
-        warming = warming._replace(covariance=correct_probability * warming.covariance)
-    return replace(posterior, joint=joint, covariance=joint[parameters, parameters], warming=warming)
+    good_count = int((~is_left_out).sum())
+    left_out_count = int(is_left_out.sum())
+    probability = min(left_out_count / (good_count * good_count), MAX_MISTAKE_PROBABILITY)
+    if good_count <= FEW:  # among only a few presses, a wrong press cannot be recognised
+        probability += MISTAKE_PROBABILITY * good_count
+    return probability
 
 
 def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> Iterator[str]:

@@ -125,31 +125,29 @@ class ContactSensitivity:
         """
         domain = problem.domain
         contact = spread_contacts(domain, N_CONTACTS)
+        # Derivatives of the charges in units of the noise, with respect to (x, y, ln F) and to the unknowns of the film
         contact_slopes, film_slopes = _whitened_slopes(problem, unknowns, contact)
 
-        # Prior standard deviations of x, y and ln F. The prior of ln F is uniform, and the standard deviation of a
-        # uniform distribution is its width divided by the root of 12.
-        min_force, max_force = domain.force_range
-        log_force_range = max(np.log(max_force / min_force), MIN_LOG_FORCE_RANGE)
-        log_force_std = log_force_range / np.sqrt(12.0)
-        prior_std = np.array([0.5 * domain.radius, 0.5 * domain.radius, log_force_std])
-        # J' W J of each contact n: sums over the electrodes k, for each pair of coordinates i and j. The slopes are
-        # already in units of the noise.
+        # Covariance of each estimated contact, shape (n, 3, 3). Its inverse is the information of the charges plus that
+        # of the prior. The information of the charges is a sum over the electrodes k, for each contact n and each pair
+        # of coordinates i and j.
         charge_information = np.einsum("nki,nkj->nij", contact_slopes, contact_slopes)
-        noise_covariance = np.linalg.inv(charge_information + np.diag(prior_std**-2))
+        prior_information = np.diag(_prior_contact_std(domain) ** -2)
+        noise_covariance = np.linalg.inv(charge_information + prior_information)
 
-        # If the charges change, the estimated contact moves by the gain times this change. The whitened gain refers to
-        # changes in units of the noise, shape (n, 3, n_electrode).
-        charge = problem.charges.charges(unknowns, contact)
-        sigma = problem.noise.sigma(charge)
+        # If the charges change, the estimated contact moves by a matrix, the gain, times this change. The whitened gain
+        # is for changes in units of the noise, shape (n, 3, n_electrode).
         whitened_gain = noise_covariance @ contact_slopes.swapaxes(1, 2)
+        charge = problem.charges.charges(unknowns, contact)
+        noise_std = problem.noise.sigma(charge)
         return cls(
             contact=contact,
+            # The estimate assumes the wrong film, and moves to compensate the wrong charges: hence the minus sign.
             contact_jacobian=-(whitened_gain @ film_slopes),
             noise_covariance=noise_covariance,
             misfit_jacobian=derivatives_with_adjusted_contacts(film_slopes, contact_slopes),
-            log_charge_jacobian=film_slopes * (sigma / charge)[:, :, None],  # from units of the noise to ln Q
-            charge_gain=whitened_gain / sigma[:, None, :],
+            log_charge_jacobian=film_slopes * (noise_std / charge)[:, :, None],  # d ln Q = dQ / Q
+            charge_gain=whitened_gain / noise_std[:, None, :],  # for changes in pC
         )
 
     def contact_error(self, covariance: Array) -> ContactError:
@@ -212,6 +210,23 @@ def spread_contacts(domain: Domain, count: int) -> Array:
     return domain.to_contact(np.column_stack([position.real, position.imag, unit_log_force]))
 
 
+def _prior_contact_std(domain: Domain) -> Array:
+    """Return the prior standard deviations of the coordinates (x, y, ln F) of a contact, shape (3,).
+
+    According to the prior, contacts are distributed uniformly over the positions and the logarithms of the forces of
+    the domain.
+
+    Args:
+        domain: Range of contacts.
+    """
+    position_std = 0.5 * domain.radius  # of x and of y, in a disk
+    # The standard deviation of a uniform distribution is its width divided by the root of 12.
+    min_force, max_force = domain.force_range
+    log_force_range = max(np.log(max_force / min_force), MIN_LOG_FORCE_RANGE)
+    log_force_std = log_force_range / np.sqrt(12.0)
+    return np.array([position_std, position_std, log_force_std])
+
+
 def _whitened_slopes(problem: CalibrationProblem, unknowns: Array, contact: Array) -> tuple[Array, Array]:
     """Compute the derivatives of the charges of a film, divided by the standard deviations of the noise.
 
@@ -261,25 +276,32 @@ def _information_roots(
 ) -> Array:
     """For each press, compute a matrix R for which R' R is the Fisher information of the press about a film.
 
-    Each row of R is the derivative of one residual with respect to the unknowns of the film. The first residuals belong
-    to the charges. The last three residuals belong to the measured contact (x, y, ln F). If the unknowns change, the
-    best contact moves, and the derivatives include the effect of this movement. The arguments are those of
-    `information_of`.
+    Each row of R contains the derivatives of one residual with respect to the unknowns of the film. The first residuals
+    of a press are those of its charges. The last three residuals are those of its contact (x, y, ln F), as the rig
+    measures it. If the unknowns change, the contact that agrees best with all measurements moves. The derivatives
+    include the effect of this movement.
+
+    Args:
+        problem: The calibration problem, with the films and the noise.
+        unknowns: Unknowns of the film, as `FilmCharges.film` expects them.
+        contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
+        position_std_mm: Standard deviation of the measured positions, mm; infinite if the positions are unknown.
+        force_std: Standard deviation of the measured forces, relative to the force.
 
     Returns:
         Matrices R, shape (n, n_electrode + 3, n_unknown).
     """
-    contact_slopes, film_slopes = _whitened_slopes(problem, unknowns, contact)
+    # Derivatives of the residuals of the charges
+    charge_contact_slopes, charge_film_slopes = _whitened_slopes(problem, unknowns, contact)
 
-    # The residuals of the measured contact depend only on the contact. Each of them depends only on its own coordinate,
-    # so their derivatives with respect to the contact form a diagonal matrix. Their derivatives with respect to the
-    # unknowns of the film are zero.
+    # Derivatives of the residuals of the measured contact. Each of them depends only on its own coordinate of the
+    # contact, and does not depend on the unknowns of the film.
     rig_weights = np.array([1.0 / position_std_mm, 1.0 / position_std_mm, 1.0 / force_std])
     rig_contact_slopes = np.broadcast_to(np.diag(rig_weights), (len(contact), 3, 3))
-    rig_film_slopes = np.zeros((len(contact), 3, film_slopes.shape[2]))
+    rig_film_slopes = np.zeros((len(contact), 3, charge_film_slopes.shape[2]))
     return derivatives_with_adjusted_contacts(
-        np.concatenate([film_slopes, rig_film_slopes], axis=1),
-        np.concatenate([contact_slopes, rig_contact_slopes], axis=1),
+        np.concatenate([charge_film_slopes, rig_film_slopes], axis=1),
+        np.concatenate([charge_contact_slopes, rig_contact_slopes], axis=1),
     )
 
 

@@ -122,6 +122,9 @@ class _ContactResiduals(NamedTuple):
     def of(cls, charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> "_ContactResiduals":
         """Prepare the residuals by computing all values that do not change during the search for the contacts.
 
+        Imperfections of the film multiply its charges by a factor that depends on the contact. This factor is computed
+        only at the start of the search, together with its derivatives.
+
         Args:
             charges: Model of the charges of all films.
             unknowns: Unknowns of the pressed film, as `FilmCharges.film` expects them.
@@ -129,11 +132,15 @@ class _ContactResiduals(NamedTuple):
             start: Contacts (x, y, ln F) at which the search begins, shape (n, 3).
         """
         layout = charges.layout
+        # The pretension may differ from press to press. Charges and factors are therefore interpolated between copies
+        # of the film with several pretensions.
         films, film_weights = neighbouring_films(charges, unknowns, data)
         forward_maps = [charges.forward_map(film[layout.parameters]) for film in films]
+
+        # Without imperfections, all coefficients are zero, and the factor is 1 at all contacts.
         start_factor = np.ones_like(data.charge)
         factor_slopes = np.zeros((*data.charge.shape, 3))
-        if unknowns[layout.coefficients].any():  # without coefficients, the factor is 1
+        if unknowns[layout.coefficients].any():
             film_factors = [_values_and_slopes(partial(charges.factor, film), with_force(start)) for film in films]
             start_factor, factor_slopes = _interpolated(film_factors, film_weights)
         return cls(

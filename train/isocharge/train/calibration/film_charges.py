@@ -149,9 +149,10 @@ class FilmCharges(FilmMaps):
     def _imperfection_factor(self, unknowns: Array, contact: Array, charge: Array) -> Array:
         """Compute the factors by which modes and traces multiply the charges of a film.
 
-        Modes and traces add charges. Therefore, the factor is 1 plus the ratio of the added charges to the charges
-        without modes and traces. An uneven tension has an additional second-order effect, which multiplies this factor.
-        The result is at least `MIN_FACTOR`.
+        Modes are imperfections of the film, such as an uneven tension. Traces are metal lines that also collect charge.
+        Both add charges. Therefore, the factor is 1 plus the ratio of the added charges to the charges without modes
+        and traces. An uneven tension also has a second-order effect, by which the factor is multiplied. The result is
+        at least `MIN_FACTOR`.
 
         Args:
             unknowns: Parameters and coefficients of the film, as in `film`.
@@ -177,7 +178,8 @@ class FilmCharges(FilmMaps):
             modes = self._mode_charges(parameters, contact, charge)
             factor += modes.mode_jacobian @ mode_coefficients / charge
 
-            # Second order: an uneven tension acts like a lower mean tension.
+            # Second order: an uneven tension acts like a lower mean tension. The unevenness is the relative decrease of
+            # the mean tension, and `log_unevenness` is the derivative of ln Q with respect to the unevenness.
             unevenness, _ = self._unevenness(self._pretension(parameters), mode_coefficients)
             factor *= np.exp(unevenness * modes.log_unevenness)
         return np.maximum(factor, MIN_FACTOR)
@@ -189,10 +191,10 @@ class FilmCharges(FilmMaps):
     def _mode_charges(self, parameters: Array, contact: Array, charge: Array) -> ModeCharges:
         """Return the effects of the modes on the charges of presses, using cached results if possible.
 
-        The modes depend only on the film and the probe. The charges of the modes also depend on the electrodes and
-        gains of the sensor, and on the contacts. Therefore, a cached result is returned if it has the same film, probe,
-        sensor and contacts. If a cached result has only the same film and probe, its modes are used to compute the
-        charges.
+        The computation has two slow parts. The first part, the modes themselves, depends only on the film and the
+        probe. The second part, the charges of the modes, also depends on the sensor (its electrodes and gains) and on
+        the contacts. The cache contains one result for each film and probe. If this result also has the same sensor and
+        contacts, it is returned. Otherwise, only its modes are used again.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -201,18 +203,18 @@ class FilmCharges(FilmMaps):
         """
         forward_map = self.forward_map(parameters)
         sensor = forward_map.sensor
-        if self.family.imperfections is None:
+        if self.family.imperfections is None:  # no modes were computed for these films, so there are no effects
             no_modes = np.zeros((*charge.shape, 0))
             return ModeCharges(None, sensor, contact, mode_jacobian=no_modes, log_unevenness=np.zeros_like(charge))
 
         film_and_probe = (sensor.film, forward_map.probe)
-        cached_charges = self._cached_modes.get(film_and_probe)
-        if cached_charges is not None:
-            has_same_contact = np.array_equal(cached_charges.contact, contact)
-            if cached_charges.sensor == sensor and has_same_contact:
-                return cached_charges
-        if cached_charges is not None and cached_charges.modes is not None:
-            modes = cached_charges.modes
+        cached_result = self._cached_modes.get(film_and_probe)
+        if cached_result is not None:
+            has_same_contact = np.array_equal(cached_result.contact, contact)
+            if cached_result.sensor == sensor and has_same_contact:
+                return cached_result
+        if cached_result is not None and cached_result.modes is not None:
+            modes = cached_result.modes
         else:
             modes = self.family.imperfections.mode_map(forward_map, self.modes)
         mode_charges = self._computed_mode_charges(modes, forward_map, parameters, contact, charge)
@@ -237,22 +239,26 @@ class FilmCharges(FilmMaps):
     ) -> ModeCharges:
         """Compute the effects of given modes on the charges of presses.
 
+        The effects are the charges that each mode adds, and the change of the charges by a lower mean tension.
+
         Args:
-            modes: The modes of the film, for any electrodes and gains.
+            modes: The modes of the film. They may have been computed for a sensor with other electrodes and gains.
             forward_map: Forward map of the film.
             parameters: Parameters of the film, shape (n_parameter,).
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             charge: Charges of these contacts without modes, shape (n, n_electrode), pC.
         """
-        # The modes may have been computed with another sensor. They are evaluated with the electrodes and the gains of
-        # the sensor of `forward_map`.
+        # Charges that are added by one standard deviation of each mode, shape (n, n_electrode, n_mode). The modes are
+        # evaluated with the electrodes and the gains of the sensor of `forward_map`.
         sensor = forward_map.sensor
         fields = replace(modes.fields, sensor=sensor) if modes.fields is not None else None
         modes_of_sensor = replace(modes, film=forward_map, fields=fields)
-        mode_jacobian = modes_of_sensor.mode_jacobian(contact) * self._mode_stds  # per standard deviation of each mode
+        mode_jacobian = modes_of_sensor.mode_jacobian(contact) * self._mode_stds
 
+        # Derivative of ln Q with respect to ln T, where T is the tension. It gives the effect of a lower mean tension,
+        # which is the second-order effect of an uneven tension.
         pretension_derivative = self.difference("pretension", parameters, contact, charge)
-        log_tension_derivative = self._pretension(parameters) * pretension_derivative / charge  # d ln Q / d ln T
+        log_tension_derivative = self._pretension(parameters) * pretension_derivative / charge
         return ModeCharges(modes, sensor, contact, mode_jacobian, log_unevenness(log_tension_derivative))
 
     @cached_property
@@ -310,10 +316,10 @@ class FilmCharges(FilmMaps):
     def unknown_slopes(self, unknowns: Array, contact: Array, contact_slopes: Array) -> Array:
         """Compute the derivatives of the charges with respect to the unknowns of the film.
 
-        The charges of a film with coefficients are the product of a factor and the charges without coefficients. The
-        charges without coefficients obey scaling laws; see `parameter_jacobian`. The effect of modes on the factor is
-        assumed not to depend on the piezoelectric coefficients, the positions of the electrodes, and the radius of the
-        probe.
+        The unknowns are the parameters of the film, which may be followed by coefficients of modes, traces and the
+        discrepancy. Together, the coefficients multiply the charges by a factor. The charges without this factor obey
+        scaling laws; see `parameter_jacobian`. The effect of modes on the factor is assumed not to depend on the
+        piezoelectric coefficients, the positions of the electrodes, and the radius of the probe.
 
         Args:
             unknowns: Parameters of the film, shape (n_parameter,), or parameters and coefficients, shape
@@ -329,15 +335,16 @@ class FilmCharges(FilmMaps):
         layout = self.layout
         parameters = unknowns[layout.parameters]
         coefficients = unknowns[layout.coefficients]
-        film = self.forward_map(parameters)
-        charge = film.charges(contact)
+        forward_map = self.forward_map(parameters)
+        charge = forward_map.charges(contact)  # without the factor
 
-        # Derivatives of the charges of the film without coefficients. If the coefficients are not zero,
-        # `contact_slopes` includes the effect of their factor and cannot be used here.
+        # Derivatives of the charges without the factor with respect to the parameters. They need the derivative with
+        # respect to ln F, also without the factor. `contact_slopes` contains it if all coefficients are zero.
         force_derivative = contact_slopes[:, :, 2]
         if coefficients.any():
-            force_derivative = log_force_derivative(film, contact)
-        film_jacobian = self.parameter_jacobian(film, parameters, contact, charge, force_derivative) * self.prior.std
+            force_derivative = log_force_derivative(forward_map, contact)
+        parameter_jacobian = self.parameter_jacobian(forward_map, parameters, contact, charge, force_derivative)
+        film_jacobian = parameter_jacobian * self.prior.std  # per prior standard deviation
         if not coefficients.size:
             return np.asarray(film_jacobian)
 
@@ -345,14 +352,15 @@ class FilmCharges(FilmMaps):
         factor = self.factor(unknowns, contact, charge)[:, :, None]  # shape (n, n_electrode, 1)
         film_jacobian = self._with_factor_slopes(film_jacobian, unknowns, contact, charge) * factor
 
-        # The tension of an uneven mode is relative to Young's modulus E, as the pretension is. Therefore, an uneven
-        # tension contributes to the derivative with respect to ln E.
+        # A film with uneven tension depends on the ratio of tension to Young's modulus E. An increase of ln E therefore
+        # acts like a relative decrease of the coefficients of uneven tensions.
         mode_jacobian = self._mode_jacobian(unknowns, contact, charge, factor)
         tension_coefficients = unknowns[layout.modes] * self._is_uneven_tension
         young = layout.parameter("young")
         film_jacobian[:, :, young] -= mode_jacobian @ tension_coefficients * self.prior.std[young]
 
-        trace_jacobian = trace_charges(film, self._trace_lines, contact)
+        # Derivatives with respect to the coefficients of traces and of the terms of the discrepancy
+        trace_jacobian = trace_charges(forward_map, self._trace_lines, contact)
         term_jacobian = self._term_jacobian(contact, factor[:, :, 0] * charge)
         return np.concatenate([film_jacobian, mode_jacobian, trace_jacobian, term_jacobian], axis=2)
 
@@ -384,7 +392,8 @@ class FilmCharges(FilmMaps):
     def _mode_jacobian(self, unknowns: Array, contact: Array, charge: Array, factor: Array) -> Array:
         """Compute the derivatives of the charges with respect to the coefficients of the modes.
 
-        A mode adds charge. A mode of uneven tension also multiplies the charge by exp(unevenness * log_unevenness).
+        A mode adds charge. A mode of uneven tension also lowers the mean tension, and thereby multiplies the charge by
+        exp(unevenness * log_unevenness). The unevenness is this relative decrease of the mean tension.
 
         Args:
             unknowns: Parameters and coefficients of the film.
@@ -397,7 +406,9 @@ class FilmCharges(FilmMaps):
         """
         parameters = unknowns[self.layout.parameters]
         modes = self._mode_charges(parameters, contact, charge)
+        # Derivatives of the unevenness with respect to the coefficients, shape (n_mode,)
         _, unevenness_slopes = self._unevenness(self._pretension(parameters), unknowns[self.layout.modes])
+        # Derivatives of the exponential by the chain rule, times the charge: shape (n, n_electrode, 1)
         log_unevenness_charge = (charge * modes.log_unevenness)[:, :, None]
         return np.asarray(modes.mode_jacobian + factor * log_unevenness_charge * unevenness_slopes)
 

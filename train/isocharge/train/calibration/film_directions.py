@@ -46,9 +46,10 @@ LEAST_VARIANCE = 1e-12
 def film_directions(result: CalibrationResult) -> FilmDirections:
     """Compute the directions in which a calibrated film will be uncertain when it is used.
 
-    A direction is a linear combination of the unknowns of the film. The combination has the standard deviation 1. The
-    direction that causes the largest misfits comes first. Directions that cause only small misfits are left out. The
-    directions describe the uncertainty at a given pretension, because the service estimates the pretension separately.
+    A direction is a linear combination of the unknowns of the film, scaled to the standard deviation 1. A misfit is the
+    part of measured charges that no contact explains. The direction that causes the largest misfits comes first.
+    Directions that cause only small misfits are left out. The directions describe the uncertainty at a given
+    pretension, because the service estimates the pretension separately.
 
     Args:
         result: Result of the calibration of the film.
@@ -64,8 +65,8 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
     pretension_regression = covariance[:, pretension] / covariance[pretension, pretension]
     conditional_covariance = covariance - np.outer(pretension_regression, covariance[pretension])
 
-    # The root R, with C = R R', expresses the unknowns by independent variables with a standard deviation of 1. Each
-    # direction is a unit vector of these variables, and the unknowns change by R times this vector.
+    # With a root R of the covariance, C = R R', the unknowns are R times independent variables with the standard
+    # deviation 1. Each direction is a unit vector v of these variables, and changes the unknowns by R v.
     root = _covariance_root(conditional_covariance)
     film_unknowns = slice(0, len(covariance))  # the estimate may have only the first of all unknowns
     directions = _visible_directions(sensitivity.misfit_jacobian[:, :, film_unknowns], root)
@@ -74,7 +75,9 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
     # Change of ln Q by each direction: sum over the unknowns u, for each contact n, direction k and electrode e
     log_charge_jacobian = sensitivity.log_charge_jacobian[:, :, film_unknowns]
     log_changes = np.einsum("neu,ku->nke", log_charge_jacobian, unknown_changes)
-    # Change of the mean of each direction per unit change of the pretension, shape (n_direction,)
+    # If the pretension changes by 1, the mean of the unknowns changes by the regression. The pseudoinverse of R
+    # converts this change to the independent variables. The result is the change along each direction, shape
+    # (n_direction,).
     mean_by_pretension = directions @ np.linalg.pinv(root) @ pretension_regression
     return FilmDirections(
         coefficients=_fitted_series(problem.domain, sensitivity.contact, log_changes),

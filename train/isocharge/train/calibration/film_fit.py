@@ -180,17 +180,36 @@ def fit_film(
     # Repeat the fit with the most probable hypothesis until neither the film nor the selection of presses changes.
     settled = problem.settle(data, is_kept, degrees_of_freedom, solved, no_effects)
 
-    # If the film has imperfections, the presses that were left out may be good. The film is fitted to all presses if it
-    # is more probable that all presses are good than that the presses left out were recorded wrongly.
+    # Presses that were left out as wrong may be good if the film has imperfections.
     if not settled.is_kept.all():
-        unknowns = settled.solved.unknowns
-        film_with_all_presses = SolvedFilm(unknowns, problem.adjusted_contacts(unknowns, data))
-        mixture_of_all = problem.mixture(data, film_with_all_presses)
-        log_evidence_without_mistakes = mixture_of_all.log_evidence
-        log_evidence_with_mistakes = settled.mixture.log_evidence + _log_density_of_mistakes(data, ~settled.is_kept)
-        if log_evidence_without_mistakes > log_evidence_with_mistakes:
-            settled = problem.settle(data, every_press, degrees_of_freedom, settled.solved, mixture_of_all.best)
+        settled = _refit_if_all_good(problem, data, degrees_of_freedom, settled)
     return _posterior(problem, data, degrees_of_freedom, settled, at_C)
+
+
+def _refit_if_all_good(
+    problem: FitProblem, data: PressData, degrees_of_freedom: Array, settled: SettledFit
+) -> SettledFit:
+    """Fit a film to all presses if all presses are probably good; otherwise, return the given fit.
+
+    Two explanations of the presses that were left out are compared: they were recorded wrongly, or all presses are good
+    and the film has imperfections. The evidence of an explanation is the probability density of all presses according
+    to the explanation, including the prior probability of the mistakes.
+
+    Args:
+        problem: The least-squares problem.
+        data: All presses.
+        degrees_of_freedom: Number of redundant measurements of each press, shape (n,).
+        settled: The given fit, in which some presses were left out.
+    """
+    unknowns = settled.solved.unknowns
+    film_with_all_presses = SolvedFilm(unknowns, problem.adjusted_contacts(unknowns, data))
+    mixture_of_all = problem.mixture(data, film_with_all_presses)  # average over all hypotheses
+    log_evidence_without_mistakes = mixture_of_all.log_evidence
+    log_evidence_with_mistakes = settled.mixture.log_evidence + _log_density_of_mistakes(data, ~settled.is_kept)
+    if log_evidence_without_mistakes <= log_evidence_with_mistakes:
+        return settled
+    every_press = np.ones(len(data), dtype=bool)
+    return problem.settle(data, every_press, degrees_of_freedom, settled.solved, mixture_of_all.best)
 
 
 def refit_film(
@@ -342,7 +361,9 @@ def _posterior(
         at_C: Temperature of the film, degrees Celsius; None if temperatures were not measured.
     """
     layout = problem.layout
-    mixture = settled.mixture  # average over all hypotheses, as a difference from the mean before the presses
+    # A hypothesis is a combination of effects besides the parameters. The mixture is the average of the estimates under
+    # all hypotheses. Its mean is the change of the unknowns from their mean before the presses.
+    mixture = settled.mixture
     unknowns = np.clip(problem.mean + mixture.mean, *problem.bounds)
 
     # Root-mean-square scatter of the forces over all hypotheses, weighted by their probabilities
@@ -359,6 +380,9 @@ def _posterior(
     # covariance of the unknowns of the film, but only the standard deviations of the nuisances.
     nuisances = _nuisance_estimates(layout, unknowns, mixture.covariance)
     joint = mixture.covariance[layout.film, layout.film] + problem.gain_covariance(nuisances, force_scatter)
+
+    # One nuisance, the change of the pretension per kelvin, is a property of the film. The estimate also contains its
+    # covariances with the unknowns of the film.
     warming = None
     if at_C is not None:
         change = nuisances[PRETENSION_PER_KELVIN.name]

@@ -223,9 +223,10 @@ class FitProblem:
     ) -> SettledFit:
         """Repeat the fit until neither the film nor the selection of presses changes.
 
-        There are at most `MAX_ROUNDS` rounds. Each round assumes the most probable hypothesis of the previous round. A
-        hypothesis is a combination of effects that the parameters of the film do not describe. A press that was left
-        out in an earlier round is used again if it agrees with the new film.
+        A hypothesis is a combination of effects that the parameters of the film do not describe. Each round fits the
+        film under the most probable hypothesis of the previous round, and then averages the estimates under all
+        hypotheses. This average is the mixture. A press that was left out as bad is used again in the next round if it
+        agrees with the film. There are at most `MAX_ROUNDS` rounds.
 
         Args:
             data: All presses.
@@ -243,7 +244,8 @@ class FitProblem:
             solved = self._solve_kept(data, is_kept, solved.unknowns, hypothesis)
         for round_index in range(MAX_ROUNDS):
             mixture = self.mixture(data[is_kept], solved)
-            # The mixture uses derivatives at the solved film, so its estimate must be near this film.
+            # The mixture is computed with derivatives at the solved film. It is accurate only if the step from the
+            # solved film to the estimate of the mixture is small.
             step = self.mean + mixture.mean - solved.unknowns
             is_step_small = np.abs(step[self.layout.parameters]).max() < MAX_LINEAR_STEP
 
@@ -253,6 +255,8 @@ class FitProblem:
                 is_kept_next = is_kept | self.agrees(data, solved, mixture, degrees_of_freedom)
             is_selection_stable = np.array_equal(is_kept_next, is_kept)
 
+            # The returned film and mixture must belong to the same presses, so `is_kept` changes only if another round
+            # follows.
             is_last_round = round_index == MAX_ROUNDS - 1
             if is_last_round or (is_step_small and is_selection_stable):
                 break
@@ -318,10 +322,14 @@ class FitProblem:
             The average of the estimates under all hypotheses. Its mean is the difference from the mean before the
             presses.
         """
+        # The fit may have assumed a scatter of the forces. The contacts are adjusted again without this assumption.
         unknowns = solved.unknowns
         contacts = self.adjusted_contacts(unknowns, data, solved.contacts.contact)
-        jacobian = self.derivatives(SolvedFilm(unknowns, contacts), data)
-        models_by_scatter = self._models_by_force_scatter(SolvedFilm(unknowns, contacts), data, jacobian)
+        adjusted = SolvedFilm(unknowns, contacts)
+
+        # Linear model of the residuals for each possible scatter of the forces
+        jacobian = self.derivatives(adjusted, data)
+        models_by_scatter = self._models_by_force_scatter(adjusted, data, jacobian)
         mixture = mix_hypotheses(models_by_scatter, self.prior_covariance)
         bounded_unknowns = most_probable_within(self.bounds, self.mean + mixture.mean, mixture.covariance)
         return mixture._replace(mean=bounded_unknowns - self.mean)
@@ -331,8 +339,9 @@ class FitProblem:
     ) -> dict[float, LinearModel]:
         """Create a linear model of the residuals for each value in `FORCE_SCATTERS`.
 
-        A random scatter of the forces adds noise to the vector of residuals of each press. This noise has the direction
-        of the derivative of the vector with respect to the stated force.
+        If the forces scatter at random, the vector of the residuals of a press gets additional noise. This noise
+        changes the vector only along its derivative with respect to the logarithm of the stated force. The standard
+        deviation of the noise is the scatter times the length of this derivative.
 
         Args:
             solved: The film about which the residuals are linearised, and the contacts of the presses on this film.
@@ -348,18 +357,18 @@ class FitProblem:
 
         # Unit vector of the derivative with respect to the force for each press, shape (n, n_electrode + 3)
         force_derivative = self._force_derivative(solved.unknowns, data, solved.contacts)
-        length = np.linalg.norm(force_derivative, axis=1)
-        direction = force_derivative / np.maximum(length, SMALLEST_DERIVATIVE)[:, None]
+        derivative_length = np.linalg.norm(force_derivative, axis=1)
+        noise_direction = force_derivative / np.maximum(derivative_length, SMALLEST_DERIVATIVE)[:, None]
 
-        # Components of the Jacobian, shape (n, n_unknown), and of the residuals, shape (n,), along these vectors: sums
-        # over the residuals k of each press n, for each unknown u
-        jacobian_along = np.einsum("nk,nku->nu", direction, jacobian)
-        residual_along = (direction * residual).sum(axis=1)
+        # Components of the Jacobian, shape (n, n_unknown), and of the residuals, shape (n,), along the unit vectors:
+        # sums over the residuals k of each press n, for each unknown u
+        jacobian_component = np.einsum("nk,nku->nu", noise_direction, jacobian)
+        residual_component = (noise_direction * residual).sum(axis=1)
 
         models = {}
         for scatter in FORCE_SCATTERS:
-            added_variance = (scatter * length) ** 2
-            models[scatter] = model.with_added_noise(jacobian_along, residual_along, deviation, added_variance)
+            noise_variance = (scatter * derivative_length) ** 2
+            models[scatter] = model.with_added_noise(jacobian_component, residual_component, deviation, noise_variance)
         return models
 
     def adjusted_contacts(self, unknowns: Array, data: PressData, start: Array | None = None) -> AdjustedContacts:

@@ -211,12 +211,12 @@ def _weight_names(network: FoldedNetwork) -> list[str]:
 
 
 def _lasting_std_MPa(result: CalibrationResult) -> float:
-    """Compute the standard deviation that the followed pretension has even after many touches, MPa.
+    """Compute the standard deviation, in MPa, that the pretension estimated by a service has even after many touches.
 
-    The service estimates the pretension from the misfits of touches by least squares. All other unknowns of the film
-    keep their calibrated values. The errors of the calibrated values cause an error of the estimated pretension.
-    Further touches do not reduce this error. The error of the calibrated pretension itself also contributes to it, with
-    the factor 1.
+    The service estimates the pretension by least squares from the misfits of touches. A misfit is the part of the
+    charges that no contact explains. The service does not estimate the other unknowns of the film again. Errors of
+    their calibrated values therefore cause an error of the estimated pretension, which further touches do not reduce.
+    An error of the calibrated pretension is added to the error of the estimate without any change.
 
     Args:
         result: Result of the calibration.
@@ -226,8 +226,8 @@ def _lasting_std_MPa(result: CalibrationResult) -> float:
     misfit_jacobian = result.sensitivity.misfit_jacobian
     pretension_jacobian = misfit_jacobian[:, :, pretension]  # shape (n_touch, n_misfit)
 
-    # Error of the least-squares estimate of the pretension for a unit error of each unknown p. The sums extend over the
-    # touches n and the misfits k of each touch.
+    # Error of the least-squares estimate of the pretension if the calibrated value of the unknown p has the error 1.
+    # The sums extend over the touches n and the misfits k of each touch.
     projection = np.einsum("nk,nkp->p", pretension_jacobian, misfit_jacobian)
     error_per_unknown = projection / (pretension_jacobian**2).sum()
 

@@ -225,18 +225,21 @@ class LinearModel(NamedTuple):
             Change of the mean by the presses, shape (n_unknown,), and covariance after the presses, shape (n_unknown,
             n_unknown). The mean of unknowns without a variance before the presses does not change.
         """
-        # The solution contains only the active unknowns, which have a variance before the presses. The solution is in
-        # units of the root L of their covariance L L' before the presses.
+        # Only the active unknowns, which have a variance before the presses, are solved for. They are L s. Here L L' is
+        # their covariance before the presses, and s are scaled unknowns, whose covariance is the identity matrix.
         solution = self._solve(prior_covariance)
+        prior_root = solution.prior_root  # L
         active = solution.active
-        mean_change = np.zeros(len(active))
-        mean_change[active] = -solution.prior_root @ solution.step
 
-        # Covariance L P^-1 L' with the precision P. The argument True states that the Cholesky factor of P is a lower
-        # triangular matrix.
+        # The presses change the mean of s by minus the step of the solution.
+        mean_change = np.zeros(len(active))
+        mean_change[active] = -prior_root @ solution.step
+
+        # After the presses, s has the covariance P^-1, where P is the precision. The active unknowns then have the
+        # covariance L P^-1 L'. The argument True states that the Cholesky factor of P is a lower triangular matrix.
         covariance = np.zeros_like(prior_covariance)
-        whitened_covariance = cho_solve((solution.precision_factor, True), solution.prior_root.T)
-        covariance[np.ix_(active, active)] = solution.prior_root @ whitened_covariance
+        inverse_precision_times_root = cho_solve((solution.precision_factor, True), prior_root.T)  # P^-1 L'
+        covariance[np.ix_(active, active)] = prior_root @ inverse_precision_times_root
         return mean_change, covariance
 
     def _solve(self, prior_covariance: Array) -> "_Solution":
@@ -249,11 +252,12 @@ class LinearModel(NamedTuple):
         active_block = np.ix_(active, active)  # rows and columns of the active unknowns
         prior_root = np.asarray(np.linalg.cholesky(prior_covariance[active_block]), np.float64)
 
-        # In units of the root L, the covariance of the unknowns before the presses is the identity matrix. Their
-        # precision after the presses (the inverse of the covariance) is then 1 + L' N L, where N is the normal matrix.
+        # The active unknowns are L s with the prior root L. Before the presses, the covariance of the scaled unknowns s
+        # is the identity matrix. Their precision after the presses (the inverse of the covariance) is 1 + L' N L, where
+        # N is the matrix of the normal equations.
         precision = np.eye(len(prior_root)) + prior_root.T @ self.normal[active_block] @ prior_root
         precision_factor = np.asarray(np.linalg.cholesky(precision), np.float64)
-        moment = prior_root.T @ self.moment[active]
+        moment = prior_root.T @ self.moment[active]  # half the gradient of the sum of squares with respect to s
         step = cho_solve((precision_factor, True), moment)
         return _Solution(active, prior_root, precision_factor, moment, step)
 

@@ -98,16 +98,22 @@ def trace_charges(forward_map: ForwardMap, lines: Array, contact: Array) -> Arra
         Charges, shape (n, n_electrode, n_electrode * n_line), pC. The second axis is the electrode that receives the
         charge, and the last axis is the line. A line adds charge only to its own electrode.
     """
+    n_contact = len(contact)
     n_electrode = len(lines)
+
+    # Charge of each line per millimetre of its width
     points = ReadoutPoints.along(forward_map.sensor, lines)
     charge_per_mm = forward_map.field_charges(contact, EVEN_FIELD, points)
-    # Axes: contact, electrode of the line, an axis of length 1, line
-    line_charge = TRACE_STD_MM * charge_per_mm.reshape(len(contact), n_electrode, 1, -1)
 
-    # The matrix is 1 if the electrode that receives the charge (first axis) is the electrode of the line (second axis).
+    # In the product, the axes are the contact, the electrode that receives the charge, the electrode of the line, and
+    # the line, shape (n, n_electrode, n_electrode, n_line). Both electrodes must be equal, otherwise the charge is 0.
+    # The charges of the lines are multiplied by the identity matrix, which is symmetric in the two electrodes.
+    line_charge = TRACE_STD_MM * charge_per_mm.reshape(n_contact, n_electrode, 1, -1)
     is_own_electrode = np.eye(n_electrode)[:, :, None]
-    charge_by_line = line_charge * is_own_electrode  # shape (n, n_electrode, n_electrode, n_line)
-    return np.asarray(charge_by_line.reshape(len(contact), n_electrode, -1))
+    charge_by_line = line_charge * is_own_electrode
+
+    # Join the last two axes, because the returned last axis counts the lines of all electrodes.
+    return np.asarray(charge_by_line.reshape(n_contact, n_electrode, -1))
 
 
 def trace_widths(coefficients: Array, covariance: Array) -> tuple[Array, Array]:

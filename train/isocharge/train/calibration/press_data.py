@@ -67,6 +67,7 @@ class PressData:
             noise: Noise of the charges.
             domain: Range of contacts for which the charges of the films are known.
         """
+        # Charges and contacts, with a note of what was measured
         has_charge = ~np.isnan(presses.charge_pC)
         charge = np.where(has_charge, presses.charge_pC, 0.0)
         log_contact = np.column_stack([presses.contact[:, :2], np.log(presses.contact[:, 2])])
@@ -74,7 +75,8 @@ class PressData:
         rig_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
         unknown_std = [domain.radius, domain.radius, UNKNOWN_FORCE_STD]
         temperature_C = temperatures(presses)
-        # The presses are assumed to be made at equal intervals. A single press has the time 0.
+        # The time runs from -1/2 to 1/2 in the session. The presses are assumed to be made at equal intervals. A single
+        # press has the time 0.
         session_time = np.linspace(-0.5, 0.5, len(presses)) if len(presses) > 1 else np.zeros(1)
         return cls(
             charge=charge,
@@ -85,8 +87,8 @@ class PressData:
             session_time=session_time,
             warming_K=temperature_C - temperature_C.mean(),
             film_excess_K=_film_excess(presses),
-            tension_change=np.zeros(len(presses)),
-            friction_charge=np.zeros_like(charge),
+            tension_change=np.zeros(len(presses)),  # `without_nuisances` sets this value
+            friction_charge=np.zeros_like(charge),  # `with_friction` sets this value if there is friction
         )
 
     def __getitem__(self, rows: Integers | Booleans) -> "PressData":

@@ -175,17 +175,8 @@ class FilmEstimate:
                 f"{upper:g} MPa: a temperature nearer to that of the presses"
             )
 
-        # The new pretension is T + k w, where T is the old pretension, k is the change of the temperature, and w is the
-        # change of the pretension per kelvin. Its covariance with an unknown u is cov(T, u) + k cov(w, u). The terms
-        # with k are added first to the row of the pretension, then to cov(w, T), and then to the column of the
-        # pretension. The last step uses the new cov(w, T), as the variance of the new pretension requires.
-        scaled_change = change_K / prior.std[pretension]
-        covariance = self.unknown_covariance.copy()
-        warming_covariance = self.warming.covariance.copy()
-        covariance[pretension] += scaled_change * warming_covariance
-        warming_covariance[pretension] += scaled_change * self.warming.std**2
-        covariance[:, pretension] += scaled_change * warming_covariance
-
+        change_in_prior_stds = change_K / prior.std[pretension]
+        covariance, warming_covariance = self._covariance_after_warming(self.warming, change_in_prior_stds, pretension)
         n_parameter = len(parameters)
         return FilmEstimate(
             parameters=parameters,
@@ -194,6 +185,31 @@ class FilmEstimate:
             joint=covariance if self.joint.size else self.joint,
             warming=self.warming._replace(at_C=at_C, covariance=warming_covariance),
         )
+
+    def _covariance_after_warming(self, warming: Warming, change: float, pretension: int) -> tuple[Array, Array]:
+        """Compute the covariances of the unknowns after the pretension T has changed to T + k w.
+
+        Here w is the change of the pretension per kelvin, and k is the change of the temperature.
+
+        Args:
+            warming: The value w, with its standard deviation and its covariances with the unknowns.
+            change: Change k, in K, divided by the prior standard deviation of the pretension.
+            pretension: Index of the pretension among the unknowns.
+
+        Returns:
+            Covariance of the unknowns, shape (n, n), and covariances of w with the unknowns, shape (n,).
+        """
+        covariance = self.unknown_covariance.copy()
+        warming_covariance = warming.covariance.copy()
+
+        # Replace T by T + k w, first in the rows of the covariance: cov(T + k w, u) for every unknown u.
+        covariance[pretension] += change * warming_covariance
+        # cov(w, T + k w)
+        warming_covariance[pretension] += change * warming.std**2
+        # Replace T in the columns. This step uses the covariance of w with the new pretension, because the pretension
+        # of the row was already replaced.
+        covariance[:, pretension] += change * warming_covariance
+        return covariance, warming_covariance
 
 
 @dataclass(frozen=True)
@@ -268,11 +284,12 @@ class CalibrationProblem:
         *,
         release: bool = True,
     ) -> Fitted:
-        """Return a network that is adapted to the charges of a film and to the electrodes of the sensor.
+        """Return a network for one film, which is derived from the network for all films.
 
-        The charges that follow from the parameters of the film are multiplied by given factors. The sensor may have
-        other electrodes than the network for all films. Then the charges are also multiplied by the ratio of the
-        charges of these two kinds of electrodes.
+        The network for all films knows only the parameters of a film. The real charges may differ from the charges that
+        this network expects, for two reasons. First, effects such as imperfections multiply the charges by given
+        factors. Second, the sensor may have other electrodes than the sensor of the network for all films. Therefore,
+        the network is adapted to the ratio of real to expected charges.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
@@ -285,7 +302,7 @@ class CalibrationProblem:
         options: dict[str, Any] = {} if release else {"correlation": False, "n_test": 0}
         sensor_map = self.charges.forward_map(parameters)
         network_map = self.films.forward_map(parameters)
-        # `prior` is a new object if and only if the electrodes of the network's prior were replaced.
+        # The property `prior` is a new object if and only if the electrodes in the prior of the network were replaced.
         has_same_electrodes = self.prior is self.films.prior
 
         def charge_factor(contact: Array) -> Array:

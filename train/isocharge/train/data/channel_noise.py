@@ -127,9 +127,11 @@ class ChannelNoise:
         return np.asarray(np.sinh(exponent) * self.white / self.gain)
 
     def transition_charge(self, charge: Array) -> Array:
-        """Return the charge at which each feature changes from linear to logarithmic, shape (n_electrode,), pC.
+        """Return the transition charge of each channel, shape (n_electrode,), pC.
 
-        The features are asinh(Q / transition charge).
+        The inputs of the network are asinh(Q / transition charge). They are nearly linear in charges Q below the
+        transition charge, and nearly logarithmic above it. The transition charge is the charge above which the noise is
+        mostly proportional to the charge. A channel with charges of both signs also has a smallest transition charge.
 
         Args:
             charge: Charges of presses, shape (n, n_electrode), pC.
@@ -137,11 +139,11 @@ class ChannelNoise:
         positive_share = np.mean(charge > 0.0, axis=0)  # shape (n_electrode,)
         negative_share = np.mean(charge < 0.0, axis=0)
         has_both_signs = np.minimum(positive_share, negative_share) > BOTH_SIGNS
-        # Without a lower limit, the features of a channel with little noise would have a kink at the charge 0.
-        lower_limit = np.where(has_both_signs, MIN_TRANSITION_RATIO * usual_size(charge), 0.0)
-        # Above white / gain, the noise is mostly proportional to the charge.
+        # Without this lower limit, asinh would have a kink at the charge 0 for a channel with little noise.
+        smallest_transition = np.where(has_both_signs, MIN_TRANSITION_RATIO * usual_size(charge), 0.0)
+        # Below this charge, the noise is mostly white, and above it mostly proportional to the charge.
         noise_corner = self.white / self.gain
-        return np.asarray(np.maximum(noise_corner, lower_limit))
+        return np.asarray(np.maximum(noise_corner, smallest_transition))
 
     def scaled(self, factor: float) -> "ChannelNoise":
         """Multiply all standard deviations by a factor, and return the new noise model."""
@@ -175,9 +177,10 @@ class LocalPlanes:
 
     @classmethod
     def through(cls, unit: Array, values: Array) -> "LocalPlanes":
-        """For each press, fit a plane to its neighbours by least squares.
+        """For each press, fit a plane to the values of its neighbours by least squares.
 
-        The press itself is not used in the fit.
+        The plane is a linear function from the unit coordinates of a contact to the k values. The press itself is not
+        used in the fit, so that its residual is independent of the plane.
 
         Args:
             unit: Contacts in unit coordinates, shape (n, 3).
@@ -206,10 +209,11 @@ class LocalPlanes:
         return cls(value, slope, residual, reach)
 
     def residuals(self, values: Array) -> Array:
-        """Compute the difference between each set of k values and the point on the planes that is nearest to it.
+        """Compute the difference between each set of k values and the nearest point of all planes.
 
-        Only the `CANDIDATES` planes whose centres are nearest to the set are searched. A plane extends as far as the
-        farthest neighbour of its press.
+        A plane is a linear function from contacts to values. Its points are the values of the contacts around its
+        press, up to the distance of the farthest neighbour of the press. Only the `CANDIDATES` planes whose values at
+        their own press are nearest to the set are searched.
 
         Args:
             values: m sets of values, shape (m, k).
@@ -221,17 +225,21 @@ class LocalPlanes:
         inverse_slope = np.linalg.pinv(self.slope)  # shape (n, 3, k)
         smallest_residual = np.full(values.shape, np.inf)
         for planes in candidate_planes.T:  # indices of one plane for each set of values, shape (m,)
-            # Project each set of values onto its plane. The vector `step`, shape (m, 3), leads from the centre of the
-            # plane to the projection, in unit coordinates. The last axis of the difference makes it a column vector.
-            difference = values - self.value[planes]
+            # Find the point of the plane that is nearest to each set of values. The vector `step`, shape (m, 3), leads
+            # from the press of the plane to the contact of this point, in unit coordinates. The matrices are
+            # multiplied by column vectors, which have an additional last axis.
+            difference = values - self.value[planes]  # from the value at the press, shape (m, k)
             step = (inverse_slope[planes] @ difference[..., None])[..., 0]
 
             # Shorten steps that end beyond the farthest neighbour.
             length = np.linalg.norm(step, axis=1)
             factor = np.minimum(1.0, self.reach[planes] / np.maximum(length, TINY))
             limited_step = step * factor[:, None]
+
+            # Difference from the point at the end of the step, shape (m, k)
             residual = difference - (self.slope[planes] @ limited_step[..., None])[..., 0]
 
+            # Keep the residual if this plane is nearer than all earlier planes.
             is_nearer = (residual**2).sum(axis=1) < (smallest_residual**2).sum(axis=1)
             smallest_residual[is_nearer] = residual[is_nearer]
         return smallest_residual
@@ -250,8 +258,9 @@ def _fit_variances(charge: Array, residual: Array) -> tuple[float, float]:
     """Estimate the variances white^2 and gain^2 of one channel.
 
     The function white^2 + gain^2 Q^2 is fitted to the squared residuals by weighted least squares. Neither white^2 nor
-    gain^2 can become negative. The standard deviation of a squared residual is proportional to its expected value. The
-    weights of each round therefore follow from the expected values of the previous round.
+    gain^2 can become negative. The squared residuals of large charges scatter more, so each squared residual is divided
+    by its expected value. The expected values are not known at first. The fit is therefore repeated, and each round
+    uses the expected values that follow from the variances of the previous round.
 
     Args:
         charge: Charges Q without noise, shape (n,), pC.
@@ -268,13 +277,14 @@ def _fit_variances(charge: Array, residual: Array) -> tuple[float, float]:
     sum_of_squares = np.maximum((columns**2).sum(axis=0), TINY)
     column_scale = np.sqrt(sum_of_squares) / np.sqrt(len(charge))
 
-    variances = np.array([mean_square, 0.0])
+    variances = np.array([mean_square, 0.0])  # white^2 and gain^2 before the first round
     for _ in range(ROUNDS):
         expected_square = np.maximum(columns @ variances, smallest_variance)
-        limited_square = np.minimum(residual**2, OUTLIER**2 * expected_square)  # limits the influence of outliers
+        clipped_square = np.minimum(residual**2, OUTLIER**2 * expected_square)  # limits the influence of outliers
+        # Divide both sides of the equations by the expected values, and solve them without negative variances.
         weighted_columns = columns / column_scale / expected_square[:, None]
-        weighted_square = limited_square / expected_square
-        scaled_variances, _ = nnls(weighted_columns, weighted_square)  # least squares without negative variances
+        weighted_square = clipped_square / expected_square
+        scaled_variances, _ = nnls(weighted_columns, weighted_square)
         variances = scaled_variances / column_scale
     white_variance, gain_variance = variances.tolist()
     return white_variance, gain_variance

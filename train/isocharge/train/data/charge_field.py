@@ -135,7 +135,8 @@ class ChargeField:
             fewest = FEWEST_PER_TERM * series_term_count(*first_degrees)
             raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(presses)}")
 
-        # If the first degrees for taut films have a clearly smaller error, the film is taut.
+        # A taut film, which has a pretension, needs higher degrees in the force. If the first degrees for taut films
+        # have a clearly smaller error, the film is taut.
         if not presses.signed and best_field.error > GOOD_ENOUGH:
             first_taut_degrees, *further_taut_degrees = TAUT_CANDIDATE_DEGREES
             taut_field = fitter.fit(*first_taut_degrees)
@@ -143,6 +144,7 @@ class ChargeField:
                 best_field = taut_field
                 further_degrees = further_taut_degrees
 
+        # Try the further degrees until the error is small enough, or the presses are too few.
         for degree, force_degree in further_degrees:
             if best_field.error < GOOD_ENOUGH:
                 break
@@ -166,6 +168,9 @@ class ChargeField:
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute charges and their derivatives together, which is faster than computing them separately.
 
+        The value of the series is ln Q for positive charges Q, and Q / S(l) for charges of both signs. S(l) is the
+        typical size of the charges as a function of the scaled logarithm l of the force.
+
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
@@ -174,20 +179,24 @@ class ChargeField:
             n_electrode, 3).
         """
         unit = self.domain.to_unit(contact)
-        # The second axis has the value of the series, and then its derivatives with respect to x, y and l.
+        # The second axis has the value of the series, and then its derivatives with respect to the unit coordinates x,
+        # y and l.
         values_and_slopes = self._series.values_and_derivatives(unit)  # shape (n, 4, n_electrode)
         value = values_and_slopes[:, 0]
-        slopes = values_and_slopes[:, 1:]
-        if self.log_size is None:  # ln Q = value, so Q' = Q value'
+        slopes = values_and_slopes[:, 1:]  # shape (n, 3, n_electrode)
+
+        # In both cases, the derivative of the charge is a factor times `slopes`.
+        if self.log_size is None:  # Q = exp(value), so the derivative is Q' = Q value'
             charge = np.exp(value)
             factor = charge
-        else:  # Q = S(l) value, so Q' = S (value' + (ln S)' value), where (ln S)' is not zero only along l
+        else:  # Q = S(l) value, so the derivative is Q' = S (value' + (ln S)' value)
             size, log_size_slope = _size_and_slope(self.log_size, unit[:, 2])
             charge = size * value
-            slopes[:, 2] += log_size_slope * value
+            slopes[:, 2] += log_size_slope * value  # S depends only on l, the third coordinate
             factor = size
+        charge_slopes = factor[:, :, None] * slopes.swapaxes(1, 2)
         # The division by the scale converts derivatives in unit coordinates into derivatives in x, y and ln F.
-        return charge, factor[:, :, None] * slopes.swapaxes(1, 2) / self.domain.scale
+        return charge, charge_slopes / self.domain.scale
 
     @cached_property
     def _series(self) -> Series:
@@ -230,6 +239,10 @@ class _SeriesFitter:
     ) -> "_SeriesFitter":
         """Compute the target values of the series, and the units in which its errors are measured.
 
+        For positive charges Q, the targets are ln Q, and the errors are relative. For charges of both signs, the
+        targets are Q / S. The typical size S of the charges is a fitted function of the force, and `log_size` contains
+        its coefficients.
+
         Args:
             domain: Working area and range of forces of the contacts.
             electrodes: Names of the electrodes, in the order of the charges.
@@ -237,11 +250,11 @@ class _SeriesFitter:
             validation: Other presses, on which the errors will be measured.
         """
         unit = domain.to_unit(presses.contact)
-        if presses.signed:
+        if presses.signed:  # the presses have charges of both signs
             log_size = _fit_log_size(unit[:, 2], presses.charge)
             size, _ = _size_and_slope(log_size, unit[:, 2])
             target = presses.charge / size
-            smallest_error_unit = NOISE_CORNER_pC  # charges near zero have large relative errors
+            smallest_error_unit = NOISE_CORNER_pC  # otherwise, charges near zero would have large relative errors
         else:
             log_size = None
             target = np.log(presses.charge)
@@ -369,11 +382,18 @@ SMALLEST_SHARE = 0.2
 def invertible_domain(
     field: ChargeField, presses: LabelledPresses, noise: NoiseModel
 ) -> tuple[Domain, tuple[str, ...]]:
-    """Return the largest disk that contains no certain fold, and sentences about folds and ambiguous pairs.
+    """Return the disk on which a network is trained, and sentences for the user about ambiguous contacts.
 
-    A fit to few presses, or to measured charges with noise, is too inaccurate to prove a fold. If a fold is not
-    certain, the domain is not reduced, and a sentence states where the map seems to fold. Ambiguous pairs are searched
-    for only if the error of the fit is small.
+    At a fold, the map from contacts to charges turns back, so that contacts on both sides of the fold have the same
+    charges. There are three cases:
+
+    - The fit is accurate and shows a fold: the disk is reduced to the radius of the fold, and a sentence states this.
+    - The fit is inaccurate, because there are few presses or the charges have noise, and it shows a fold well inside
+      the domain: the disk is not reduced, and a sentence states where the map seems to fold.
+    - Otherwise, the disk is the domain of the field.
+
+    If the charges have little noise and no uncertain fold was found, distant pairs of contacts with the same charges
+    are searched for as well.
 
     Args:
         field: Charge field that was fitted to the presses.
@@ -387,10 +407,11 @@ def invertible_domain(
         DatasetError: If the radius of the disk is less than `SMALLEST_SHARE` of the radius of the field.
     """
     requested_domain = field.domain
+    fold_radius = _fold_radius(field, noise)  # infinity without a fold
     has_little_noise = field.error < MAX_ERROR_WITHOUT_NOISE
-    fold_radius = _fold_radius(field, noise)
+
+    # An inaccurate fit does not prove a fold, so the fold is only reported, and only if it lies well inside the domain.
     if field.error > MAX_ERROR_OF_CERTAIN_FOLD:
-        # The fold may be an error of the fit, so it is only reported, and only if it lies well inside the domain.
         credible_ratio = CREDIBLE_FOLD_RATIO if has_little_noise else CREDIBLE_FOLD_RATIO_WITH_NOISE
         if fold_radius < credible_ratio * requested_domain.radius:
             return requested_domain, (_uncertain_fold_caution(fold_radius, requested_domain.radius),)
@@ -402,6 +423,7 @@ def invertible_domain(
             f"{requested_domain.radius:g} mm asked for: beyond, two contacts give the same charges; add an "
             "electrode, or take a biaxial film"
         )
+    # Reduce the domain to a certain fold, and search for pairs of distant contacts with the same charges.
     domain = requested_domain
     cautions = []
     if fold_radius < requested_domain.radius:

@@ -256,7 +256,8 @@ def _boundary_neighbours(triangles: Integers) -> dict[int, list[int]]:
 def _enlarged_polygon(corners: Array, distance: float) -> Array:
     """Enlarge a polygon by moving all its sides outwards by the same distance.
 
-    The function represents points and directions in the plane by complex numbers x + i y.
+    Points and directions in the plane are complex numbers x + i y, so a multiplication by -i turns a direction to the
+    right.
 
     Args:
         corners: Corners (x, y) of the polygon, clockwise or anticlockwise, shape (n, 2), mm.
@@ -266,17 +267,20 @@ def _enlarged_polygon(corners: Array, distance: float) -> Array:
     Returns:
         Corners, anticlockwise, shape (m, 2), mm. Corners between two sides in the same direction are left out.
     """
+    # Make the corners anticlockwise, and leave out those at which the polygon does not turn.
     is_anticlockwise = area_of(corners) > 0.0
     all_points = to_complex(corners if is_anticlockwise else corners[::-1])
     all_sides = np.roll(all_points, -1) - all_points  # from each point to the next one
     turning_angle = np.angle(all_sides / np.roll(all_sides, 1))
     points = all_points[np.abs(turning_angle) > MIN_TURN_rad]
 
-    # Let m and n be the unit normals of both sides of a corner, and m n their scalar product. A displacement of the
-    # corner by (m + n) / (1 + m n) moves both sides by 1. The normal of a side points to the right, which is outwards.
+    # Unit normals of the sides that follow and precede each corner. A normal points to the right, which is outwards.
     sides = np.roll(points, -1) - points
     next_normal = -1j * sides / np.abs(sides)
     previous_normal = np.roll(next_normal, 1)
+
+    # The displacement of each corner that moves both of its sides by 1, called the mitre. It is (m + n) / (1 + m n),
+    # with the normals m and n of both sides and their scalar product m n. The mitre of a sharp corner is shortened.
     scalar_product = (previous_normal * np.conj(next_normal)).real
     denominator = np.maximum(1.0 + scalar_product, 1e-9)  # not zero
     mitre = (previous_normal + next_normal) / denominator

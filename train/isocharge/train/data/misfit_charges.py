@@ -201,25 +201,25 @@ def _compute_residuals(
     is_near: Booleans,
     find_nearest: Callable[[ChargeMap, Array, Array], tuple[Array, Array]],
 ) -> Array:
-    """Compute the residuals of charges at the nearest contact.
+    """Compute the residuals of charges at the nearest contact, which is the contact with the most similar charges.
 
-    Some charges are similar to the charges of the press from which they were made. For such charges, the search for the
-    nearest contact begins at the contact of the press. The charge map is scaled so that it gives the charges of the
-    press at this contact. For all other charges, and if the residuals of the first search are large, a search begins at
-    several contacts, which are chosen from many candidates.
+    Charges that are similar to those of the press from which they were made are called near. For near charges, a fast
+    search begins at the contact of the press. In this search, the charge map is scaled so that it gives the charges
+    of the press at this contact. A thorough search begins at several contacts. It is made for all charges that
+    are not near, and for near charges whose residuals are large after the fast search.
 
     Args:
         charge_map: Map from contacts to charges.
         charge: Charges, shape (n, n_electrode), pC.
         sigma: Standard deviations of the noise of these charges, same shape, pC.
         source_presses: Presses from which the charges were made.
-        is_near: Whether the charges of each row are similar to the charges of their press, shape (n,).
-        find_nearest: Function that searches for the nearest contacts among many candidates; see
-            `ExampleOptions.find_nearest`.
+        is_near: Whether the charges of each row are near, shape (n,).
+        find_nearest: Function for the thorough search; see `ExampleOptions.find_nearest`.
 
     Returns:
         Residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
+    # Fast search for the near charges
     residual = np.zeros_like(charge)
     near_rows = np.flatnonzero(is_near)
     start_contact = source_presses.contact[near_rows]
@@ -231,12 +231,12 @@ def _compute_residuals(
         charge_map, charge[near_rows] / map_factor, sigma[near_rows] / map_factor, start_contact, min_change=MIN_CHANGE
     )
 
-    # A large residual near the press may be a local minimum. Such charges are therefore also searched for elsewhere.
+    # Thorough search for the other charges, and for near charges with large residuals, which may be local minima
     has_large_residual = np.linalg.norm(residual, axis=1) > MAX_NEAR_MISFIT
     searched_rows = np.flatnonzero(~is_near | has_large_residual)
     _, searched_residual = find_nearest(charge_map, charge[searched_rows], sigma[searched_rows])
 
-    # Keep the smaller of both residuals. Rows with charges that are not near their press only have the second residual.
+    # Keep the smaller of both residuals. Rows whose charges are not near have only the residual of the thorough search.
     near_residual = residual[searched_rows]
     near_is_smaller = (near_residual**2).sum(axis=1) < (searched_residual**2).sum(axis=1)
     keeps_near_residual = is_near[searched_rows] & near_is_smaller
@@ -308,9 +308,9 @@ def _draw_charges_of_kind(
 def _move_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Array:
     """Move charges in random directions by random distances.
 
-    Charges of any sign are moved by random multiples of the standard deviation of their noise; see
-    `MOVED_LOG_DISTANCES`. Positive charges are multiplied by factors whose logarithms are normally distributed;
-    `MOVED_LOG_STDS` states the range of the standard deviations of these logarithms.
+    Charges of any sign are moved by random multiples of the standard deviation of their noise. The factor of each press
+    is log-uniform within `MOVED_LOG_DISTANCES`. Positive charges are multiplied by factors whose logarithms are
+    normally distributed. The standard deviation of these logarithms is log-uniform within `MOVED_LOG_STDS`.
 
     Args:
         rng: Random number generator.
@@ -322,7 +322,8 @@ def _move_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Arra
     """
     one_per_press = (len(charge), 1)  # the shape of an array with one number for each press
     if isinstance(noise, ChannelNoise):
-        # The noise of a level has the standard deviation 1, so a distance between levels is a multiple of the noise.
+        # A level is a function of the charge whose noise has the standard deviation 1 for every charge. A distance
+        # between levels is therefore a multiple of the noise.
         distance = 10.0 ** rng.uniform(*MOVED_LOG_DISTANCES, one_per_press)
         moved_level = noise.level(charge) + distance * rng.standard_normal(charge.shape)
         return noise.charge(moved_level)
@@ -361,16 +362,16 @@ def _draw_common_factors(rng: np.random.Generator, shape: tuple[int, ...]) -> Ar
 
 
 def _draw_any_charges(rng: np.random.Generator, shape: tuple[int, ...], other_charge: Array, noise: Noise) -> Array:
-    """Draw random charges from a box that contains the charges of all presses.
+    """Draw random charges of each electrode from a range that contains the charges of the presses.
 
-    For charges of any sign, the levels (`ChannelNoise.level`) are uniformly distributed. For positive charges, the
-    logarithms are uniformly distributed. The smallest charge is 1 pC, and the largest charge is the upper limit of a
-    small box or, for some presses, of a large box.
+    For charges of any sign, the levels are uniformly distributed. A level is a function of the charge whose noise has
+    the standard deviation 1. For positive charges, the logarithms are uniformly distributed from 1 pC to an upper
+    limit, which is larger for some presses.
 
     Args:
         rng: Random number generator.
         shape: Shape of the charges, (n, n_electrode).
-        other_charge: Charges of presses, which determine the box for charges of any sign, shape (m, n_electrode), pC.
+        other_charge: Charges of presses, which determine the range for charges of any sign, shape (m, n_electrode), pC.
         noise: Noise of good presses; a `ChannelNoise` for charges of any sign.
 
     Returns:
@@ -380,15 +381,15 @@ def _draw_any_charges(rng: np.random.Generator, shape: tuple[int, ...], other_ch
         level = noise.level(other_charge)
         lowest_level = level.min(axis=0)
         highest_level = level.max(axis=0)
-        # With a margin on both sides, the box is twice as wide as the range of the charges.
+        # With a margin on both sides, the range is twice as wide as that of the presses.
         margin = 0.5 * (highest_level - lowest_level)
         drawn_level = rng.uniform(lowest_level - margin, highest_level + margin, shape)
         return noise.charge(drawn_level)
 
     n_press, _ = shape
-    has_large_box = rng.random((n_press, 1)) < LARGE_BOX_FRACTION
-    log_limit = np.where(has_large_box, np.log10(HIGHEST_CHARGE), BOX_LOG_LIMIT)
-    return 10.0 ** (log_limit * rng.random(shape))  # from 10^0 = 1 pC
+    has_large_limit = rng.random((n_press, 1)) < LARGE_BOX_FRACTION
+    log_limit = np.where(has_large_limit, np.log10(HIGHEST_CHARGE), BOX_LOG_LIMIT)  # of each press, shape (n_press, 1)
+    return 10.0 ** (log_limit * rng.random(shape))  # the exponents begin at 0, so the smallest charge is 1 pC
 
 
 def combined_charge(first: Array, second: Array, exponent: Array | float) -> Array:

@@ -53,22 +53,22 @@ class OutsidePresses:
 
     @classmethod
     def of(cls, sensor: Sensor, probes: tuple[str, ...], force_range: tuple[float, float]) -> "OutsidePresses | None":
-        """Simulate a coarse forward map of the whole film for the probe with the largest reach.
+        """Simulate a coarse forward map of the whole film, and return presses on it. The map is for a single probe.
 
-        The reach of a probe is the distance from the centroid of its footprint to the farthest point of the footprint.
+        This probe is a disk whose radius is the largest reach of the given probes. The reach of a probe is the distance
+        from the centroid of its footprint to the farthest point of the footprint.
 
         Args:
             sensor: The sensor.
-            probes: Notations of the probes. In the simulation, the probe with the largest reach is replaced by a disk
-                with the same reach.
+            probes: Notations of the probes of the model.
             force_range: Smallest and largest force of the model, N.
 
         Returns:
             Presses on the whole film, which `beyond` restricts to the part outside the working area. None if the film
             cannot be simulated.
         """
-        reach = max(parse_probe(notation).reach for notation in probes)
-        probe = Circle(reach)
+        largest_reach = max(parse_probe(notation).reach for notation in probes)
+        probe = Circle(largest_reach)
         if outermost_distance(sensor.film, probe) < MIN_WIDTH:  # the probe is nearly as large as the film
             return None
         try:
@@ -76,7 +76,8 @@ class OutsidePresses:
         except (SceneError, SolveError) as error:
             _log.warning("presses outside the working area are not simulated: %s", error)
             return None
-        return cls(charge_map, inner=0.0)  # `beyond` replaces the radius, because the working area is not known yet
+        # The working area is not known yet, so its radius is zero at first. `beyond` sets the true radius.
+        return cls(charge_map, inner=0.0)
 
     def beyond(self, radius: float) -> "OutsidePresses | None":
         """Restrict the presses to the ring outside a working area.

@@ -89,9 +89,10 @@ def _stage_numbers(prefix: str, settings: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _stage_settings(chain: Chain) -> dict[str, dict[str, Any]]:
-    """Return the settings of each stage of a signal chain, by the prefix of its macros in C.
+    """Return the settings of each stage of a signal chain, by the prefix of the C macros of the stage.
 
-    If a stage is missing in the chain, its settings are empty. The switch `on` of a stage is one of its settings.
+    A stage is one step of the signal processing, such as the tare. If a stage is missing in the chain, its settings are
+    empty. The switch `on` of a stage is one of its settings.
 
     Args:
         chain: The signal chain.
@@ -105,8 +106,8 @@ def _stage_settings(chain: Chain) -> dict[str, dict[str, Any]]:
         settings.pop("pC_per_K", None)  # a chain in C has no pyroelectric charges
         settings_by_prefix[prefix] = settings
     if leak is not None:
-        # The settings of the leak have one time constant for all electrodes. The time constants of the chain, one for
-        # each electrode, replace it, and are written first.
+        # The settings of the leak contain a single time constant. The time constants of the chain, one for each
+        # electrode, replace it. They become the first setting, and the macros are written in the order of the settings.
         leak_settings = settings_by_prefix["LEAK"]
         del leak_settings["tau_s"]
         settings_by_prefix["LEAK"] = {"tau_s": chain.tau_s, **leak_settings}

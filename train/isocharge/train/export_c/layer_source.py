@@ -59,9 +59,12 @@ class LayerSource:
     def text(self) -> str:
         """Return the C text of the constant arrays, and of the function that computes y = activation(x @ weight + c).
 
-        The function adds c last. If a large c were added first, the intermediate sums would lose accuracy.
+        The arguments of the C function are the inputs x, the bias c and the outputs y. The function adds c last. If a
+        large c were added first, the intermediate sums would lose accuracy.
         """
         n_input, n_output = self.weight.shape
+
+        # The arrays: the weights of each block, the scales if the weights are integers, and the bias if it is constant
         values, scale = round_to_int8(self.weight)
         block_names = [f"{self.name}_weights_{block_index}" for block_index in range(len(self.blocks))]
         named_blocks = list(zip(block_names, self.blocks, strict=True))
@@ -71,10 +74,13 @@ class LayerSource:
         if self.bias is not None:
             arrays.append(c_array(f"{self.name}_bias", self.bias))
 
-        # If the weights are integers, each sum is multiplied by the scale of its column.
+        # C expression for output j. At first, y[j] contains the sum of the products for this output. If the weights are
+        # integers, the sum is multiplied by the scale of its column.
         result = "y[j] + c[j]" if scale is None else f"y[j] * {self.name}_scale[j] + c[j]"
         if self.activation is not None:
             result = f"{self.activation.c_function}({result})"
+
+        # The function: set the sums to zero, add the products of each block, and compute the outputs.
         products = [_product_lines(name, block, values[block]) for name, block in named_blocks]
         lines = [
             f"/* {n_input} numbers x to {n_output} numbers y */",
@@ -92,13 +98,14 @@ class LayerSource:
 
 
 def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Block, ...]]:
-    """Find the blocks of the weights of consecutive layers.
+    """Find the blocks of the weight matrices of consecutive layers, outside which all weights are zero.
 
-    A layer has two blocks if two perceptrons run side by side in it, and otherwise one block. With two perceptrons, the
-    weight matrix is block diagonal, because no weight connects both perceptrons. The inputs and outputs of the first
-    perceptron come first. The layers are examined in reverse order. For the last layer, the caller states which outputs
-    belong to the first perceptron. The rows of a weight matrix show which inputs of the layer belong to the first
-    perceptron. The inputs of a layer are the outputs of the layer before it.
+    In some layers, two perceptrons run side by side, and no weight connects them. The weight matrix then has two blocks
+    on its diagonal: the upper left block of the first perceptron, and the lower right block of the second one. All
+    other layers have a single block, which is the whole matrix.
+
+    The layers are examined from the last to the first. It is always known which outputs of a layer belong to the first
+    perceptron. The weights then show which inputs belong to it, and these inputs are the outputs of the layer before.
 
     Args:
         weights: Weights of each layer except the first layer, whose inputs both perceptrons share.
@@ -110,10 +117,11 @@ def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Bloc
     blocks: list[tuple[Block, ...]] = []
     n_first_output = first_width  # number of outputs of the examined layer that belong to the first perceptron
     for matrix in reversed(weights):
-        # The inputs of the second perceptron follow those of the first perceptron. They begin at the first row with a
-        # weight for the outputs of the second perceptron.
+        # Each row of the matrix is an input. The inputs of the second perceptron begin at the first row with a weight
+        # for an output of the second perceptron.
         is_used_by_second = matrix[:, n_first_output:].any(axis=1)
-        n_first_input = int(is_used_by_second.argmax())  # index of the first true value
+        n_first_input = int(is_used_by_second.argmax())  # index of the first true value, or 0 without true values
+        # The matrix has two blocks if no later row has a weight for an output of the first perceptron.
         connects_second_to_first = matrix[n_first_input:, :n_first_output].any()
         is_block_diagonal = n_first_input > 0 and not connects_second_to_first
         if is_block_diagonal:

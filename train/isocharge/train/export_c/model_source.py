@@ -70,8 +70,9 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     activation = network.layers.activation
     widest = max(layer.weight.shape[1] for layer in hidden)
 
-    # The first hidden layer reads the buffer `logs` with the inputs of the network. The hidden layers write alternately
-    # to the buffers `one` and `other`, and each layer reads the buffer that the layer before it wrote.
+    # Write the C calls of the layers. The first hidden layer reads the inputs of the network from the buffer `logs`.
+    # The hidden layers write alternately to the buffers `one` and `other`, and each layer reads the buffer that the
+    # layer before it wrote.
     buffers = ["logs", *islice(cycle(["one", "other"]), len(hidden))]
     calls = []
     for layer, (input_buffer, output_buffer) in zip(hidden, pairwise(buffers), strict=True):
@@ -79,6 +80,10 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     calls.append(f"skip({buffers[0]}, skip_bias, skipped);")
     calls.append(f"last({buffers[-1]}, skipped, answers);")
     hidden_buffers = dict.fromkeys(buffers[1:])  # removes repeated names, and keeps the order
+
+    # The template of the file contains a placeholder for each of these arguments. The arguments `plane`, `logs` and
+    # `known` are the numbers of outputs of the last layer up to the position, up to the logarithms, and up to the
+    # angles of the correlations.
     return source_text(
         "isocharge_model.c",
         label=c_comment(metadata.label),
@@ -100,8 +105,9 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
 def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSource, LayerSource]:
     """Return the hidden layers, the skip layer and the output layer of a network.
 
-    The weights and biases are converted to single precision. If the features are logarithms, the weights of the layers
-    that read the features are also changed by `_convert_to_differences`.
+    The weights and biases are converted to single precision. The first hidden layer and the skip layer read the
+    features, which are the inputs of the network. If the features are logarithms, the weights of these two layers are
+    also changed by `_convert_to_differences`.
 
     Args:
         network: The network.
@@ -109,13 +115,16 @@ def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSour
     perceptron = network.layers
     is_logarithmic = network.features.mean is None
     convert_input_weights = _convert_to_differences if is_logarithmic else _to_single_precision
+
+    # From the second layer on, the contact perceptron and the misfit perceptron run side by side, so that the weights
+    # consist of blocks. The outputs of the last layer before the misfit vector belong to the contact perceptron.
     first_layer, *other_layers = perceptron.hidden
     other_weights = [_to_single_precision(layer.weight) for layer in other_layers]
     last_weight = _to_single_precision(perceptron.last.weight)
-    # The outputs before the misfit vector belong to the contact perceptron.
     n_contact_output = network.angle_columns.stop
     *other_blocks, last_blocks = find_blocks([*other_weights, last_weight], n_contact_output)
 
+    # The hidden layers
     first_weight = convert_input_weights(first_layer.weight)
     hidden = [
         LayerSource("layer_0", first_weight, _to_single_precision(first_layer.bias), activation=perceptron.activation)
@@ -124,7 +133,8 @@ def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSour
         name = f"layer_{len(hidden)}"
         bias = _to_single_precision(layer.bias)
         hidden.append(LayerSource(name, weight, bias, blocks, perceptron.activation))
-    # The bias of the output layer is added with the skip layer.
+
+    # The skip layer and the output layer. The bias of the output layer is added with the skip layer.
     skip = LayerSource("skip", convert_input_weights(perceptron.skip), _to_single_precision(perceptron.last.bias))
     last = LayerSource("last", last_weight, blocks=last_blocks)
     return hidden, skip, last

@@ -132,9 +132,11 @@ class ConditionalPerceptron(nn.Module):
     ) -> None:
         """Create the layers with random weights.
 
-        The weight matrix of each layer is the sum of a constant matrix and `N_BASES` basis matrices, each multiplied by
-        a factor phi. The context network computes features of the film from its context. The factors phi and the biases
-        are linear functions of these features. Before the training, the biases do not depend on the film.
+        The weight matrix of each layer is a constant matrix plus a weighted sum of `N_BASES` basis matrices. The
+        weights of this sum, called the factors phi, and the biases depend on the film. A small context network computes
+        features of the film from its context, and the factors and biases are linear functions of these features. The
+        skip layer connects the inputs directly with the outputs. Before the training, its weights are zero, and the
+        biases are the same for all films.
 
         Args:
             n_input: Number of inputs.
@@ -145,11 +147,15 @@ class ConditionalPerceptron(nn.Module):
         """
         super().__init__()
         self.activation = activation
-        layer_shapes = list(pairwise((n_input, *hidden, n_output)))  # numbers of inputs and outputs of each layer
+
+        # Context network: two layers that compute the features of a film
         context_shapes = [(n_context, CONTEXT_WIDTH), (CONTEXT_WIDTH, CONTEXT_WIDTH)]
         self.context = nn.ModuleDict(
             {name: nn.Linear(*shape) for name, shape in zip(CONTEXT_LAYERS, context_shapes, strict=True)}
         )
+
+        # Constant matrix, basis matrices and bias of each layer, and the matrices of the skip layer
+        layer_shapes = list(pairwise((n_input, *hidden, n_output)))  # numbers of inputs and outputs of each layer
         self.constant = nn.ParameterList([_uniform_weights(1.0, shape) for shape in layer_shapes])
         self.bases = nn.ParameterList(
             [_uniform_weights(INITIAL_BASIS_SIZE, shape, (N_BASES,)) for shape in layer_shapes]
@@ -157,7 +163,9 @@ class ConditionalPerceptron(nn.Module):
         self.bias = nn.ModuleList([nn.Linear(CONTEXT_WIDTH, width) for _, width in layer_shapes])
         self.skip = nn.Parameter(torch.zeros(n_input, n_output))
         self.skip_bases = nn.Parameter(torch.zeros(N_BASES, n_input, n_output))
-        n_mixed_matrix = len(layer_shapes) + 1  # the weights of the layers and of the skip layer
+
+        # Linear layer that computes all factors phi: `N_BASES` factors for each layer and for the skip layer
+        n_mixed_matrix = len(layer_shapes) + 1
         self.phi = nn.Linear(CONTEXT_WIDTH, N_BASES * n_mixed_matrix)
 
         for bias_layer in self.bias:  # with weights of zero, the biases are the same for all films

@@ -85,9 +85,10 @@ class FilmScaling:
     def offset(self, parameters: Array) -> Array:
         """Compute the offset vectors o of `to_film` in unit coordinates.
 
-        The electrodes of a film are first rotated about the origin and then displaced. The first two components of the
-        vector o are the displacement of the electrodes. The third component is ln(k / k0), with the stiffness k of the
-        film and the stiffness k0 of the described film.
+        `to_film` converts a contact (x, y, ln F) on the described film into the corresponding contact on another film.
+        The position moves with the electrodes, which are rotated and then displaced. The force is multiplied by k / k0,
+        where k is the stiffness of the film, and k0 is that of the described film. The vector o is the constant part of
+        this conversion: the displacement along x and y, and ln(k / k0).
 
         Args:
             parameters: Parameters of the films, shape (..., n_parameter).
@@ -95,15 +96,17 @@ class FilmScaling:
         Returns:
             Vectors o, shape (..., 3).
         """
-        # A point p moves with the electrodes to R (p - s) + s + ds, where s is the shift in the sensor file and ds the
-        # additional shift of the film. The part that does not depend on p is s + ds - R s.
+        # Position: a point p moves with the electrodes to R (p - s) + s + ds, where R is the rotation matrix, s is the
+        # shift in the sensor file, and ds is the additional shift of the film. The part that does not depend on p is
+        # s + ds - R s.
         described_shift = np.array(self.prior.sensor.calibration.shift)
         rotated_shift = _rotation(_shared(parameters, "rotation")) @ described_shift
         position_offset = described_shift + _shift(parameters) - rotated_shift
 
-        log_stiffness = _shared(parameters, "young") + _shared(parameters, "thickness")
-        offset = np.concatenate([position_offset, log_stiffness[..., None]], axis=-1)  # x, y and ln F
-        return np.asarray(offset / self.domain.scale)
+        # Force: the stiffness is Young's modulus times the thickness. Both parameters are logarithms of ratios.
+        log_stiffness_ratio = _shared(parameters, "young") + _shared(parameters, "thickness")
+        offset = np.concatenate([position_offset, log_stiffness_ratio[..., None]], axis=-1)  # in (x, y, ln F)
+        return np.asarray(offset / self.domain.scale)  # in unit coordinates
 
     def to_film(self, parameters: Array, unit: Array) -> Array:
         """Convert the unit coordinates u on the described film into the unit coordinates T u + o on another film.

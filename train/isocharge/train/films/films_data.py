@@ -168,10 +168,10 @@ def _press_films(
 
 
 def _compute_response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: Array) -> Array:
-    """For presses on one film, compute the parts of the charges that are due to d31, d32 and d33.
+    """For presses on one film, compute the three parts of the charges that are due to d31, d32 and d33.
 
-    The parts are computed with the piezoelectric coefficients and the gains of the sensor file. `FilmPresses.charge`
-    converts the parts to the coefficients and gains of the film.
+    The charge of an electrode is the sum of the three parts. The parts are computed with the piezoelectric coefficients
+    and the gains of the sensor file. `FilmPresses.charge` later multiplies them by factors of the film.
 
     Args:
         prior: Distribution of the films.
@@ -182,7 +182,8 @@ def _compute_response(prior: FilmPrior, family: FilmFamily, parameters: Array, c
     Returns:
         Parts for d31, d32 and d33, shape (n_press, n_electrode, 3), pC.
     """
-    # The coefficients and the gains are logarithms of factors, so zero stands for the values in the sensor file.
+    # Build the forward map of the film, but with the coefficients and the gains of the sensor file. These parameters
+    # are logarithms of factors, so zero stands for the values in the sensor file.
     described_parameters = parameters.copy()
     described_parameters[[D31, D32]] = 0.0
     described_parameters[GAINS] = 0.0
@@ -192,8 +193,11 @@ def _compute_response(prior: FilmPrior, family: FilmFamily, parameters: Array, c
     no_charge = np.zeros((len(contact), len(prior.sensor.electrodes)))
 
     def charges_with(d31: float, d32: float, d33: float = 0.0) -> Array:
-        """Return the charges for the given piezoelectric coefficients, shape (n_press, n_electrode), pC."""
-        if d31 == 0.0 and d32 == 0.0:  # the coefficient of this part is zero in the sensor file
+        """Return the charges for the given piezoelectric coefficients, shape (n_press, n_electrode), pC.
+
+        Without d31 and d32, the charges are zero, and the forward map is not evaluated.
+        """
+        if d31 == 0.0 and d32 == 0.0:
             return no_charge
         other_sensor = replace(forward_map.sensor, piezo=Piezo(d31, d32, d33))
         return replace(forward_map, sensor=other_sensor).charges(contact)
@@ -203,7 +207,7 @@ def _compute_response(prior: FilmPrior, family: FilmFamily, parameters: Array, c
     if piezo.d33 == 0.0:
         d33_part = no_charge
     else:
-        # The charge is a sum of three parts. The map is not evaluated with d33 alone, so its part is the remainder.
+        # `charges_with` needs d31 or d32, so the part of d33 is what remains of the total charge.
         total_charge = charges_with(piezo.d31, piezo.d32, piezo.d33)
         d33_part = total_charge - d31_part - d32_part
     return np.stack([d31_part, d32_part, d33_part], axis=-1)
@@ -308,6 +312,8 @@ def draw_misfit_films(
 ) -> DrawnFilms:
     """Draw films from the prior, and draw charges of every kind on each film.
 
+    The kinds are charges of good presses, charges of faulty presses, and random charges.
+
     Args:
         source: Distribution and forward maps of the films, contacts and noise.
         films: Number of films.
@@ -321,8 +327,8 @@ def draw_misfit_films(
     """
     parameters = source.prior.draw(np.random.default_rng([seed, 2]), films)
     results = in_order(executor, partial(_draw_charges_of_every_kind, source, charges, seed), enumerate(parameters))
-    charge_and_residual = list(track(results, "searching nearest contacts", films))  # one array for each film
-    charge, residual = np.stack(charge_and_residual, axis=1)
+    arrays_of_films = list(track(results, "searching nearest contacts", films))  # each contains charges and residuals
+    charge, residual = np.stack(arrays_of_films, axis=1)  # both of shape (films, charges, n_electrode)
     return DrawnFilms(parameters, charge, residual)
 
 

@@ -176,10 +176,12 @@ class FilmsModel:
     ) -> Fitted:
         """Compute the network of one film, with test presses and all other values that a release needs.
 
-        The network is first computed from the parameters of the film. Up to three corrections follow, each of which is
-        fitted to presses on the simulated film. The first correction adapts the network to charges that differ from the
-        simulated charges by known factors. The second correction fits the correlations of the network. The third
-        correction includes the added variances.
+        The network is first computed from the parameters of the film. Up to three corrections follow, which use presses
+        on the simulated film:
+
+        1. With `charge_factor`, adapt the network to charges that differ from the simulated charges by known factors.
+        2. With `correlation`, fit the correlations between the errors of x, y and force.
+        3. With `added_variance`, add variances to those that the network reports.
 
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
@@ -204,17 +206,20 @@ class FilmsModel:
         sensor, probe = self.prior.film(parameters)
         rng = np.random.default_rng(SEED)
 
-        # The charges of three groups of contacts are computed together: contacts for the test, for the corrections, and
-        # for the added variances.
+        # Draw contacts for the test and for the first two corrections. The contacts for the third correction are given.
         n_train = N_CORRELATION_PRESSES if correlation else N_REGRESSION_PRESSES
         test_contact, train_contact = self._draw_contacts(rng, n_test, n_train)
         uncertain_contact = np.empty((0, 3)) if added_variance is None else added_variance.contact
+
+        # Compute the charges of all three groups of contacts together.
         contact = np.concatenate([test_contact, train_contact, uncertain_contact])
         test_rows, train_rows, uncertain_rows = np.split(np.arange(len(contact)), [n_test, n_test + n_train])
 
         simulated_charge = self.forward_map(parameters).charges(contact)
         factors = np.ones(simulated_charge.shape) if charge_factor is None else charge_factor(contact)
         presses = LabelledPresses(contact, simulated_charge * factors)
+
+        # Apply the corrections.
         if charge_factor is not None:
             regression_rows = train_rows[:N_REGRESSION_PRESSES]
             network = self._adapt_to_factors(network, presses[regression_rows], factors[regression_rows], rng)
@@ -276,9 +281,10 @@ class FilmsModel:
     def fold(self, parameters: Array) -> FoldedNetwork:
         """Compute the network of one film without corrections.
 
-        The perceptrons for the contact and for the misfit are merged into one perceptron. The first layer of the merged
-        perceptron includes the charge scales of the film. The last layer of the merged perceptron includes the rotation
-        and the shift of the electrodes.
+        One perceptron estimates the contact, and another the misfit. Both are merged into one perceptron, which reads
+        the logarithms of the charges. Its first layer also divides the charges by the charge scales of the film, which
+        are their expected ratios to the charges of the described film. Its last layer also converts the estimated
+        contact from the described film to this film, whose electrodes are rotated and shifted.
 
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
@@ -296,13 +302,16 @@ class FilmsModel:
                 f"{parameters.tolist()}"
             )
 
+        # The perceptrons with the weights of this film
         context = self.scaling.context(parameters)
         perceptrons = [weights.perceptron(context) for weights in (self.contact, self.misfit)]
 
+        # The input features ln(Q / typical charge) and their mean. `self.mean` is the mean of ln(Q / charge scale).
         log_charge_mean = self.mean + self.scaling.log_charge_scale(parameters)
         features = logarithmic_features(log_charge_mean)
-        features_mean = log_charge_mean - np.log(features.typical_pC)  # because the features are ln(Q / typical charge)
+        features_mean = log_charge_mean - np.log(features.typical_pC)
 
+        # The map from the answers of the perceptrons to contacts on this film
         rotation = self.scaling.rotation(parameters)
         offset = self.scaling.offset(parameters)
         answer_map = linear_answer_map(self.domain, rotation, offset, features.n_electrode)

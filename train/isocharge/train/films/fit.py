@@ -484,6 +484,9 @@ class _MisfitTraining:
     def good_press_loss(self, n_film: int, n_press: int, random: torch.Generator) -> Tensor:
         """Draw good presses at random, add new noise to their charges, and compute their loss.
 
+        The loss compares the outputs of the network with the residuals. A residual is the difference between the noisy
+        charges and those of the nearest contact, in standard deviations of the noise.
+
         The noise of each press is multiplied by a random factor from 1 to `MAX_NOISE_FACTOR`, because the network also
         has to learn larger misfits.
 
@@ -504,9 +507,11 @@ class _MisfitTraining:
         noise_std = torch.hypot(torch.tensor(self.noise.white), self.noise.gain * charge)
         noisy_charge = charge + noise_std * deviation
 
-        # The residual is the part of the noise that no change of the contact explains.
+        # The target is the residual, which is the part of the noise that no change of the contact explains.
         deviation_column = deviation[..., None]  # column vectors, shape (n_film, n_press, n_electrode, 1)
         residual = (self.good_projection[film_column, press_rows] @ deviation_column)[..., 0]
+
+        # The network learns the residuals with compressed lengths: large lengths count on a logarithmic scale.
         parameters = self.good_presses.parameters[film_rows.numpy()]
         misfit_vector = self.network(self.inputs.values(noisy_charge, parameters), self.inputs.context(parameters))
         return mean_squared_distance(misfit_vector, compress_length(residual))

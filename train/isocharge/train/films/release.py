@@ -60,11 +60,15 @@ class FilmsErrors:
 
 
 def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PRESSES, seed: int = SEED) -> FilmsErrors:
-    """Measure the errors of a network on new films, which are drawn from the prior.
+    """Measure the errors of a network for all films on new films, which are drawn from the prior.
 
-    The result contains position errors in mm and relative force errors in percent over all presses. The result also
-    contains the rms position errors on the median film and on the worst film. The coverage of the 68 or 95 % intervals
-    is the fraction of coordinates, 0 to 1, that lie in their interval.
+    The same presses are evaluated twice. The first evaluation computes a network from the true parameters of each film.
+    The second evaluation uses the network of one assumed film for all films. The assumed film is either the described
+    film or the mean of the prior, whichever gives the smaller rms position error.
+
+    The errors are position errors in mm and relative force errors in percent over all presses, and the rms position
+    errors on the median film and on the worst film. The coverage of the 68 or 95 % intervals is the fraction of
+    coordinates, 0 to 1, that lie in their interval.
 
     Args:
         films: The network.
@@ -73,30 +77,28 @@ def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PR
         seed: Seed of films, presses and noise.
 
     Returns:
-        Errors if the network of each film is computed from its true parameters, and errors if the network of one
-        assumed film is used for all films. The assumed film is the described film or the mean of the prior, whichever
-        gives the smaller error.
+        The errors of both evaluations, and the parameters and the description of the assumed film.
     """
     rng = np.random.default_rng(seed)
     true_films = films.prior.draw(rng, n_film)
     true_contact, noisy_charge = _draw_presses(films, true_films, n_press, rng)
     errors_with_known_film = _errors_with_networks(films, true_films, true_contact, noisy_charge)
 
-    # For each candidate for the assumed film, use its network for all films.
-    assumed_films = {"as described": films.prior.described, "in the middle of all": films.prior.mean}
-    assumed_errors = {}
-    for name, film in assumed_films.items():
-        network_films = np.tile(film, (n_film, 1))
-        assumed_errors[name] = _errors_with_networks(films, network_films, true_contact, noisy_charge)
-    rms_mm = {name: errors["position_rms_mm"] for name, errors in assumed_errors.items()}
+    # Measure the errors with each candidate for the assumed film.
+    candidate_films = {"as described": films.prior.described, "in the middle of all": films.prior.mean}
+    candidate_errors = {}
+    for name, film in candidate_films.items():
+        network_films = np.tile(film, (n_film, 1))  # the same film for all presses
+        candidate_errors[name] = _errors_with_networks(films, network_films, true_contact, noisy_charge)
+    rms_mm = {name: errors["position_rms_mm"] for name, errors in candidate_errors.items()}
     best_name, other_name = sorted(rms_mm, key=lambda name: rms_mm[name])  # the smaller error first
-    best_film = assumed_films[best_name]
-    pretension_MPa = best_film[films.prior.index("pretension")]
+    assumed_film = candidate_films[best_name]
+    pretension_MPa = assumed_film[films.prior.index("pretension")]
     description = (
         f"the film {best_name}, with a pretension of {pretension_MPa:g} MPa.\nThe error over all films is then "
         f"{rms_mm[best_name]:g} mm rms (with the film {other_name}: {rms_mm[other_name]:g} mm)"
     )
-    return FilmsErrors(errors_with_known_film, assumed_errors[best_name], best_film, description)
+    return FilmsErrors(errors_with_known_film, candidate_errors[best_name], assumed_film, description)
 
 
 def _errors_with_networks(

@@ -78,8 +78,11 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
 def _good_press_misfits(fitted: Fitted, seed: int) -> dict[str, float]:
     """Compute the misfits that only a few good presses exceed, for a network that is tested on measured presses.
 
-    Noise is added to the charges of simulated good presses. For measured good presses, the misfits of the
-    cross-validation are used. If there was no cross-validation, the misfits of the network are used.
+    There are three cases:
+
+    - Good presses that were simulated: noise is added to their charges.
+    - Measured good presses with a cross-validation: the misfits of the cross-validation are used.
+    - Measured good presses without a cross-validation: the misfits of the network itself are used.
 
     Args:
         fitted: The network, with its good presses.

@@ -116,14 +116,18 @@ def write_contact_graph(network: FoldedNetwork) -> bytes:
 def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     """Return the ONNX model of a network, without metadata.
 
-    The nodes after the perceptron convert its answers into the outputs: the contact, its standard deviations, the
-    correlations if the network has them, and the misfit. The variables of this function contain the names of tensors.
+    The outputs of the perceptron are called answers. The nodes after the perceptron convert the answers into the
+    outputs of the graph: the contact, its standard deviations, the correlations if the network has them, and the
+    misfit. In this function, a tensor is represented by its name.
 
     Args:
         network: The network.
     """
     builder = GraphBuilder()
     n_electrode = network.features.n_electrode
+
+    # Split the answers: x and y, the logarithms of the force and of the three standard deviations, the angles that
+    # determine the correlations, and the misfit vector.
     widths = {"plane": POSITION.stop, "logs": LOG_STD.stop - POSITION.stop}
     if network.n_angle:
         widths["angles"] = network.n_angle
@@ -131,7 +135,8 @@ def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
     answers = _add_answers(builder, network)
     position, logarithms, *optional_angles, misfit_vector = builder.split(answers, widths)
 
-    # The second part, `contact_std`, is an output of the graph, so it needs no further node.
+    # The exponentials of the logarithms are the force and the standard deviations. The standard deviations already have
+    # the name of an output of the graph, `contact_std`, so they need no further node.
     force, _ = builder.split(builder.add("Exp", logarithms), {"force": 1, "contact_std": 3})
     builder.add("Concat", position, force, to="contact", axis=1)
     for angles in optional_angles:  # one tensor, or none if the network has no correlations
@@ -299,9 +304,10 @@ def _activation_of(operators: Sequence[str], where: str) -> Activation:
         where: Beginning of the error message.
     """
     activation_of_operator = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
-    # The operator `Gemm` is a linear layer. In a graph without linear layers, no operator follows the first one.
+    # The operator `Gemm` is a linear layer. The list `following` contains the operator after the first `Gemm`. It is
+    # empty if the graph has no `Gemm`, or ends with the first one.
     first_layer = operators.index("Gemm") if "Gemm" in operators else len(operators)
-    following = operators[first_layer + 1 : first_layer + 2]  # one operator, or none at the end of the graph
+    following = operators[first_layer + 1 : first_layer + 2]
     if not following or following[0] not in activation_of_operator:
         known_operators = ", ".join(activation_of_operator)
         _refuse(where, f"expected one of the activations {known_operators} after a Gemm, got {following}")

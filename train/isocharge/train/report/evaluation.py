@@ -111,6 +111,10 @@ class DatasetEvaluation:
     ) -> "DatasetEvaluation":
         """Select the presses on which the released model can be evaluated, and split them for fits and tests.
 
+        Measured presses are split into three groups: for training, for the choice of parameters (validation), and for
+        the test (held out). Simulated presses are only split into the first two groups, because the test presses are
+        simulated later.
+
         Args:
             dataset: The dataset.
             model_folder: Version folder of the released model.
@@ -125,15 +129,17 @@ class DatasetEvaluation:
             ModelError: If the model is for another sensor or for a smaller range of forces than the dataset.
             PressError: If there are too few measured presses.
         """
+        # The released model, and the small models of the same sensor
         model = Predictor(model_folder).metadata
         unique_students = dict.fromkeys(students)
         own_students = tuple(path for path in unique_students if Predictor(path).metadata.sensor == model.sensor)
 
+        # The presses within the working area and the forces of the model
         select_for_model = measured_presses_for if is_measured(dataset) else simulated_presses_for
         usable_dataset = select_for_model(model, dataset)
         case = EvaluationCase.of(usable_dataset, settings.presses, settings.seed)
 
-        # The test presses of a simulated dataset are simulated later, so none of its presses is held out.
+        # Separate the test presses from the presses for the fits.
         held_out_presses = None
         if is_measured(dataset):
             all_presses = LabelledPresses.of(usable_dataset)
@@ -145,6 +151,7 @@ class DatasetEvaluation:
             fitting_dataset = _first_presses(usable_dataset, settings.learn_from)
             fitting_presses = presses_of(fitting_dataset)
 
+        # Separate the validation presses from the training presses.
         train, validation = split_by_position(fitting_presses, settings.hold_out, settings.seed)
         task = FittingTask(train, validation, case.domain, case.noise, settings.seed, settings.quick)
         return cls(fitting_dataset, ReleasedModel(model_folder), own_students, task, case, settings, held_out_presses)
@@ -187,22 +194,26 @@ class DatasetEvaluation:
         """
         case = self.case
         settings = self.settings
+
+        # Simulate the test presses. They come from other solves of the film than the limits, except in a quick report.
         forward_maps = case.forward_maps(range_factor=1.0, accuracy=settings.accuracy, executor=executor)
-        # The test presses come from other solves than the limits, except in a quick report.
         test_maps = self._test_maps(forward_maps, executor)
         clean_presses = simulate_presses(test_maps, case.test_sweep())
         noisy_charge = clean_presses.noisy(case.noise, case.seed + TEST_NOISE_SEED)
         test_presses = replace(clean_presses, charge=noisy_charge)
 
+        # Compute the theoretical limits: the Cramér-Rao limit of all presses, and the Bayes limit of the first presses.
         charge_map = ChargeSpline.of(forward_maps[0])
         limits = ErrorBounds.of(case, charge_map, clean_presses, noisy_charge[: settings.limited], executor)
 
+        # Fit and measure the methods. On simulated presses, a method that cannot be fitted raises an error, so there
+        # are no failures to report.
         methods = [*self._released_models(), *compared_methods(self.task, charge_map), *self._new_networks()]
-        # On simulated presses a method that cannot be fitted raises an error, so there are no reasons to report.
         fitted_methods, _ = fit_all(methods, self.task, test_presses)
         fitted_by_name = {fitted.method.name: fitted for fitted in fitted_methods}
         records = measure_methods(fitted_methods, test_presses, settings, limits.posterior_mean)
 
+        # Study the released model.
         noise_draws = studies.NoiseDraws.of(self.released, clean_presses, case, settings.draws)
         threshold = alarm_threshold(noise_draws.misfit)
         content = {

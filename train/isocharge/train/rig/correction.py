@@ -130,12 +130,13 @@ class Correction:
 
 
 def fit_correction(residuals: Residuals) -> Correction:
-    """Fit a correction to residuals by generalised least squares.
+    """Fit a correction of the charges to residuals by generalised least squares.
 
-    For each electrode, the logarithm of the correction is a sum of polynomials. The prior standard deviation of the
-    polynomials' coefficients is called the size of the correction. Each size in `SIZES` is a hypothesis, and the size
-    zero means that there is no correction. The coefficients are averaged over the hypotheses, with the probabilities of
-    the hypotheses as weights.
+    The correction multiplies the charge of each electrode by a factor. The logarithm of the factor is a sum of
+    polynomials of the contact. The expected size of their coefficients is not known, so several sizes are tried. Each
+    size is a hypothesis: the coefficients are normally distributed with this standard deviation. With the size zero,
+    there is no correction. The fitted coefficients are averaged over the hypotheses, with the probabilities of the
+    hypotheses as weights.
 
     Args:
         residuals: Differences between measured presses and a forward map.
@@ -157,16 +158,19 @@ def fit_correction(residuals: Residuals) -> Correction:
         """Return the prior covariance of the coefficients, which are independent of each other."""
         return hypothesis.discrepancy**2 * np.eye(n_coefficient)
 
+    # Fit the coefficients under each hypothesis, and average them. The attribute `discrepancy` is the size.
     model = _normal_equations(residuals, domain, n_coefficient)
     models_by_force_scatter = {0.0: model}  # none of the hypotheses has an additional scatter of the forces
     hypotheses = [Hypothesis(discrepancy=size) for size in SIZES]
     mixture = mix_hypotheses(models_by_force_scatter, prior_covariance, hypotheses)
 
+    # Without a correction if this is most probable; otherwise with the averaged coefficients
     most_probable_size = mixture.best.discrepancy
     if most_probable_size == 0.0:
         return Correction(domain, coefficients=np.zeros((n_term, n_electrode)), freedom=0.0)
     coefficients = mixture.mean.reshape(n_term, n_electrode)
-    # The effective number of determined coefficients is the trace of the posterior covariance times the information.
+    # The residuals determine some of the coefficients, and the prior determines the others. The effective number of
+    # coefficients that the residuals determine is the trace of the posterior covariance times the normal matrix.
     effective_count = float(np.trace(mixture.covariance @ model.normal))
     return Correction(domain, coefficients, effective_count)
 
@@ -197,11 +201,12 @@ def _normal_equations(residuals: Residuals, domain: Domain, n_coefficient: int) 
 
 
 def _linear_model(residuals: Residuals, domain: Domain) -> LinearModel:
-    """Express the sum of the squared residuals as a quadratic function of the coefficients.
+    """Express the sum of the squared residuals as a quadratic function of the coefficients of a correction.
 
-    Let P be the polynomials of a press, c the coefficients, and l the measured ln(Q / charge of the map). The whitened
-    residuals of the press are W (P c - l), which are linear in c. The whitening matrix W is the inverse of the Cholesky
-    factor of the covariance. The covariance of the whitened residuals is therefore the unit matrix.
+    Let P be the values of the polynomials at a press, c the coefficients, and l the measured ln(Q / charge of the map).
+    The residuals P c - l of the electrodes are correlated. They are multiplied by a whitening matrix W, so that their
+    covariance becomes the unit matrix. W is the inverse of the Cholesky factor of the covariance. The whitened
+    residuals W (P c - l) are linear in c, so the sum of their squares is quadratic in c.
 
     Args:
         residuals: Residuals of n presses.

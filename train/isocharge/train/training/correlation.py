@@ -96,46 +96,59 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
     Returns:
         Network with eight additional answers, which are the arguments of the cosines.
     """
-    # Errors of (x, y, ln F) and their estimated standard deviations, each of shape (n, 3)
+    # Outputs of the network for copies of the presses with noise
     layers = network.layers
     examples = presses.repeated(N_EXAMPLES)
     features = network.features.evaluate(examples.noisy(noise, seed))
     hidden_output = evaluate_hidden_layers(layers.hidden, layers.activation, features)
     answers = evaluate_output_layer(layers, hidden_output, features)
     contact, std, *_ = network.outputs_from_answers(answers)
-    true_contact = examples.contact
-    position_error = true_contact[:, :2] - contact[:, :2]
-    log_force_error = np.log(true_contact[:, 2] / contact[:, 2])
-    log_force_std = std[:, 2] / contact[:, 2]
-    error = np.column_stack([position_error, log_force_error])
-    error_std = np.column_stack([std[:, :2], log_force_std])
 
-    # Fit the angles a, b and c.
+    # Fit the linear functions for the angles. Their inputs are the outputs of the hidden units that influence the
+    # contact, followed by the features.
     contact_weight = layers.last.weight[:, :N_CONTACT_ANSWERS]  # shape (n_hidden, N_CONTACT_ANSWERS)
     is_contact_unit = np.any(contact_weight != 0.0, axis=1)
     inputs = np.hstack([hidden_output[:, is_contact_unit], features])
     with threadpool_limits(1):  # the steps are so small that two threads would be slower than one
-        angles = _fit_angles(inputs, error / error_std)
+        angle_layer = _fit_angles(inputs, _errors_over_std(examples.contact, contact, std))
 
-    # The inputs of the fit were the hidden units that influence the contact, followed by the features. All other hidden
-    # units get the weight zero.
+    # Split the fitted weights into those of the hidden units and those of the features. All hidden units that do not
+    # influence the contact get the weight zero.
     n_contact_unit = np.count_nonzero(is_contact_unit)
-    contact_unit_weight, skip_weight = np.split(angles.weight, [n_contact_unit])
+    contact_unit_weight, skip_weight = np.split(angle_layer.weight, [n_contact_unit])
     hidden_weight = np.zeros((hidden_output.shape[1], 3))
     hidden_weight[is_contact_unit] = contact_unit_weight
 
     # The correlations are weighted sums of cosines of a, b, a - b, a + b and so on. The new output layer computes these
     # eight arguments instead of the three angles.
-    argument_layer = Layer(hidden_weight @ ANGLES_TO_COSINE_ARGUMENTS, angles.bias @ ANGLES_TO_COSINE_ARGUMENTS)
+    argument_layer = Layer(hidden_weight @ ANGLES_TO_COSINE_ARGUMENTS, angle_layer.bias @ ANGLES_TO_COSINE_ARGUMENTS)
     return network.with_angles(argument_layer, skip_weight @ ANGLES_TO_COSINE_ARGUMENTS)
+
+
+def _errors_over_std(true_contact: Array, contact: Array, std: Array) -> Array:
+    """Return the errors of estimated (x, y, ln F), divided by their estimated standard deviations, shape (n, 3).
+
+    Args:
+        true_contact: True contacts (x, y, F), shape (n, 3), mm and N.
+        contact: Estimated contacts (x, y, F), shape (n, 3), mm and N.
+        std: Estimated standard deviations of (x, y, F), shape (n, 3), mm and N.
+    """
+    position_error = true_contact[:, :2] - contact[:, :2]
+    log_force_error = np.log(true_contact[:, 2] / contact[:, 2])
+    log_force_std = std[:, 2] / contact[:, 2]  # d ln F = dF / F
+    error = np.column_stack([position_error, log_force_error])
+    error_std = np.column_stack([std[:, :2], log_force_std])
+    return np.asarray(error / error_std)
 
 
 def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
     """Fit a linear layer that computes the angles a, b and c.
 
-    The inputs are whitened for the fit. The returned layer includes this whitening. The fit minimises
-    `correlation_loss` plus a penalty on the squared weights. The first step of the L-BFGS method has a length of about
-    1. For a shorter first step, the variables of the minimisation are the bias and the weights divided by `FIRST_STEP`.
+    The fit minimises `correlation_loss` plus a penalty on the squared weights. For the fit, the inputs are whitened: a
+    linear map gives them unit variances without correlations. The returned layer includes this map.
+
+    The variables of the minimisation are the bias and the weights divided by `FIRST_STEP`. The L-BFGS method makes a
+    first step with a length of about 1 in the variables, and thus of about `FIRST_STEP` in the bias and the weights.
 
     Args:
         inputs: Inputs of the layer, shape (n, k).
@@ -144,11 +157,11 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
     Returns:
         Layer from the inputs to the angles: weight, shape (k, 3), and bias, shape (3,).
     """
-    whitening_inputs = inputs[::WHITENING_STRIDE]
-    mean, matrix = whitening(whitening_inputs, MIN_RELATIVE_STD)
+    # Whitened inputs, shape (n, n_input), and limited errors, shape (3, n), in single precision
+    mean, matrix = whitening(inputs[::WHITENING_STRIDE], MIN_RELATIVE_STD)
     whitened_inputs = np.ascontiguousarray((inputs - mean) @ matrix, dtype=np.float32)
     clipped_deviation = np.clip(deviation, -MAX_DEVIATION, MAX_DEVIATION)
-    transposed_deviation = np.ascontiguousarray(clipped_deviation.T, dtype=np.float32)  # shape (3, n)
+    transposed_deviation = np.ascontiguousarray(clipped_deviation.T, dtype=np.float32)
     n_input = inputs.shape[1]
 
     def loss(scaled_parameters: Array) -> tuple[float, Array]:
@@ -164,6 +177,7 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
         loss_without_penalty, angle_gradient = correlation_loss(angles, transposed_deviation)
         penalty = RIDGE * float((weight**2).sum())
 
+        # Gradient with respect to the parameters by the chain rule, and then with respect to the scaled parameters
         bias_gradient = angle_gradient.sum(axis=1, dtype=float)
         weight_gradient = whitened_inputs.T @ angle_gradient.T + 2.0 * RIDGE * float32_weight
         parameter_gradient = np.vstack([bias_gradient, weight_gradient])
@@ -175,6 +189,8 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
     scaled_solution = _minimise(loss, start.ravel())
     solution = FIRST_STEP * scaled_solution.reshape(start.shape)
     bias, weight_of_whitened = np.split(solution, [1])
+
+    # Include the whitening in the layer:
     # ((inputs - mean) @ matrix) @ weight_of_whitened + bias = inputs @ weight + (bias - mean @ weight)
     weight = matrix @ weight_of_whitened
     return Layer(weight, bias[0] - mean @ weight)

@@ -124,13 +124,15 @@ def fit_presses(
     noise = ChannelNoise.of(labelled.charge, domain.to_unit(labelled.contact))
     with threads_and_seed(training.threads, training.seed):
         features = WhitenedFeatures.fit_signed(labelled.charge, noise.transition_charge(labelled.charge))
-        # The first network is trained last, on the mean outputs of the other networks. Each of these belongs to a fold.
+        # The first network will be returned. The other networks each belong to one fold of the cross-validation.
         network, *fold_networks = (InverseNetwork(domain, features, settings.network) for _ in range(1 + N_FOLDS))
+        # Cross-validation: for each fold, train a network on the presses of all other folds.
         fold = folds_by_place(labelled.contact, N_FOLDS)
         steps = _train_fold_networks(fold_networks, labelled, fold, noise, training, run)
         contact, std = _cross_validated_contact(fold_networks, labelled.charge, fold)
-        position_factor, force_factor = std_factors(contact, std, labelled.contact)
+        position_factor, force_factor = std_factors(contact, std, labelled.contact)  # correct the stated errors
 
+        # Train the returned network: its contacts on the mean outputs of the other networks, then its misfits.
         distillation = _distillation_stage(network, fold_networks, labelled, noise, training)
         train_perceptron(distillation, network.contact, settings, run)
         draw = partial(_misfit_examples, labelled, domain, noise, training)
@@ -142,17 +144,7 @@ def fit_presses(
         std=std * [position_factor, position_factor, force_factor],
         misfit=_cross_validated_misfit(labelled, domain, noise, fold),
     )
-    made_with = {
-        "config": settings.to_dict(),
-        "torch": torch.__version__,
-        "measured": {
-            "presses": len(usable),
-            "places": len(np.unique(labelled.contact[:, :2], axis=0)),
-            "folds": N_FOLDS,
-            "steps": steps,
-            "std_factors": [float(f"{factor:.4g}") for factor in (position_factor, force_factor)],
-        },
-    }
+    made_with = _made_with(settings, labelled, steps, (position_factor, force_factor))
     return Fitted(
         network=fold_network(network.eval()).with_scaled_std(position_factor, force_factor),
         sensor=MeasuredSensor(name, usable.electrodes),
@@ -176,6 +168,30 @@ def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, o
         "config": config.to_dict(),
         "isocharge": metadata.version("isocharge"),
         "torch": torch.__version__,
+    }
+
+
+def _made_with(
+    settings: FitConfig, presses: LabelledPresses, steps: int, factors: tuple[float, float]
+) -> dict[str, object]:
+    """Return what the metadata of the network state about its training.
+
+    Args:
+        settings: Settings of the training.
+        presses: Presses on which the network was trained.
+        steps: Number of steps with which the networks of the cross-validation were trained.
+        factors: Factors on the standard deviations of the position and of the force.
+    """
+    return {
+        "config": settings.to_dict(),
+        "torch": torch.__version__,
+        "measured": {
+            "presses": len(presses),
+            "places": len(np.unique(presses.contact[:, :2], axis=0)),
+            "folds": N_FOLDS,
+            "steps": steps,
+            "std_factors": [float(f"{factor:.4g}") for factor in factors],
+        },
     }
 
 
@@ -443,10 +459,11 @@ def _distillation_stage(
 def _misfit_examples(
     presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, config: TrainingConfig
 ) -> Array:
-    """Draw charges of many kinds, and compute their residuals with respect to the nearest contact.
+    """Draw charges for the training of the misfit perceptron, and compute their residuals.
 
-    Near each measured press, the charges as functions of the contact are approximated by a plane. This plane is fitted
-    to neighbouring presses.
+    The charges are of many kinds, also such that no contact causes. The residual of charges is their difference from
+    the charges of the most similar contact. The charges of contacts are known only at the measured presses. Near each
+    press, they are therefore approximated by linear functions of the contact, which are fitted to neighbouring presses.
 
     Args:
         presses: All presses.
@@ -458,8 +475,11 @@ def _misfit_examples(
         Charges, pC, and residuals in standard deviations of the noise, shape (2, n, n_electrode).
     """
     rng = np.random.default_rng(config.seed)
-    # The level of a charge is the charge on a scale on which the noise has the standard deviation 1.
+    # The linear functions, as one plane for each press. They approximate the levels of the charges. A level is a charge
+    # on a scale on which the noise has the standard deviation 1.
     planes = LocalPlanes.through(domain.to_unit(presses.contact), noise.level(presses.charge))
+
+    # Draw charges, which are made from the charges of randomly chosen presses.
     n_electrode = presses.charge.shape[1]
     chosen_rows = rng.integers(len(presses), size=config.misfit_charge_count(n_electrode))
     _, charge = draw_charges(rng, presses.charge[chosen_rows], presses.charge, noise)
@@ -483,7 +503,10 @@ def _saved_or_drawn(draw: Callable[[], Array], run: ResumableRun | None) -> Arra
 def _cross_validated_misfit(
     presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, fold: Integers
 ) -> Array:
-    """Compute the misfit of each press, using local planes that are fitted to the presses of all other folds.
+    """Compute the misfit of each press with respect to the presses of all other folds.
+
+    The misfit is the length of the residual: the difference of the charges of the press from those of the most similar
+    contact. Near each of the other presses, the charges of contacts are approximated by linear functions (planes).
 
     Args:
         presses: All presses.

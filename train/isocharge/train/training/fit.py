@@ -235,7 +235,12 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
         inner_examples = examples.inner()
 
         def train_misfit() -> OutsidePresses | None:
-            """Train the misfit perceptron, and return the presses outside the working area if they are simulated."""
+            """Train the misfit perceptron, and return the presses outside the working area.
+
+            The perceptron learns examples from the working area and, if the presses are simulated, from the rest of the
+            film. The function returns None if there are no presses outside.
+            """
+            # Wait until the presses on the whole film are simulated, and select those outside the working area.
             outside = None
             film_presses = whole_film.result() if whole_film is not None else None
             if film_presses is not None:
@@ -372,15 +377,24 @@ def contact_stage(
     linear_steps = round(LINEAR_TARGET_FRACTION * steps)
 
     def loss(step: int, random: torch.Generator) -> Tensor:
-        """Return the loss of a random batch with new noise. The form of the loss depends on the step."""
+        """Return the loss of a random batch with new noise.
+
+        In the first steps, the network learns from linear targets if there are any. Later, or without linear targets,
+        it learns from the answers of the teacher or, without a teacher, from the true contacts. The warm-up has a
+        simpler loss in each case.
+
+        Args:
+            step: Number of the step.
+            random: Random number generator of the batch and of its noise.
+        """
         rows = torch.randint(len(charge), (batch,), generator=random)
+        contact = unit_contact[rows]
+        is_warm_up = step < warm_up_steps
         if linear_targets is not None and step < linear_steps:
-            return linear_loss(linear_targets.draw(rows, random), unit_contact[rows], is_warm_up=step < warm_up_steps)
+            return linear_loss(linear_targets.draw(rows, random), contact, is_warm_up=is_warm_up)
 
         noisy_batch = with_fresh_noise(charge[rows], noise, random)
-        contact = unit_contact[rows]
         mean, log_std, angles = network.posterior_with_angles(noisy_batch)
-        is_warm_up = step < warm_up_steps
         if teacher is None:
             if is_warm_up:
                 return warm_up_loss(mean, log_std, contact)
@@ -395,15 +409,19 @@ def contact_stage(
     def linear_loss(linear_batch: TargetBatch, contact: Tensor, *, is_warm_up: bool) -> Tensor:
         """Return the loss of a batch with linear targets.
 
+        A linear target is the true contact plus the change that the enlarged noise of the charges causes in a linear
+        estimate.
+
         Args:
-            linear_batch: Charges, targets and factors of the noise.
+            linear_batch: Charges with enlarged noise, targets, and factors by which the noise was enlarged.
             contact: True unit coordinates, shape (n, 3).
             is_warm_up: Whether the step belongs to the warm-up.
         """
         mean, log_std, angles = network.posterior_with_angles(linear_batch.charge)
         if is_warm_up:
             return warm_up_loss(mean, log_std, linear_batch.target)
-        # The errors grow with the noise. The division gives the errors that charges with their usual noise cause.
+        # The errors are proportional to the noise. The division by the factor gives the errors that charges with their
+        # usual noise would cause, from which the standard deviations and the correlations learn.
         error = (contact - mean) / linear_batch.noise_factor
         mean_and_std_loss = linear_target_loss(mean, log_std, linear_batch.target, error)
         return mean_and_std_loss + correlation_loss(angles, error, log_std)

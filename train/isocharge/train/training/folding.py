@@ -78,8 +78,9 @@ def transform_inputs(perceptron: Perceptron[Array], transform: Layer[Array]) -> 
 def linear_answer_map(domain: Domain, rotation: Array, offset: Array, n_electrode: int) -> Layer[Array]:
     """Return the linear map from the outputs of the contact perceptron and the misfit perceptron to the answers.
 
-    The outputs contain the logarithm of the relative standard deviation of the force. The answers contain the logarithm
-    of its absolute standard deviation. The map therefore adds ln F to the logarithm.
+    The outputs are in unit coordinates, and are converted to (x, y, ln F). The outputs also contain the logarithm of
+    the relative standard deviation of the force. The answers contain the logarithm of its absolute standard deviation
+    in N. The map therefore adds ln F to this logarithm.
 
     Args:
         domain: Domain that defines the centre and the scale of the unit coordinates.
@@ -97,7 +98,8 @@ def linear_answer_map(domain: Domain, rotation: Array, offset: Array, n_electrod
     weight[MEAN, MEAN] = rotation.T * domain.scale
     bias[MEAN] = offset * domain.scale + domain.centre
 
-    # Logarithms of the standard deviations: add ln(scale). For the force, also add ln F as the map above computes it.
+    # Logarithms of the standard deviations: add ln(scale). For the force, also add ln F, and therefore copy the weights
+    # and the bias with which the map computes ln F from the means.
     bias[LOG_STD] = np.log(domain.scale)
     weight[MEAN, LOG_FORCE_STD] = weight[MEAN, LOG_FORCE]
     bias[LOG_FORCE_STD] += bias[LOG_FORCE]

@@ -80,7 +80,11 @@ class LinearTargets:
 
     @classmethod
     def of(cls, presses: LabelledPresses, charge_map: ChargeMap, noise: Noise) -> "LinearTargets":
-        """Compute the linear estimates of presses.
+        """Compute, for each press, the matrix A with which its estimated contact follows the noise of its charges.
+
+        If the noise n is added to the charges, the linear estimate of the contact changes by A n. With the derivatives
+        J of the charges, the inverse W of the noise covariance, and the prior precision P, the matrix is
+        A = (J' W J + P)^-1 J' W. It is zero where the estimate is not linear in the noise.
 
         Args:
             presses: Presses without noise.
@@ -90,12 +94,15 @@ class LinearTargets:
         domain = charge_map.domain
         derivatives = charge_map.derivatives(presses.contact)
         noise_std = noise.sigma(presses.charge)
-        whitened_jacobian = derivatives * domain.scale / noise_std[:, :, None]  # W^(1/2) J, shape (n, n_electrode, 3)
+        # W^(1/2) J in unit coordinates, shape (n, n_electrode, 3), and its transpose
+        whitened_jacobian = derivatives * domain.scale / noise_std[:, :, None]
         transposed = whitened_jacobian.swapaxes(1, 2)
         precision = transposed @ whitened_jacobian + UNIT_PRECISION * np.eye(3)  # J' W J + P, shape (n, 3, 3)
         gain = np.linalg.solve(precision, transposed / noise_std[:, None, :])
 
-        # The inverse of the precision is the covariance of the contact. Its diagonal contains the variances.
+        # If the contact is too uncertain, the estimate is not linear. If it is very certain, the noise is enlarged up
+        # to the limit of linearity. The inverse of the precision is the covariance of the contact, and its diagonal
+        # contains the variances.
         contact_variance = np.linalg.inv(precision).diagonal(axis1=1, axis2=2)
         largest_std = np.sqrt(contact_variance.max(axis=1))
         is_linear = largest_std <= LARGEST_LINEAR_STD

@@ -52,14 +52,15 @@ class Split:
     def of(cls, data: TrainingData, training: TrainingConfig) -> "Split":
         """Split presses into three parts for training, validation and test, and fit a charge field to them.
 
-        The charge field is a map from contacts to charges. A first charge field is fitted to all presses. This first
-        field determines the largest disk in which the map certainly does not fold. Only the presses within this disk
-        are distributed among the three parts.
+        A charge field is a smooth map from contacts to charges. The map folds where different contacts have the same
+        charges. A first field is fitted to all presses. It determines the largest disk in which the map certainly does
+        not fold. Only the presses within this disk are distributed among the three parts.
 
         Args:
             data: Presses of the sensor.
             training: Fractions of the presses, noise and seed.
         """
+        # First field, and the domain without folds
         presses = data.presses
         electrode_names = data.sensor.electrode_names
         field_train, field_validation = split_by_position(presses, training.hold_out, training.seed)
@@ -70,9 +71,9 @@ class Split:
 
         train, validation, test = _split_presses(used_presses, training)
 
-        # If the map folds, the first field was also fitted to presses beyond the fold. If the presses are measured, the
-        # first field was also fitted to test presses. In both cases, a second field is fitted to the training presses.
-        # For a map that folds, the more accurate field is used.
+        # A second field, without the test presses, is fitted in two cases. If the map folds, the first field was also
+        # fitted to presses beyond the fold. Then the more accurate of both fields is used. If the presses are measured,
+        # the first field was also fitted to test presses.
         field: ChargeMap = whole_field
         if is_folded or presses.measured:
             field = ChargeField.fit(domain, electrode_names, train, validation)
@@ -84,17 +85,19 @@ class Split:
     def features(self, noise: NoiseModel) -> WhitenedFeatures:
         """Fit the input features to the training presses.
 
-        The features are logarithms if all charges are positive, and inverse hyperbolic sines otherwise.
+        The features are logarithms of the charges if all charges are positive. Otherwise, they are inverse hyperbolic
+        sines of charge / typical charge, which are linear for small charges and logarithmic for large charges.
 
         Args:
-            noise: Noise of the charges, which determines the scale on which the inverse hyperbolic sines are nonlinear.
+            noise: Noise of the charges, which determines the typical charges.
         """
         charge = self.train.charge
         has_both_signs = self.train.signed or self.validation.signed or self.test.signed
         if not has_both_signs:
             return WhitenedFeatures.fit_logarithms(charge)
         channel_noise = ChannelNoise.alike(noise, charge.shape[1])
-        # The typical charges are the charges above which smaller noise would be proportional to the charge.
+        # The typical charge of a channel is the charge above which the noise would be proportional to the charge if the
+        # white noise were multiplied by `SIGNED_FEATURE_SCALE`.
         smaller_noise = replace(channel_noise, white=SIGNED_FEATURE_SCALE * channel_noise.white)
         return WhitenedFeatures.fit_signed(charge, smaller_noise.transition_charge(charge))
 

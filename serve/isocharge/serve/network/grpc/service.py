@@ -103,7 +103,7 @@ class Service:
         return grpc.method_handlers_generic_handler(SERVICE, methods)
 
     async def _handle(self, name: str, _: object, context: grpc.aio.ServicerContext) -> Any:
-        """Answer a call, count the call by its status, and log the call if there is a log.
+        """Answer a call. Then count the call by its status, and log the call if there is a log.
 
         Args:
             name: Name of the method.

@@ -152,14 +152,13 @@ class Connection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Process data that the client has sent.
 
-        Short data are parsed at once. Long data are parsed in slices, and other connections are served between the
-        slices. While an answer is being computed, or while the client does not read its responses, data are stored but
-        not parsed. If a request has the same head as the previous request, the head is not parsed again.
+        There are three cases. Data that are long or that must wait are stored, and are parsed in slices. A request with
+        the same head as the previous request is answered without parsing it. All other data are parsed at once.
         """
-        if self._is_refused or self._transport.is_closing():
+        if self._is_refused or self._transport.is_closing():  # the data are ignored
             return
 
-        # Store data that are long, or that must wait for earlier data or for an answer. They are parsed in slices.
+        # Case 1: the data are long, or must wait for earlier data, for an answer, or for the client to read responses.
         must_wait = self._unparsed or self._answering or self._is_blocked
         if must_wait or len(data) > SLICE_BYTES:
             self._unparsed += data
@@ -167,17 +166,17 @@ class Connection(asyncio.Protocol):
                 self._parse_stored_data()
             return
 
-        # If a request has the same head and the same size as the previous request, answer it without the parser.
+        # Case 2: the data have the same head and the same size as the previous request.
         repeats_head = len(data) == self._remembered_bytes and data.startswith(self._remembered_head)
-        if repeats_head and self._head is not None:
+        if repeats_head and self._head is not None:  # `_head` is the parsed head of the previous request
             body = data[len(self._remembered_head) :]
             self._answer(self._head, body)
             return
 
-        # Parse all other short data. If the data are exactly one complete request, store its head.
-        begins_request = self._phase is Phase.IDLE
+        # Case 3: all other data.
+        begins_request = self._phase is Phase.IDLE  # no earlier request is incomplete
         self._parse(data)
-        if begins_request and self._piece_was_answered:
+        if begins_request and self._piece_was_answered:  # the next request may have the same head
             self._remember(data)
 
     def eof_received(self) -> bool:
@@ -253,9 +252,11 @@ class Connection(asyncio.Protocol):
         self._resume_reading()
 
     def _resume_reading(self) -> None:
-        """Resume reading if all stored data have been parsed, and pause reading otherwise.
+        """After stored data were parsed, pause reading, resume reading, or close the connection.
 
-        If all requests are answered and the client sends no more data, the connection is closed.
+        While stored data remain, no further data are read. If no stored data remain, reading is resumed, unless the
+        client does not read its responses. If the client sends no more data and all requests are answered, the
+        connection is closed.
         """
         if self._transport.is_closing():
             return
@@ -279,11 +280,13 @@ class Connection(asyncio.Protocol):
         The parser calls the `on_...` methods of this connection. The method `on_message_complete` answers each complete
         request.
         """
+        # Set the state of the piece, which the `on_...` methods use.
         self._piece_bytes = len(data)
-        self._unchecked_bytes += self._piece_bytes
+        self._unchecked_bytes += self._piece_bytes  # the bytes that `_check_incomplete_request` compares with the limit
         self._piece_begins_with_request = self._phase is Phase.IDLE
         self._piece_was_answered = False
-        self._remembered_bytes = 0  # the remembered head is discarded, because the piece may contain another request
+        self._remembered_bytes = 0  # discards the head of the previous request, because another request may follow
+
         try:
             self._parser.feed_data(data)
         except httptools.HttpParserUpgrade as upgrade:
@@ -295,14 +298,15 @@ class Connection(asyncio.Protocol):
             self._check_incomplete_request()
 
     def _check_incomplete_request(self) -> None:
-        """Check the size of an incomplete request, and set a deadline if a new phase has begun.
+        """Refuse an incomplete request if it is too large. Otherwise set a deadline for its headers or for its body.
 
-        The content of the body is not counted, because the body has its own limit. The size of the headers is counted.
-        If the body is sent in chunks, the sizes of the trailers and of the chunk extensions are also counted.
+        The content of the body is not counted here, because the body has its own limit. The size of the headers is
+        counted. If the body is sent in chunks, the sizes of the trailers and of the chunk extensions are also counted.
+        The deadline is set once for the headers and once for the body. Further pieces do not extend it.
         """
         if self._unchecked_bytes > self._limits.header_bytes:
             self._refuse_headers()
-        elif self._timed_phase is not self._phase:
+        elif self._timed_phase is not self._phase:  # the present deadline was set for an earlier phase
             self._timed_phase = self._phase
             if self._phase is Phase.HEADERS:
                 self._set_deadline(self._limits.header_seconds)
@@ -332,12 +336,13 @@ class Connection(asyncio.Protocol):
     def on_message_begin(self) -> None:
         """Reset the state of the request, because a new request begins.
 
-        The parser does not report where in a piece of data a request begins. The bytes of a piece are therefore counted
-        only for the first request in the piece.
+        A piece of data may contain several requests. If the piece begins with a request, all bytes of the piece are
+        counted for this request. For every other request, the count begins at 0, because the parser does not report
+        where in the piece the request begins.
         """
         self._phase = Phase.HEADERS
         self._unchecked_bytes = self._piece_bytes if self._piece_begins_with_request else 0
-        self._piece_begins_with_request = False
+        self._piece_begins_with_request = False  # the next request in the same piece begins later
         self._expects_continue = False
         self._url = b""
         self._headers = []
@@ -361,17 +366,18 @@ class Connection(asyncio.Protocol):
 
     def on_headers_complete(self) -> None:
         """Check the size of the complete headers, and send `100 Continue` if the client waits for this response."""
-        # If the request began in the middle of a piece, up to SLICE_BYTES bytes of its headers have not been counted.
-        # The exact size is only computed if the headers may be too long.
+        # Computing the exact size of the headers takes time. It is only computed if the headers may be too long. Up to
+        # SLICE_BYTES bytes of the headers have not been counted if the request began in the middle of a piece.
         max_possible_bytes = self._unchecked_bytes + SLICE_BYTES
         may_be_too_long = max_possible_bytes > self._limits.header_bytes
         self._phase = Phase.BODY
-        self._unchecked_bytes = 0
+        self._unchecked_bytes = 0  # the headers are complete, and the body has its own limit
         if may_be_too_long and self._header_bytes() > self._limits.header_bytes:
             self._refuse_headers()
             return
 
-        is_parsed_again = self._parser.should_upgrade()  # if true, this method will be called again for this request
+        # A request for a protocol upgrade is parsed a second time. The response is only sent the second time.
+        is_parsed_again = self._parser.should_upgrade()
         if self._expects_continue and not self._is_refused and not is_parsed_again:
             self._transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 
@@ -476,6 +482,8 @@ class Connection(asyncio.Protocol):
             self._transport.close()
         elif self._is_blocked and self._transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
             self._transport.abort()  # the client sends requests but does not read the responses
+
+        # The next deadline is for the phase `IDLE`, in which the connection waits for a request.
         self._timed_phase = Phase.IDLE
         self._set_deadline(self._limits.idle_seconds)
 

@@ -210,9 +210,11 @@ def _read_charges(
     shape = tensor.shape
     _check_shape(shape, electrodes, max_presses)
     stated_size = tensor.parameters.binary_data_size  # number of bytes after the JSON text, as the request states it
-    if stated_size is None and not binary:
+    if stated_size is None and not binary:  # the charges are numbers in the JSON text
         return _from_values(tensor.data, shape, electrodes)
 
+    # The charges are bytes after the JSON text. Their number must be equal to the stated size and to the size that
+    # follows from the shape.
     dtype = DATATYPES[tensor.datatype]
     press_count, electrode_count = shape
     expected_size = press_count * electrode_count * dtype.itemsize
@@ -268,15 +270,17 @@ def _from_values(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> 
     """
     press_count, electrode_count = shape
     is_flat_list = type(values) is list and len(values) == press_count * electrode_count
-    # If there are few numbers, struct is several times faster than creating and checking arrays. However, struct would
-    # accept True and False. Lists that contain them are therefore converted by `_from_array`. The numbers 1 and 0 are
-    # equal to True and False, so that lists with these numbers are also converted by `_from_array`.
-    if is_flat_list and not (True in values or False in values):
+    # Try the fast conversion by the module `struct`, which is several times faster than `_from_array` for few numbers.
+    # Lists with True or False are excluded, because `struct` would accept these values as numbers. The test with `in`
+    # also excludes lists with the numbers 1 and 0, because Python treats them as equal to True and False.
+    may_contain_booleans = is_flat_list and (True in values or False in values)
+    if is_flat_list and not may_contain_booleans:
         charges = np.empty(shape, np.float32)
         write_into_charges = partial(_packer(len(values)), charges.data, 0)  # writes to the array, from its beginning
-        if write_finite(write_into_charges, values):
+        if write_finite(write_into_charges, values):  # false if a value is not a finite number
             return charges
-    # `_from_array` is slower, but also accepts rows, and raises an error if the values are not valid.
+
+    # The slow conversion also accepts rows, and raises an error if the values are not valid.
     return _from_array(values, shape, electrodes)
 
 
@@ -406,20 +410,22 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
     Raises:
         ModelError: If onnxruntime fails to run the graph.
     """
-    if FLAGS in names:  # the flags are not an output of the graph, but are computed from all outputs of the graph
+    # The graph does not compute the flags. They are computed from all outputs of the graph. A second call of this
+    # function therefore requests all these outputs.
+    if FLAGS in names:
         outputs, unchecked, alarms = infer(loaded, charge_pC, loaded.outputs)
         outputs[FLAGS] = _flags(loaded, outputs)
         return {name: outputs[name] for name in names}, unchecked, alarms
-    if len(charge_pC) == 1:
-        return _infer_single_press(loaded, charge_pC[0], names)
 
-    count = len(charge_pC)
+    press_count = len(charge_pC)
+    if press_count == 1:  # a single press is computed in a faster way
+        return _infer_single_press(loaded, charge_pC[0], names)
     outputs = dict[str, Rows](run(loaded.model.session, charge_pC, names))
-    check_output_shapes(outputs, count, loaded.metadata.label)
+    check_output_shapes(outputs, press_count, loaded.metadata.label)
     if "misfit" not in outputs:
-        return outputs, count, 0
+        return outputs, press_count, 0
     is_good = outputs["misfit"] <= loaded.validity.misfit_limit  # false if the misfit is NaN
-    alarms = count - int(np.count_nonzero(is_good))
+    alarms = press_count - int(np.count_nonzero(is_good))
     return outputs, 0, alarms
 
 
@@ -447,7 +453,7 @@ def _infer_single_press(
         press.run_into(charge_pC, row[0])
     except Exception as error:  # the exceptions of onnxruntime have no common base class other than Exception
         raise run_error(error) from error
-    columns = press.columns
+    columns = press.columns  # columns of the row that belong to each output, by the name of the output
     outputs = {name: row[:, columns[name]] for name in names}
     misfit = row[:, columns["misfit"]].item()
     is_alarm = not misfit <= loaded.validity.misfit_limit  # also true if the misfit is NaN

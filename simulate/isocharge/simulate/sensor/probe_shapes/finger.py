@@ -60,7 +60,7 @@ class Finger(RoundProbe):
 
         Let a be the radius of the footprint. The pressure exceeds the fraction t of its peak within a disk of radius
         a sqrt(1 - t^2). Let A(t) be the area that the polygon and this disk have in common. The force on the polygon is
-        the peak pressure times the integral of A(t) over t from 0 to 1.
+        the peak pressure times the integral of A(t) over t from 0 to 1. The integral is computed by a Gauss rule.
 
         Args:
             corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
@@ -71,5 +71,7 @@ class Finger(RoundProbe):
         pressure_fraction = 0.5 * (nodes + 1.0)
         disk_radius = self.radius * np.sqrt(1.0 - pressure_fraction**2)
         points = to_complex(corners)
-        areas = [float(area_in_disk(points, at, radius)) for radius in disk_radius]
-        return float(PEAK_PRESSURE / self.area * 0.5 * (weights @ areas))
+        common_areas = [float(area_in_disk(points, at, radius)) for radius in disk_radius]  # A(t), mm^2
+
+        # For a force of 1, the mean pressure is 1 / area, and the peak pressure is `PEAK_PRESSURE` times as large.
+        return float(PEAK_PRESSURE / self.area * 0.5 * (weights @ common_areas))
