@@ -77,6 +77,13 @@ def test_replay_that_is_stopped_leaves_no_files(record, tmp_path):
     assert outputs.has_incomplete_file
 
 
+def test_replay_without_outputs_that_is_stopped_misses_no_records(record):
+    outputs = Outputs(["none"], context()).__enter__()
+    outputs.write(record())
+    outputs.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
+    assert outputs.not_written == {}
+
+
 def test_live_stream_that_is_stopped_keeps_its_files(record, tmp_path):
     path = tmp_path / "a.jsonl"
     outputs = Outputs([str(path)], context(is_live=True)).__enter__()

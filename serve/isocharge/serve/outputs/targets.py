@@ -217,7 +217,8 @@ class Outputs:
         """Discard all open outputs, because they have not received all records."""
         for target, output in self._remove_each():
             discard(output)
-            self.not_written[target] = None  # the number of missing records is unknown
+            if not kind_of(target).writes_nothing:
+                self.not_written[target] = None  # the number of missing records is unknown
 
     def _remove_each(self) -> Iterator[tuple[str, Output]]:
         """Remove the open outputs one by one in reverse order, and yield each output with its target."""

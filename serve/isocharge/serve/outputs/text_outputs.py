@@ -136,6 +136,6 @@ def _open_csv_file(target: str, context: OutputContext) -> Output:
 
 STDOUT_JSON = OutputKind(form="json", accepts="json".__eq__, open=_open_stdout_json, is_standard_output=True)
 STDOUT_CSV = OutputKind(form="csv", accepts="csv".__eq__, open=_open_stdout_csv, is_standard_output=True)
-NO_OUTPUT = OutputKind(form="none", accepts="none".__eq__, open=_open_nothing, may_block=False)
+NO_OUTPUT = OutputKind(form="none", accepts="none".__eq__, open=_open_nothing, may_block=False, writes_nothing=True)
 JSON_FILE = OutputKind(form="FILE.jsonl", accepts=lambda target: target.endswith(".jsonl"), open=_open_json_file)
 CSV_FILE = OutputKind(form="FILE.csv", accepts=lambda target: target.endswith(".csv"), open=_open_csv_file)
