@@ -48,7 +48,8 @@ MAX_WEIGHT = 1e6
 
 CALIBRATION_ADVICE = (
     "a film is followed from a model that `isocharge train calibrate` made of presses on it, with four electrodes "
-    "or more: calibrate it, or again with this version"
+    "or more: calibrate it, or again with this version. A calibration writes no such file if its network explains "
+    "good touches too poorly, as on uniaxial and on very imperfect films; update such a film with --from"
 )
 """Advice to the user if the file cannot be read."""
 
