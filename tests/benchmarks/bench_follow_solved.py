@@ -14,9 +14,11 @@ the positions and of the forces within two reported standard deviations:
 - followed, other touches: as followed, for other random orders of the presses, so that other presses are the touches.
 
 A change of -0.45 MPa is the change of a film that is 1 K warmer than its ring. Solved charges are stored in the folder.
-Solving a film takes about three minutes. The results of each film are printed as soon as they are available.
+Solving a film takes about three minutes. The results of each film are printed as soon as they are available. A film
+whose calibration cannot be followed is named and left out.
 """
 
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -29,6 +31,7 @@ from measured_films import contact_errors, measured_presses, with_rig_errors
 from shared import arguments, print_results, report_progress
 from solved_films import SolvedFilm, solved_film
 
+from isocharge.common.errors import ModelError
 from isocharge.serve import Contact, Predictor
 from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.simulate import Circle, load_sensor
@@ -110,11 +113,16 @@ def main() -> None:
     with ProcessPoolExecutor(asked.workers, mp_context=get_context("spawn")) as pool:
         for seed in asked.seeds.split(","):
             solved = solved_film(problem, int(seed), asked.change, counts, asked.folder, pool)
-            film = followed_film(problem, solved, int(seed), asked.orders)
+            try:
+                film = followed_film(problem, solved, int(seed), asked.orders)
+            except ModelError as error:  # the calibration has written no file for following
+                print(f"film {seed}: cannot be followed ({error})", file=sys.stderr)
+                continue
             for method, values in film.items():
                 report_progress(f"film {seed}, {method}", values)
             films.append(film)
-    results = {method: mean([film[method] for film in films]) for method in films[0]}
+    methods = films[0] if films else ()
+    results = {method: mean([film[method] for film in films]) for method in methods}
     print_results("follow_solved", asked, results)
 
 
