@@ -74,7 +74,7 @@ class SideForceMap:
                 "or `isocharge simulate point --side-force` for other probes"
             )
         # The table contains the stress fields and, in the last column, the ratio of the holding force to the force.
-        derivative_map = solve_derivatives(film, _read_side_force, executor)
+        derivative_map = solve_derivatives(film, _side_force_changes, executor)
         stress_table, holding_column = np.split(derivative_map.table, [-1], axis=1)
         return cls(film, replace(derivative_map, table=stress_table), holding_column.ravel())
 
@@ -159,16 +159,17 @@ class SideForceMap:
         return ReadoutPoints.of(self.film.sensor, FINE)
 
 
-def _read_side_force(solved: Equilibrium, surface: Surface) -> Array:
-    """Compute the stress fields of a side force, and the holding force, for one press.
+def _side_force_changes(solved: Equilibrium, surface: Surface) -> Array:
+    """For one press, compute how a side force changes the stress, and which holding force keeps the probe in place.
 
     Args:
         solved: Equilibrium of the film under a press on the positive x axis.
-        surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
+        surface: Surface at which the stress is computed: the middle, the top or the bottom of the film.
 
     Returns:
-        The values of `side_force_stress`, followed by the ratio of the holding force to the force of the press, shape
-        (n_value + 1,), dimensionless. The ratio is positive if the holding force points away from the centre.
+        One array, as the interpolation between presses requires. It contains all changes of the scaled stress, which
+        `side_force_stress` computes, and then the holding force divided by the force of the press. Shape
+        (n_change + 1,), dimensionless. The holding force is positive if it points away from the centre.
     """
     # The second component is zero, because the press is symmetric about the x axis.
     outward_force, _ = holding_force(solved)

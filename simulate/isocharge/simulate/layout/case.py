@@ -115,10 +115,11 @@ def read_goal(text: str) -> Goal:
     """Convert the value of the option `--goal` into a goal.
 
     Args:
-        text: "worst", "rms", or the path of a CSV file with the header `WEIGHT_MAP_HEADER`.
+        text: "worst", "rms", or the path of a CSV file. The file contains the weights of the position errors at several
+            places, below the header `WEIGHT_MAP_HEADER`.
 
     Returns:
-        The text if it is the name of a goal, and otherwise the weights in the file.
+        The name "worst" or "rms" unchanged, or the weights that the file contains.
 
     Raises:
         InputError: If the file cannot be read, or its content is not a weight map.
@@ -133,7 +134,7 @@ def read_goal(text: str) -> Goal:
         table = np.loadtxt(lines, delimiter=",", ndmin=2)
         has_three_columns = len(table) > 0 and table.shape[1] == 3
         if not has_three_columns or not np.isfinite(table).all() or table[:, 2].min() < 0.0:
-            raise ValueError("expected rows of three finite numbers, the weight from 0")
+            raise ValueError("expected rows of three finite numbers, of which the weight is not negative")
     except (OSError, ValueError) as error:
         raise InputError(
             f"goal {text!r}: expected 'worst', 'rms' or a CSV file {WEIGHT_MAP_HEADER}: {error}"

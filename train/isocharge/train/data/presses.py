@@ -232,8 +232,11 @@ FEWEST_MEASURED = 50
 def held_out(contact: Array) -> Booleans:
     """Determine which measured presses are held out for the measurement of errors.
 
-    Presses at one position are held out together. The order in which positions are chosen depends only on their
-    coordinates. The order is therefore the same in every subset of the presses.
+    The fraction `HELD_SHARE` of the presses is held out, but at least `FEWEST_HELD` presses. Of very few presses, at
+    most half are held out. Presses at one position are held out together, so the number may be slightly larger.
+
+    The positions are chosen in an order that depends only on their coordinates. The order is therefore the same in
+    every subset of the presses.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -242,7 +245,8 @@ def held_out(contact: Array) -> Booleans:
         Whether each press is held out, shape (n,).
     """
     count = len(contact)
-    held_count = max(HELD_SHARE * count, min(FEWEST_HELD, 0.5 * count))
+    smallest_held_count = min(FEWEST_HELD, 0.5 * count)
+    held_count = max(HELD_SHARE * count, smallest_held_count)
     return _count_presses_before(contact) < held_count
 
 
