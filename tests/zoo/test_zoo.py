@@ -25,7 +25,7 @@ from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.port.serial_line import Request
-from isocharge.serve.virtual_sensor.sensor import PseudoPort
+from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 
 RATE_HZ = 400.0
 predictor = cache(Predictor)

@@ -24,7 +24,7 @@ from serial.tools.list_ports_common import ListPortInfo
 from boards import TcpBoard, interrupt, taps
 from isocharge.common.errors import InputError
 from isocharge.serve import Predictor, Recording, Script, VirtualSensor
-from isocharge.serve.virtual_sensor.sensor import PseudoPort
+from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 
 
 def records_of(text):

@@ -6,9 +6,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from isocharge.serve.viewer.hub import MAX_PIECES, Playhead, RecordedTape, Tape
 from isocharge.serve.viewer.link import make_link
 from isocharge.serve.viewer.messages import Play, SampleFormat
+from isocharge.serve.viewer.playhead import Playhead
+from isocharge.serve.viewer.tape import MAX_PIECES, RecordedTape, Tape
 
 FORMAT = SampleFormat(("A",))
 

@@ -11,7 +11,7 @@ from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError
 from isocharge.common.extras import require
 from isocharge.common.files import refuse_existing, write_whole
-from isocharge.serve.virtual_sensor.sensor import posix_modules
+from isocharge.serve.virtual_sensor.pseudo_port import posix_modules
 
 
 def demo_command(

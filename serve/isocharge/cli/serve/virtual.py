@@ -21,8 +21,8 @@ from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
 from isocharge.serve import Script, VirtualSensor, encode_frame, encode_text, load_device
 from isocharge.serve.live.board_encoder import BoardEncoder
+from isocharge.serve.virtual_sensor.pseudo_port import posix_modules
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
-from isocharge.serve.virtual_sensor.sensor import posix_modules
 from isocharge.simulate import (
     Amplifier,
     Circle,

@@ -1,18 +1,14 @@
 """Hub that distributes the samples of a stream to the viewers. A viewer is a browser that shows the live page.
 
-The class `Tape` stores samples under consecutive numbers. A tape contains the latest samples of a live stream, or all
-samples of a recording. A viewer confirms each message that it has drawn. While too many messages are unconfirmed, the
-viewer receives no further message. The next message contains all samples that have arrived since the previous message.
-If there are too many samples for one message, neighbouring samples are coalesced. The hub therefore stores no queue of
-messages for a slow viewer.
+A tape stores the samples under consecutive numbers. A viewer confirms each message that it has drawn. While too many
+messages are unconfirmed, the viewer receives no further message. The next message contains all samples that have
+arrived since the previous message. If there are too many samples for one message, neighbouring samples are coalesced.
+The hub therefore stores no queue of messages for a slow viewer.
 """
 
 import asyncio
 import json
-import tempfile
 import time
-from bisect import bisect_right
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,251 +16,13 @@ import numpy as np
 from isocharge.serve.viewer.link import PageEnd
 from isocharge.serve.viewer.messages import (
     LiveRequest,
-    Pause,
-    Play,
     ReplayRequest,
     SampleFormat,
-    Samples,
-    Seek,
-    Speed,
     coalesce,
     samples_message,
 )
-
-LIVE_SAMPLES = 1 << 14
-"""Number of stored samples of a live stream.
-
-They cover 16 s at 1 kHz. A browser that falls further behind misses samples.
-"""
-
-MAX_PIECES = 600
-"""Largest number of pieces in the overview of a recording."""
-
-FIRST_PIECE_S = 0.01
-"""Duration of a piece in the overview of a short recording, s.
-
-The duration is doubled until at most `MAX_PIECES` pieces are needed.
-"""
-
-
-class Tape:
-    """Ring buffer that stores the latest samples of a stream.
-
-    Args:
-        dtype: NumPy type of a sample.
-        capacity: Number of samples that are stored.
-
-    Attributes:
-        total: Number of samples that were appended since the tape was created.
-    """
-
-    def __init__(self, dtype: "np.dtype[Any]", capacity: int = LIVE_SAMPLES) -> None:
-        """Create a tape without samples. The docstring of the class describes the arguments."""
-        self.total = 0
-        self._ring: Samples = np.zeros(capacity, dtype)
-
-    @property
-    def oldest(self) -> int:
-        """Number of the oldest stored sample."""
-        return max(0, self.total - len(self._ring))
-
-    def append(self, samples: Samples) -> None:
-        """Append samples. If the buffer is full, the new samples replace the oldest samples."""
-        capacity = len(self._ring)
-        latest = samples[-capacity:]  # earlier samples would be overwritten at once
-        total = self.total + len(samples)
-        numbers = np.arange(total - len(latest), total)
-        self._ring[numbers % capacity] = latest
-        self.total = total
-
-    def samples(self, start: int, stop: int) -> Samples:
-        """Return the samples with the numbers from `start` to `stop` - 1.
-
-        Samples that were overwritten are left out.
-        """
-        numbers = np.arange(max(start, self.oldest), stop)
-        return self._ring[numbers % len(self._ring)]
-
-    def timestamp(self, number: int) -> float:
-        """Return the Unix time of the stored sample that has the given number, s."""
-        return float(self._ring[number % len(self._ring)]["timestamp"])
-
-    def first_number_after(self, time_s: float) -> int:
-        """Return the number of the first stored sample after a given Unix time, s.
-
-        If all stored samples are earlier, the result is the number of the next sample that will be appended.
-        """
-        numbers = range(self.total)
-        return bisect_right(numbers, time_s, lo=self.oldest, key=self.timestamp)
-
-    def span(self) -> tuple[float, float]:
-        """Return the Unix times of the oldest and the latest stored sample, s. Without samples, return two zeros."""
-        if not self.total:
-            return 0.0, 0.0
-        return self.timestamp(self.oldest), self.timestamp(self.total - 1)
-
-    def close(self) -> None:
-        """Close the file of the samples if the tape has a file."""
-
-
-class RecordedTape(Tape):
-    """Tape that stores all samples of a recording in a temporary file.
-
-    If the time of a sample is earlier than the time of the previous sample, the time of the previous sample is stored.
-    """
-
-    def __init__(self, dtype: "np.dtype[Any]") -> None:
-        """Create the temporary file and an empty overview of the forces.
-
-        The overview divides the recording into pieces of equal duration, and contains the largest force in each piece.
-
-        Args:
-            dtype: NumPy type of a sample.
-        """
-        super().__init__(dtype)
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115
-        self._piece_s = FIRST_PIECE_S  # duration of a piece
-        self._max_force_N: list[float] = []
-        self._map_file(LIVE_SAMPLES)
-
-    def append(self, samples: Samples) -> None:
-        """Append samples, and update the overview.
-
-        If a time is missing or is earlier than the previous time, the previous time is stored instead. The stored times
-        therefore never decrease. If the samples do not fit into the mapped file, the capacity of the file is doubled
-        until they fit.
-
-        Args:
-            samples: The samples, shape (n,).
-        """
-        if not len(samples):
-            return
-        ordered = samples.copy()
-        _, latest_stored_s = self.span()
-        times_s = np.nan_to_num(samples["timestamp"], nan=0.0)  # a missing time becomes 0, which is never the largest
-        largest_so_far_s = np.maximum.accumulate(times_s)
-        ordered["timestamp"] = np.maximum(largest_so_far_s, latest_stored_s)
-        while self.total + len(ordered) > len(self._ring):
-            self._map_file(2 * len(self._ring))
-        super().append(ordered)
-        self._update_overview(ordered)
-
-    def close(self) -> None:
-        """Close the temporary file, so that the operating system removes it."""
-        self._file.close()
-
-    def _map_file(self, capacity: int) -> None:
-        """Map the file to memory, with a size of `capacity` samples. The stored samples are unchanged."""
-        self._ring = np.memmap(self._file, self._ring.dtype, "r+", shape=(capacity,))
-
-    def overview(self) -> list[float]:
-        """Return the largest force in each piece of the recording, N. All pieces have the same duration."""
-        return [round(force_N, 3) for force_N in self._max_force_N]
-
-    def _update_overview(self, samples: Samples) -> None:
-        """Update the largest force in each piece of the recording with the forces of new samples.
-
-        The number of pieces is limited to `MAX_PIECES`. When a longer recording needs more pieces, neighbouring pieces
-        are joined in pairs, and the duration of a piece is doubled.
-
-        Args:
-            samples: New samples, shape (n,), whose times do not decrease.
-        """
-        elapsed_s = samples["timestamp"] - self.timestamp(0)  # time since the first sample of the recording
-        while elapsed_s[-1] >= MAX_PIECES * self._piece_s:
-            self._join_pieces()
-
-        # Append new pieces up to the piece that contains the last sample.
-        piece_of_sample = (elapsed_s / self._piece_s).astype(int)  # index of the piece that contains the sample
-        piece_count = int(piece_of_sample[-1]) + 1
-        new_piece_count = piece_count - len(self._max_force_N)
-        self._max_force_N += [0.0] * new_piece_count
-
-        # Compute the largest force of the samples in each piece. These samples are neighbours, because the times do not
-        # decrease. They are called a run here. `reduceat` computes the largest force of every run in one call.
-        force_N = np.nan_to_num(samples["force_N"], nan=0.0)
-        begins_run = np.diff(piece_of_sample, prepend=-1) != 0  # true for the first sample, because no piece is -1
-        run_starts = np.flatnonzero(begins_run)
-        run_pieces = piece_of_sample[run_starts].tolist()
-        run_max_N = np.maximum.reduceat(force_N, run_starts).tolist()
-
-        # A piece may contain earlier samples, so the larger one of the earlier and the new force is stored.
-        for piece, max_force_N in zip(run_pieces, run_max_N, strict=True):
-            self._max_force_N[piece] = max(self._max_force_N[piece], max_force_N)
-
-    def _join_pieces(self) -> None:
-        """Join neighbouring pieces of the overview in pairs, and double the duration of a piece."""
-        pairs = [self._max_force_N[first : first + 2] for first in range(0, len(self._max_force_N), 2)]
-        self._max_force_N = [max(pair) for pair in pairs]
-        self._piece_s *= 2.0
-
-
-@dataclass
-class Playhead:
-    """Position at which a viewer plays a recording.
-
-    Attributes:
-        at_s: Time since the start of the recording, s.
-        speed: Speed relative to the recorded speed.
-        is_playing: Whether the position advances.
-        has_jumped: Whether the viewer has selected another position and has not yet received samples from there.
-    """
-
-    at_s: float = 0.0
-    speed: float = 1.0
-    is_playing: bool = True
-    has_jumped: bool = True
-
-    def advance(self, step_s: float, end_s: float, *, is_complete: bool) -> bool:
-        """Advance the position if the recording is being played, and stop playing at the end of the recording.
-
-        While the recording is still being read, the position stays within the part that has already been read. Playing
-        then continues.
-
-        Args:
-            step_s: Time that has passed since the previous call, s.
-            end_s: Length of the part of the recording that has been read, s.
-            is_complete: Whether the whole recording has been read.
-
-        Returns:
-            Whether the position has just reached the end of the recording.
-        """
-        if not self.is_playing:
-            return False
-        self.at_s = min(self.at_s + step_s * self.speed, end_s)
-        self.is_playing = not (is_complete and self.at_s >= end_s)
-        return not self.is_playing
-
-    def apply(self, request: ReplayRequest, end_s: float) -> None:
-        """Carry out a request of the page.
-
-        If the position is at the end of the recording, a request to play starts again at the beginning.
-
-        Args:
-            request: Request to change the speed, to go to another position, to pause, or to play.
-            end_s: Length of the part of the recording that has been read, s.
-        """
-        match request:
-            case Speed(value=value):
-                self.speed = value
-            case Seek(value=value):
-                self._jump(min(value, end_s))
-            case Pause():
-                self.is_playing = False
-            case Play():
-                self.is_playing = True
-                if self.at_s >= end_s:
-                    self._jump(0.0)
-
-    def _jump(self, at_s: float) -> None:
-        """Set the position to a given time since the start of the recording, s."""
-        self.at_s = at_s
-        self.has_jumped = True
-
-    def to_json(self) -> dict[str, float | bool]:
-        """Return the position, the speed and whether the recording is being played, as a JSON object for the page."""
-        return {"at_s": round(self.at_s, 3), "speed": self.speed, "is_playing": self.is_playing}
-
+from isocharge.serve.viewer.playhead import Playhead
+from isocharge.serve.viewer.tape import RecordedTape, Tape
 
 POLL_INTERVAL_S = 1 / 120
 """Time between two checks for new samples while there are viewers, s."""

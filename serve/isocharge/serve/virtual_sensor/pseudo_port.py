@@ -1,0 +1,84 @@
+"""Pseudo-terminal through which the virtual sensor sends its frames."""
+
+import array
+import contextlib
+import importlib
+import os
+from typing import Any
+
+from isocharge.common.errors import PortError
+
+PORT_BUFFER_BYTES = 3840
+"""Largest number of bytes that wait for the reader.
+
+The buffer of Linux has 4095 bytes. If it were filled completely, a frame could be written incompletely.
+"""
+
+
+class PseudoPort:
+    """An open pseudo-terminal in raw mode.
+
+    Attributes:
+        url: Path of the device for the reader.
+    """
+
+    def __init__(self) -> None:
+        """Open a pseudo-terminal.
+
+        Raises:
+            PortError: If the operating system has no pseudo-terminals. Windows has none.
+        """
+        tty, self._fcntl, self._termios = posix_modules()
+        # The file descriptor of the reader's end also stays open here. Otherwise the operating system would hang up the
+        # port when a reader closes it.
+        self._writer, self._reader = os.openpty()
+        tty.setraw(self._reader)  # in raw mode, the operating system passes all bytes on unchanged
+        os.set_blocking(self._writer, False)  # a full buffer raises BlockingIOError instead of delaying the sensor
+        self.url = os.ttyname(self._reader)
+
+    def write_whole(self, data: bytes) -> bool:
+        """Write data without waiting. If the buffer does not have enough room for all data, nothing is written.
+
+        Args:
+            data: The bytes of one frame.
+
+        Returns:
+            Whether all data were written.
+        """
+        # The operating system writes the number of bytes that the reader has not read yet into this array.
+        unread_bytes = array.array("i", [0])
+        self._fcntl.ioctl(self._reader, self._termios.FIONREAD, unread_bytes)
+        if unread_bytes[0] + len(data) > PORT_BUFFER_BYTES:
+            return False
+        try:
+            written_bytes = os.write(self._writer, data)
+        except BlockingIOError:  # the buffer is full
+            return False
+        return written_bytes == len(data)
+
+    def received(self) -> bytes:
+        """Return the bytes that the reader has sent since the last call, without waiting."""
+        with contextlib.suppress(BlockingIOError):
+            return os.read(self._writer, PORT_BUFFER_BYTES)
+        return b""
+
+    def close(self) -> None:
+        """Close the pseudo-terminal. For the reader, closing the port is the same as unplugging the cable."""
+        os.close(self._writer)
+        os.close(self._reader)
+
+
+def posix_modules() -> tuple[Any, Any, Any]:
+    """Import the modules `tty`, `fcntl` and `termios`, which handle pseudo-terminals.
+
+    Raises:
+        PortError: If the operating system has no pseudo-terminals.
+    """
+    try:
+        tty, fcntl, termios = map(importlib.import_module, ("tty", "fcntl", "termios"))
+    except ImportError as error:
+        raise PortError(
+            f"a virtual sensor needs a pseudo-terminal, and this system has none ({error}); run it on Linux or macOS, "
+            "or on Windows in WSL"
+        ) from error
+    return tty, fcntl, termios
